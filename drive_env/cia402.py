@@ -54,6 +54,7 @@ RATED_CURRENT = 0x6075
 RATED_TORQUE = 0x6076
 TORQUE_ACTUAL = 0x6077
 CURRENT_ACTUAL = 0x6078
+DC_LINK_VOLTAGE = 0x6079
 TARGET_POSITION = 0x607A
 HOME_OFFSET = 0x607C
 POSITION_LIMITS = 0x607D
@@ -73,6 +74,9 @@ HOMING_METHOD = 0x6098
 HOMING_SPEEDS = 0x6099
 HOMING_ACCELERATION = 0x609A
 PROFILE_JERK = 0x60A4
+POSITION_UNIT = 0x60A8
+VELOCITY_UNIT = 0x60A9
+ACCELERATION_UNIT = 0x60AA
 POSITION_OFFSET = 0x60B0
 VELOCITY_OFFSET = 0x60B1
 TORQUE_OFFSET = 0x60B2
@@ -81,15 +85,21 @@ INTERPOLATION_DATA = 0x60C1
 INTERPOLATION_PERIOD = 0x60C2
 POSITIONING_OPTIONS = 0x60F2
 FOLLOWING_ERROR = 0x60F4
+HOMING_METHODS = 0x60E3
 DIGITAL_INPUTS = 0x60FD
 DIGITAL_OUTPUTS = 0x60FE
 TARGET_VELOCITY = 0x60FF
 MOTOR_TYPE = 0x6402
 SUPPORTED_MODES = 0x6502
 SINGLE_DEVICE_TYPE = 0x67FF
+# What commands or leads an axis, or its outputs: no parameters.
+COMMANDED = (
+    CONTROLWORD, MODE, TARGET_TORQUE, TARGET_POSITION, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
+    INTERPOLATION_DATA, DIGITAL_OUTPUTS, TARGET_VELOCITY,
+)  # fmt: skip
 # --- modes of operation (6060h) --------------------------------------------------------------------------------------
 PP, VL, PV, TQ, HM, IP, CSP, CSV, CST = 1, 2, 3, 4, 6, 7, 8, 9, 10
-MODES = {"pp": PP, "pv": PV, "hm": HM, "csp": CSP, "csv": CSV, "cst": CST}
+MODES = {"pp": PP, "pv": PV, "tq": TQ, "hm": HM, "ip": IP, "csp": CSP, "csv": CSV, "cst": CST}
 
 
 # --- states and the statusword ---------------------------------------------------------------------------------------
@@ -134,6 +144,7 @@ STATE_CODING = {
 LIVE = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)  # the power stage is on, or may be
 FAULT_BIT = Pattern(0x08, 0x08)  # fault or fault reaction active
 WARNING = Pattern(0x80, 0x80)
+REMOTE = Pattern(0x200, 0x200)  # the axis takes commands from its network
 TARGET_REACHED = Pattern(0x0400, 0x0400)
 INTERNAL_LIMIT = Pattern(0x0800, 0x0800)
 SET_POINT_ACKNOWLEDGED = Pattern(0x1000, 0x1000)  # in pp

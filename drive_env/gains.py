@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import Device
-from drive_env.dictionary.units import RPM, UNITS, Context
+from drive_env.dictionary.units import RPM, UNITS, Context, find_unit
 from drive_env.drives.interface import Drives, device_of
 from drive_env.motors import Motor
 
@@ -290,7 +290,7 @@ def cascade_columns(device: Device) -> list[int]:
 def gain_factors(device: Device) -> list[float]:
     """Return what an integer of each gain is in the drive record: duty/A, A s/rad, 1/s; of an I, a share of P e."""
     context = _context(device)
-    return [float(UNITS[device.bindings[row.key].unit].factor(context)) for row in device.gains.rows]
+    return [float(find_unit(device.bindings[row.key].unit).factor(context)) for row in device.gains.rows]
 
 
 def per_chip(device: Device) -> dict[Part, float]:

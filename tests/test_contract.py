@@ -26,6 +26,7 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import device_names, find_device
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.inertia_check import MAX_INERTIA_RATIO, MisfitWarning
 from drive_env.emulator.machine_kinds import MACHINE_KINDS
@@ -142,6 +143,9 @@ class Life:
     def mode(self, abbreviation):
         number = next(mode.number for mode in MODES if mode.abbreviation == abbreviation)
         self.drives.write(0x6060, number)
+        own = self.drives.device.mode_gate.get(number)
+        if own is not None:
+            self.drives.write(Role.MODE_GATE, own)
         self.run(0.002)
         assert np.all(self.drives.read(0x6061) == number)
 
@@ -197,14 +201,14 @@ class Life:
         self.drives.write(0x60FF, 0)
         self.run(max(0.2, self.ramp + 0.05))
 
-    def csp(self):
+    def csp(self, mode="csp", target=0x607A):
         """Back by half a turn, a set-point each millisecond."""
-        self.mode("csp")
+        self.mode(mode)
         start = self.drives.read(0x6062)
         # As a controller plans it: a step of the speed would be too much for a motor without a loop.
         share = np.minimum(np.arange(300) / 200, 1.0)
         way = -share * share * (3.0 - 2.0 * share) * self.turn // 2
-        trace = self.run(0.3, {0x607A: (start + way[:, None]).astype(np.int64)})
+        trace = self.run(0.3, {target: (start + way[:, None]).astype(np.int64)})
         # Row k is written, then recorded, then acted on.
         assert np.all(np.abs(trace[0x6062][1:] - start - way[:-1, None]) <= 1)
         assert np.all(trace[0x6041][10:] & 0x1000)
@@ -222,16 +226,27 @@ class Life:
         if self.suits:
             np.testing.assert_allclose(np.mean(moved, axis=0), -self.speed, rtol=0.2)
 
-    def cst(self):
+    def ip(self):
+        """As csp, by the object of its own (60C1h:01)."""
+        self.csp("ip", (0x60C1, 1))
+
+    def tq(self):
+        """As cst."""
+        self.cst("tq")
+
+    def cst(self, mode="cst"):
         """A tenth of the rated current, but at least one that the measurement resolves; then none."""
         self.close_loop(1)
-        self.mode("cst")
-        current = max(100.0 * self.drives.motor.rated_current, 300.0)  # mA
-        trace = self.run(0.02, {0x6071: np.full(20, round(current))})
+        self.mode(mode)
+        ampere = ampere_per_count(self.drives)
+        current = max(0.1 * self.drives.motor.rated_current, 0.3)
+        trace = self.run(
+            0.02, {0x6071: np.tile(to_counts(self.drives, np.full(self.drives.num_axes, current)), (20, 1))}
+        )
         # The integrator follows the back-EMF of a motor that speeds up: the current lags.
-        assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0) - current) < 0.25 * current + 60.0)
+        assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0) * ampere - current) < 0.25 * current + 0.06)
         trace = self.run(0.02, {0x6071: np.zeros(20, int)})
-        assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0)) < 0.1 * current + 60.0)
+        assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0) * ampere) < 0.1 * current + 0.06)
 
         self.close_loop(0)
 
@@ -275,7 +290,8 @@ class Life:
         drives.machine.enable_input = False
         self.run(0.003)
         assert self.in_state(FAULT)
-        assert [(m.axis, m.code) for m in drives.emergencies()] == [(k, 0x5441) for k in range(drives.num_axes)]
+        row = next(row for name, row in drives.device.emergencies.items() if name in ("shutdown_switch", "sto"))
+        assert [(m.axis, m.code) for m in drives.emergencies()] == [(k, row.code) for k in range(drives.num_axes)]
         for name in {"i_q", "i_a", "i_b"} & set(drives.inside.records.dtype.names):  # of a servo, of a stepper
             assert np.all(get_lanes(drives.inside.records, name, drives.num_axes) == 0.0), name
         self.readable()
@@ -327,7 +343,7 @@ class Life:
         assert self.in_state(ENABLED)
         if self.demand.torque <= 1.0:
             stations = {"no": self.no_mode, "pp": self.pp, "pv": self.pv, "hm": self.hm}
-            stations |= {"csp": self.csp, "csv": self.csv, "cst": self.cst}
+            stations |= {"csp": self.csp, "csv": self.csv, "cst": self.cst, "ip": self.ip, "tq": self.tq}
             # Zero last: it is the mode that stops.
             for mode in sorted(MODES, key=lambda mode: mode.number == 0):
                 if mode.number not in self.modes:

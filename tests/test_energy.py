@@ -271,7 +271,7 @@ def test_a_blocked_axis_warms_and_its_torque_per_ampere_falls():
     assert warm_duty / duty == pytest.approx(1.0 + COPPER * (winding - 25.0), rel=0.05)
 
 
-@pytest.mark.parametrize("name", sorted(motors_of(["pmsm", "dc"])))
+@pytest.mark.parametrize("name", sorted(motors_of(["pmsm", "dc"], voltage=24.0)))
 def test_rated_current_warms_the_winding_by_80_k_in_the_end(name):
     """In the end: resistance and so the loss have grown with the temperature by then."""
     motor = MOTORS[name]

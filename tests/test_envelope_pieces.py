@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 from test_envelope_limits import ENCODER_RESOLUTION, foreign
 
 from drive_env import CanDrives, Limits, SafetyError, motion
+from drive_env.dictionary.entries import Entry
+from drive_env.safety.envelope import Envelope
 from drive_env.safety.looks import Looks
 
 TURN = 65536
@@ -81,3 +84,55 @@ def test_what_comes_of_an_axis_ends_with_the_first_object_that_does_not(silent):
     found = Looks._ask_axis(SimpleNamespace(_drives=drives), 1, 1, entries, 0.1)
     assert asked == list(range(silent + 1))
     assert {key: row.tolist() for key, row in found.items()} == {(k, 0): [[0, 7]] for k in range(silent)}
+
+
+def envelope_of(is_armed=False, live=True):
+    """An envelope whose parts do nothing, and what it does besides."""
+    done, nothing = [], lambda *arguments: None
+    made = Envelope.__new__(Envelope)
+    made._drives = SimpleNamespace(
+        description=SimpleNamespace(dictionary=SimpleNamespace(roles={}), has=lambda key: False)
+    )
+    made._axes = SimpleNamespace(is_armed=is_armed)
+    made._watch, made._watchdogs = SimpleNamespace(await_stop=nothing), SimpleNamespace(check_not_held=nothing)
+    made._commands = SimpleNamespace(check_write=lambda *arguments: done.append("checked"))
+    made._stops = SimpleNamespace(keep_ramps=lambda *arguments: done.append("ramps kept"), lends_ramps=lambda: False)
+    made._lending = SimpleNamespace(give_back=lambda axes: done.append("given back"))
+    made._drives.num_axes, made._of_further_axes = 1, {}
+    made._finds_live = lambda where: live
+    made._arm = lambda: done.append("armed")
+    return made, done
+
+
+@pytest.mark.parametrize(
+    ("index", "is_armed", "live", "done"),
+    [
+        (0x1FFF, False, True, ["checked"]),  # how a node talks
+        (0x2000, False, True, ["armed", "checked"]),  # somebody else has enabled the axis that it changes
+        (0x6081, False, True, ["armed", "checked"]),
+        (0x6081, False, False, ["checked"]),
+        (0x6081, True, True, ["checked", "ramps kept"]),
+        (0x60FF, False, False, ["checked", "armed"]),  # a set-point
+        (0x607A, False, False, ["checked", "armed"]),
+        (0x1010, True, True, ["checked", "ramps kept", "given back"]),  # what the drives store is their own
+        (0x1010, False, False, ["checked"]),
+    ],
+)
+def test_what_makes_ready_for_motion_before_it_is_written(index, is_armed, live, done):
+    envelope, found = envelope_of(is_armed, live)
+    envelope.before_write(SimpleNamespace(index=index, sub=0, label="it"), np.array([1]), np.array([True]))
+    assert found == done
+
+
+def test_of_what_was_played_the_last_row_is_what_the_drives_have():
+    envelope, found = envelope_of()
+    envelope._axes.everywhere = np.array([True, True])
+    envelope.after_write = lambda entry, raw, where: found.append((entry.index, raw.tolist(), where.tolist()))
+    envelope.after_failed_write = lambda entry: found.append(entry.index)
+    speed, word, none = (Entry(index, 0, "it", 32, "rw", None, None, 0, "", True) for index in (0x60FF, 0x6040, 0x607A))
+    played = {speed: np.array([[1, 2], [3, 4]]), none: np.empty((0, 2), np.int64), word: np.array([[6, 7]])}
+    envelope.after_play(played)
+    assert found == [(0x60FF, [3, 4], [True, True]), (0x6040, [6, 7], [True, True])]
+    found.clear()
+    envelope.after_failed_play(played)
+    assert found == [0x60FF, 0x607A, 0x6040]  # any of them may have been taken

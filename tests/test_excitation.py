@@ -76,6 +76,33 @@ def test_an_anti_resonance_gets_more():
     assert amplitude[20] == pytest.approx(3.0 * amplitude[19], rel=0.05)
 
 
+def test_the_current_of_a_rigid_axis_rises_with_the_frequency_and_towards_the_lowest():
+    """f over the highest, at least 0.4 of it, and 25 Hz over f; at 25 Hz and below as much as at the highest."""
+    amplitude = dimension(LINES, FLAT, 1.0 / LINES.f[:, None], np.array([5.0]), np.array([1e6]))[:, 0]
+    at = dict(zip(LINES.f.tolist(), amplitude / amplitude[-1], strict=True))
+    expected = {
+        5: 1.0,
+        20: 1.0,
+        25: 1.0,
+        30: 25 / 30,
+        50: 0.5,
+        65: 0.4,
+        100: 0.4,
+        160: 0.4,
+        165: 165 / 400,
+        200: 0.5,
+        395: 395 / 400,
+    }
+    assert {f: at[f] for f in expected} == pytest.approx(expected)
+    assert np.sqrt(0.5 * (amplitude**2).sum()) == pytest.approx(2.0)  # 5 A at a crest of 2.5
+
+
+def test_an_axis_that_does_not_answer_at_all_is_no_division_by_zero():
+    amplitude = dimension(LINES, 0.0 * FLAT, 0.0 * FLAT, np.array([5.0]), np.array([1.0]))
+    assert np.isfinite(amplitude).all()
+    assert not periodic("multisine", LINES, 0.0 * FLAT).any()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -112,3 +112,80 @@ def test_margins_are_read_where_they_are_least_of_several_crossings():
     off = (at(found.phase_hz) + 180.0 + 180.0) % 360.0 - 180.0
     assert off == pytest.approx(found.phase_deg, abs=0.5)
     assert -20.0 * np.log10(np.interp(found.gain_hz, f, np.abs(L))) == pytest.approx(found.gain_db, abs=0.05)
+
+
+# --- by hand, from a few frequencies ----------------------------------------------------------------------------------
+def closed_to_open(closed):
+    """The open loop of a closed one: T / (1 - T)."""
+    T = np.asarray(closed, complex)
+    return T / (1.0 - T)
+
+
+@pytest.mark.parametrize(
+    ("closed", "bandwidth"),
+    [
+        ([0.9, 0.9, 0.9, 0.9], math.nan),  # it has not fallen yet
+        ([0.5, 0.4, 0.3, 0.2], math.nan),  # it had before the first
+        ([0.9, 0.9, 0.5, 0.9], None),  # the first time counts
+        ([0.9, 0.9, 0.5, 0.3], None),
+        ([0.9, 0.9, math.sqrt(0.5) * (1 - 1e-9), 0.3], 4.0),
+        ([0.9, 0.9, math.sqrt(0.5) * (1 + 1e-9), 0.3], 4.0),  # just above there, and so right behind it
+    ],
+)
+def test_the_bandwidth_lies_on_a_straight_line_of_logarithms(closed, bandwidth):
+    f = np.array([1.0, 2.0, 4.0, 8.0])
+    if bandwidth is None:  # from 0.9 at 2 Hz to 0.5 at 4 Hz
+        bandwidth = 2.0 * 2.0 ** (math.log(0.9 / math.sqrt(0.5)) / math.log(0.9 / 0.5))
+    found = margins(f, closed_to_open(closed)).bandwidth_hz
+    assert found == pytest.approx(bandwidth, rel=1e-6, nan_ok=True)
+
+
+def test_the_bandwidth_is_read_between_frequencies_that_are_trusted():
+    f = np.array([1.0, 2.0, 3.0, 4.0, 8.0])
+    L = closed_to_open([0.9, 0.9, 0.1, 0.5, 0.3])
+    seen = margins(f, L, [True, True, False, True, True]).bandwidth_hz
+    assert seen == pytest.approx(margins(f[[0, 1, 3, 4]], L[[0, 1, 3, 4]]).bandwidth_hz)
+    nobody = margins(f, L, np.zeros(5, bool))
+    assert math.isnan(nobody.bandwidth_hz) and math.isnan(nobody.ms) and math.isnan(nobody.phase_deg)
+    assert math.isnan(margins(f, np.where(np.arange(5) == 0, np.nan, L)).bandwidth_hz) is False
+
+
+def test_a_crossover_lies_where_the_gains_logarithm_is_0_and_its_phase_there():
+    """From 4 at -100 degrees to 1/2 at -130 degrees: two thirds of the way, in logarithms."""
+    f = np.array([1.0, 8.0])
+    L = np.array([4.0, 0.5]) * np.exp(1j * np.radians([-100.0, -130.0]))
+    found = margins(f, L)
+    assert found.crossover_hz == pytest.approx(4.0)
+    assert found.phase_hz == found.crossover_hz and found.phase_deg == pytest.approx(60.0)
+    assert found.gain_db == math.inf and math.isnan(found.gain_hz)
+
+
+def test_a_gain_margin_lies_where_the_phase_is_minus_180_degrees():
+    """From -150 degrees to -210: half way, in logarithms of frequency; the gain there is 1/4."""
+    f = np.array([1.0, 2.0, 8.0])
+    L = np.array([2.0, 0.5, 0.125]) * np.exp(1j * np.radians([-140.0, -150.0, -210.0]))
+    found = margins(f, L)
+    assert found.gain_hz == pytest.approx(4.0) and found.gain_db == pytest.approx(20 * math.log10(4.0))
+    assert found.crossover_hz == pytest.approx(math.sqrt(2.0)) and found.phase_deg == pytest.approx(35.0)
+
+
+@pytest.mark.parametrize(
+    ("gains", "phases", "db"),
+    [
+        # Down with a gain of 5.7, up again with 2.8, and down with 0.7: only the last counts.
+        ([8, 4, 2, 0.25, 0.1], [-170, -190, -170, -190, -200], 20 * math.log10(math.sqrt(2.0))),
+        ([8, 4, 2, 0.5, 0.1], [-170, -190, -200, -200, -190], -20 * math.log10(math.sqrt(32.0))),  # unstable
+    ],
+)
+def test_a_loop_that_passes_minus_180_degrees_with_gain_and_comes_back_is_stable(gains, phases, db):
+    f = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    found = margins(f, np.array(gains) * np.exp(1j * np.radians(phases)))
+    assert found.gain_db == pytest.approx(db, abs=1e-6)
+
+
+def test_rows_have_one_dimension_and_two_frequencies():
+    for f, L in (([1.0], [1.0]), ([[1.0, 2.0]], [[1.0, 1.0]]), ([1.0, 1.0], [1.0, 1.0])):
+        with pytest.raises(ValueError, match=r"rows of one length|must be above 0 and increase"):
+            margins(f, L)
+    with pytest.raises(ValueError, match="rows of one length"):
+        margins([1.0, 2.0], [1.0, 1.0], [True])

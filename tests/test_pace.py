@@ -128,3 +128,123 @@ def test_in_lockstep_what_is_looked_at_does_not_depend_on_how_fast_this_computer
     link, samples, looked = Answering(), Answers(), []
     run_cycles(link, LockstepPace(), 5, None, samples, 1.0, observe=lambda first, last: looked.append((first, last)))
     assert looked == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+
+
+# --- cycles -----------------------------------------------------------------------------------------------------------
+class Line:
+    """A link, its outputs and its samples: a sample comes so many SYNCs late; `log` is what went out."""
+
+    def __init__(self, clock=None, delay=0, lost=()):
+        self.log, self.delay, self.lost, self.syncs, self.waits, self.clock = [], delay, set(lost), 0, [], clock
+
+    def send(self, row):
+        self.log.append(row)
+
+    def sync(self):
+        self.syncs += 1
+        self.log.append("SYNC")
+
+    def complete(self):
+        come = [k for k in range(max(self.syncs - self.delay, 0)) if k not in self.lost]
+        return next((k for k, row in enumerate(come) if row != k), len(come))
+
+    def receive(self, timeout=0.0):
+        if self.clock is not None:
+            self.clock.now += timeout
+        return False
+
+    def wait(self, done, timeout):
+        self.waits.append(timeout)
+        if not done():
+            self.delay = 0
+        return done()
+
+    def missing(self, rows, timeout):
+        return TimeoutError(f"{rows} SYNCs, {timeout} s")
+
+
+@pytest.mark.parametrize("cycles", [0, 1, 3])
+def test_a_row_goes_out_for_each_sync(cycles):
+    line = Line()
+    run_cycles(line, LockstepPace(), cycles, line, None, 1.0)
+    assert line.log == [what for k in range(cycles) for what in (k, "SYNC")]
+
+
+def test_samples_that_stay_out_are_an_error_with_the_syncs_so_far():
+    line = Line(lost=[1])
+    with pytest.raises(TimeoutError, match=r"^4 SYNCs, 0.25 s$"):
+        run_cycles(line, LockstepPace(), 4, None, line, 0.25)
+    assert line.syncs == 4 and line.waits == [0.25] * 4
+
+
+def test_no_more_syncs_than_the_window_go_out_before_their_samples_are_in():
+    """The first that is waited for is that of as many SYNCs ago as fit; at the end all of them are."""
+    line, needed = Line(delay=1000), []
+    line.wait = lambda done, timeout: needed.append(
+        next(k for k in range(100) if (setattr(line, "delay", line.syncs - k), done())[1])
+    ) or True  # fmt: skip
+    pace = LockstepPace()
+    run_cycles(line, pace, 20, None, line, 1.0)
+    assert needed == [0] * pace.window + [1, 2, 3] + [20]
+
+
+def test_each_row_is_looked_at_before_the_next_sync_where_time_waits():
+    line, looked = Line(), []
+    run_cycles(line, LockstepPace(), 3, line, line, 1.0, observe=lambda *rows: looked.append((*rows, line.syncs)))
+    assert looked == [(0, 1, 1), (1, 2, 2), (2, 3, 3)]
+    line, looked = Line(), []
+    run_cycles(line, LockstepPace(), 0, line, line, 1.0, observe=lambda *rows: looked.append(rows))
+    assert not looked
+
+
+def test_in_real_time_all_that_came_is_looked_at_once(clock):
+    line, looked = Line(clock, delay=1), []
+    run_cycles(line, RealTimePace(CYCLE), 4, None, line, 1.0, observe=lambda *rows: looked.append((*rows, line.syncs)))
+    assert looked == [(0, 1, 2), (1, 2, 3), (2, 4, 4)]
+
+
+@pytest.mark.parametrize(("cycles", "barriers"), [(15, 0), (16, 1), (40, 2)])
+def test_without_samples_the_nodes_catch_up_now_and_then(cycles, barriers):
+    line, held = Line(), []
+    run_cycles(line, LockstepPace(), cycles, None, None, 1.0, barrier=lambda: held.append(line.syncs))
+    assert held == [16 * (k + 1) for k in range(barriers)]
+
+
+@pytest.mark.parametrize(("skip_missed", "syncs"), [(False, 10), (True, 6)])
+def test_cycles_that_passed_while_a_sync_was_late_count_where_the_time_is_kept(clock, skip_missed, syncs):
+    line = Line(clock)
+    late = iter([0.0, 0.0, 0.0052, *[0.0] * 20])  # 4 whole cycles beyond the one that was due
+    pace = RealTimePace(CYCLE)
+    wait = pace.wait
+
+    def slow(receive):
+        clock.now += next(late)
+        return wait(receive)
+
+    pace.wait = slow
+    run_cycles(line, pace, 10, None, None, 1.0, skip_missed=skip_missed)
+    assert line.syncs == syncs
+
+
+def test_what_comes_without_end_is_taken_in_for_a_while():
+    taken = []
+    pace = LockstepPace()
+    assert pace.wait(lambda timeout: taken.append(timeout) or True) == 0
+    assert taken == [0.0] * module.MOST_FRAMES
+    assert (pace.timing, pace.total) == (Timing(1, 0, 0.0), Timing(1, 0, 0.0))
+    pace.begin()
+    assert (pace.timing, pace.total) == (Timing(0, 0, 0.0), Timing(1, 0, 0.0))
+    assert pace.end(taken.append) is None and len(taken) == module.MOST_FRAMES
+
+
+def test_a_run_ends_when_the_cycle_of_its_last_sync_has_passed(clock):
+    pace = RealTimePace(CYCLE)
+    pace.begin()
+    pace.wait(clock.receive)
+    begun = clock.now
+    pace.end(clock.receive)
+    assert clock.now == pytest.approx(begun + CYCLE)
+    clock.now += 0.4 * CYCLE  # half a cycle is no pause
+    pace.begin()
+    pace.wait(clock.receive)
+    assert clock.now == pytest.approx(begun + 1.4 * CYCLE)

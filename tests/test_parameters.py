@@ -6,7 +6,23 @@ import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
-from drive_env.master.parameters import NotRestoredError, RollbackError, compare, parameters, write_all_or_none
+from drive_env.devices import find_device
+from drive_env.dictionary.entries import Entry
+from drive_env.master.parameters import (
+    CommandObjectError,
+    Difference,
+    NotRestoredError,
+    RollbackError,
+    _in_order,
+    _pdo_of,
+    check_no_commands,
+    command,
+    compare,
+    list_differences,
+    parameters,
+    restorable,
+    write_all_or_none,
+)
 
 WANTED = {(0x6081, 0): 77, (0x2003, 0): 500, (0x6065, 0): 99}
 REFUSED = 0x06090030
@@ -93,3 +109,68 @@ def test_commands_and_services_are_no_parameters(drives):
     indices = {entry.index for entry in parameters(drives)}
     assert not indices & {0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60FF, 0x5FFF}
     assert {0x2003, 0x2042, 0x6081, 0x1400, 0x1A00} <= indices
+
+
+# --- the order of writes ----------------------------------------------------------------------------------------------
+OFF = 0x80000000  # bit 31 of a COB-ID (CiA 301)
+TPDO = {
+    (0x1800, 1): 0x181, (0x1800, 2): 255, (0x1800, 5): 0, (0x1A00, 0): 2, (0x1A00, 1): 0x60410010,
+    (0x1A00, 2): 0x60640020, (0x1A00, 3): 0,
+}  # fmt: skip
+EMPTY_AND_ON = [
+    ((0x1A00, 0), 0),
+    ((0x1A00, 1), 0x60410010),
+    ((0x1A00, 2), 0x60640020),
+    ((0x1A00, 0), 2),
+    ((0x1800, 1), 0x181),
+]
+
+
+@pytest.mark.parametrize(
+    ("changes", "written"),
+    [
+        ({(0x6081, 0): 5, (0x1017, 0): 7}, [((0x6081, 0), 5), ((0x1017, 0), 7)]),
+        # A transmission type is written while the PDO is off, and the mapping as it was.
+        ({(0x1800, 2): 1}, [((0x1800, 1), 0x181 | OFF), ((0x1800, 2), 1), *EMPTY_AND_ON]),
+        ({(0x1800, 1): 0x182}, [((0x1800, 1), 0x181 | OFF), *EMPTY_AND_ON[:-1], ((0x1800, 1), 0x182)]),
+        ({(0x1800, 1): 0x181 | OFF, (0x6081, 0): 5},
+         [((0x6081, 0), 5), ((0x1800, 1), 0x181 | OFF), *EMPTY_AND_ON[:-1], ((0x1800, 1), 0x181 | OFF)]),
+        ({(0x1A00, 0): 1}, [((0x1800, 1), 0x181 | OFF), ((0x1A00, 0), 0), ((0x1A00, 1), 0x60410010), ((0x1A00, 0), 1),
+                            ((0x1800, 1), 0x181)]),
+        # An entry beyond those in use is written if it changes.
+        ({(0x1A00, 3): 0x60770010}, [((0x1800, 1), 0x181 | OFF), *EMPTY_AND_ON[:3], ((0x1A00, 3), 0x60770010),
+                                     *EMPTY_AND_ON[3:]]),
+        ({(0x1801, 2): 1}, [((0x1801, 2), 1)]),  # of a PDO that is not there
+    ],
+)  # fmt: skip
+def test_a_pdo_is_switched_off_and_emptied_then_filled_then_switched_on(changes, written):
+    assert list(_in_order(changes, TPDO)) == written
+
+
+@pytest.mark.parametrize(("index", "base"), [
+    (0x1400, 0x1400), (0x15FF, 0x15FF), (0x1600, 0x1400), (0x17FF, 0x15FF), (0x1800, 0x1800), (0x19FF, 0x19FF),
+    (0x1A00, 0x1800), (0x1BFF, 0x19FF), (0x13FF, None), (0x1C00, None), (0x6041, None),
+])  # fmt: skip
+def test_which_pdo_an_object_belongs_to(index, base):
+    assert _pdo_of(index) == base
+
+
+def test_differences_are_told_up_to_the_fifth():
+    entries = [Entry(0x2000 + k, 0, "it", 8, "rw", 0, 9, 0, "", False) for k in range(7)]
+    rows = [Difference(entry, 2, k) for k, entry in enumerate(entries)]
+    assert list_differences(rows[:1]) == "2000h:00 it is 0, not 2"
+    assert list_differences(rows[:5]).count("not 2") == 5 and "more" not in list_differences(rows[:5])
+    assert list_differences(rows).endswith("2004h:00 it is 4, not 2 and 2 more")
+
+
+def test_commands_of_further_axes_are_commands_and_what_makes_a_node_mute_is_never_written_back():
+    hints = find_device("tmcm1636").master
+    assert command(0x6840, hints) == command(0x6040, hints) == "controlword: a command"
+    assert command(0x1010, hints) == "store: a service" and command(0x6081, hints) == ""
+    with pytest.raises(
+        CommandObjectError, match=r"f holds objects that are not parameters: 6040h .* 60FFh .*Nothing was"
+    ):
+        check_no_commands([(0x6040, 0), (0x6081, 0), (0x60FF, 0), (0x6040, 0)], "f", hints)
+    check_no_commands([(0x6081, 0)], "f", hints)
+    address = next(iter(hints.addresses))
+    assert restorable({(address, 0): 1, (0x6081, 0): 2}, hints) == {(0x6081, 0): 2}

@@ -8,7 +8,7 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from drive_env.commands.scope import write_table
 from drive_env.dictionary.entries import Entry
-from drive_env.envs.randomisation import Distributions
+from drive_env.envs.randomisation import Distributions, Law
 from drive_env.trials import replay as module
 from drive_env.trials.replay import Log, _candidates, command_of, compare, fit, read_log, replay
 
@@ -268,3 +268,154 @@ def test_a_fit_draws_its_next_round_around_the_best_tenth(monkeypatch):
 def test_a_fit_never_draws_around_fewer_than_four(monkeypatch):
     second = rounds_of_a_fit(monkeypatch, accept=1e-9, rounds=2)[1][:, 0]
     assert second.std() == pytest.approx(np.sqrt(3.0) * 4 / 200 / np.sqrt(12.0), rel=0.5)
+
+
+# --- parts of it --------------------------------------------------------------------------------------------------
+def rows_of(times, values=None):
+    values = range(len(times)) if values is None else values
+    return "t [s],6064h:00 P\n" + "".join(f"{t!r},{v}\n" for t, v in zip(times, values, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([k * 1e-3 for k in range(10)], None),
+        ([k * 1e-3 for k in range(9)], "at least 10 lines of 2 values each"),
+        ([1e7 - 0.009 + k * 1e-3 for k in range(9)] + [1e7], None),
+        ([k * 1e-3 for k in range(10)] + [2e7], r"line 12 has the time 2e\+07 s; times must lie within 1e\+07 s of 0"),
+        ([-2e7] + [k * 1e-3 for k in range(10)], r"line 2 has the time -2e\+07 s"),
+        ([k * 1e-3 for k in range(10)] + [float("nan")] * 2, "line 12 has the time nan s"),
+        ([k * 3e-3 for k in range(10)], None),
+        ([k * 1.5e-3 for k in range(10)], "must increase by the same whole number of milliseconds"),
+        ([k * 0.4e-3 for k in range(10)], "must increase by the same whole number"),
+        ([-k * 1e-3 for k in range(10)], "must increase by the same whole number"),
+        ([k * 1e-3 + (0.0004 if k == 5 else 0.0) for k in range(10)], "must increase by the same"),
+        ([k * 1e-3 + (0.0002 if k == 5 else 0.0) for k in range(10)], None),  # the clock of a bus
+    ],
+)
+def test_times_go_on_by_whole_milliseconds(tmp_path, times, message):
+    path = tmp_path / "log.csv"
+    path.write_text(rows_of(times), encoding="utf-8")
+    if message is None:
+        assert read_log(path).t.tolist() == pytest.approx(times)
+        return
+    with pytest.raises(ValueError, match=message):
+        read_log(path)
+
+
+@pytest.mark.parametrize("line", ["0.010,1,2", "0.010", "", "0.010,99999999999999999999"])
+def test_a_line_of_another_length_or_a_number_that_no_drive_has_is_told(tmp_path, line):
+    path = tmp_path / "log.csv"
+    path.write_text(rows_of([k * 1e-3 for k in range(10)]) + line + "\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"every line needs a time and 1 whole numbers|at least 10 lines"):
+        read_log(path)
+
+
+@pytest.mark.parametrize(("step", "every"), [(0.001, 1), (0.002, 2), (0.0004, 1), (0.02, 20)])
+def test_how_many_cycles_lie_between_two_samples(step, every):
+    assert Log(np.arange(10) * step, {POSITION: np.zeros((10, 1), int)}).every == every
+
+
+def a_log(**objects):
+    names = {"demand": DEMAND, "target": TARGET, "speed": SPEED, "torque": TORQUE, "velocity": VELOCITY}
+    found = {names[name]: np.asarray(values)[:, None] for name, values in objects.items()}
+    return Log(np.arange(len(next(iter(found.values())))) * 1e-3, found)
+
+
+PATH, JUMP = np.arange(20), np.where(np.arange(20) < 10, 0, 19)
+
+
+@pytest.mark.parametrize(
+    ("objects", "expected"),
+    [
+        ({"target": PATH, "demand": PATH, "speed": PATH}, (DEMAND, "csp", TARGET)),
+        ({"speed": JUMP, "target": PATH, "torque": PATH}, (TARGET, "csp", TARGET)),
+        ({"target": JUMP, "speed": JUMP, "torque": PATH}, (SPEED, "csv", SPEED)),  # the target of a profile
+        ({"target": JUMP, "torque": JUMP}, (TORQUE, "cst", TORQUE)),
+        ({"target": 0 * PATH + 7, "speed": PATH}, (TARGET, "csp", TARGET)),  # it stays: nothing jumps
+        ({"target": np.array([0, 4, 8] * 5), "speed": PATH}, (SPEED, "csv", SPEED)),
+        ({"target": np.array([0, 3, 6, 9, 10]), "speed": PATH[:5]}, (TARGET, "csp", TARGET)),
+        ({"target": np.array([0, 5, 10]), "speed": PATH[:3]}, (SPEED, "csv", SPEED)),  # half of it at once
+    ],
+)
+def test_which_object_of_a_log_is_the_command(objects, expected):
+    assert command_of(a_log(**objects)) == expected
+
+
+@pytest.mark.parametrize(("first", "begins"), [(0, True), (10, True), (-10, True), (11, False), (-11, False)])
+def test_a_tenth_of_the_speeds_range_is_rest(first, begins):
+    velocity = np.clip(np.arange(20) * 10, 0, 100) if first >= 0 else -np.clip(np.arange(20) * 10, 0, 100)
+    velocity[:2] = first, 0
+    log = a_log(torque=PATH, velocity=velocity)
+    if begins:
+        assert command_of(log)[1] == "cst"
+        return
+    with pytest.raises(ValueError, match="begins in the middle of a move"):
+        command_of(log)
+
+
+def test_positions_between_samples_lie_on_a_line_and_stay_after_the_last():
+    rows = module._between(np.array([[0, 100], [10, 90], [11, 90]]), 4)
+    assert rows.tolist() == [
+        [0, 100], [2, 98], [5, 95], [8, 92], [10, 90], [10, 90], [10, 90], [11, 90], *[[11, 90]] * 4
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("rows", "period"), [(12, 0.001), (300, 0.001), (40, 0.05)])
+def test_a_shift_is_looked_for_within_20_ms_and_a_quarter_of_the_log(rows, period):
+    """A response that is later than that is told with the longest one."""
+    wave = np.arange(rows, dtype=float)[:, None]
+    reach = min(max(1, int(0.02 / period + 1e-9)), rows // 4)
+    shift, rest = module._best_shift(wave, (wave - 3 * reach)[:, None, :], np.ones(1), period)
+    assert shift == pytest.approx(reach * period) and rest == pytest.approx(2.0 * reach)
+    shift, rest = module._best_shift(wave, (wave + 0.3)[:, None, :], np.ones(1), period)
+    assert shift == pytest.approx(-0.3 * period) and rest == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_cannot_be_is_no_candidate():
+    """All machines are set at once; where one cannot have it, each by itself."""
+    tried = []
+
+    def set_all(values, where=None):
+        tried.append(where)
+        if where is None or np.any(values["load.inertia"][where] > 2.5):
+            raise ValueError("too much")
+
+    drives = SimpleNamespace(num_machines=4, machine=SimpleNamespace(set_all=set_all))
+    assert module._give(drives, {"load.inertia": np.array([1.0, 3.0, 2.0, 4.0])}).tolist() == [True, False, True, False]
+    assert len(tried) == 5
+    drives.machine.set_all = lambda values, where=None: None
+    assert module._give(drives, {}).tolist() == [True] * 4
+
+
+@pytest.mark.parametrize("best", [0.0, 0.5])
+def test_what_was_accepted_is_the_range_of_its_middle_nine_tenths(best):
+    laws = Distributions({"a": Law("uniform", True, 0.5, 1.5), "b": Law("loguniform", False, 1.0, 100.0)})
+    shares = np.stack([np.linspace(0.0, 1.0, 101), np.linspace(0.4, 0.6, 101)], axis=1)
+    found = module._result(laws, ["a", "b"], {"a": 2.0, "b": 7.0}, shares, best + np.linspace(0.0, 1.0, 101), 9.0)
+    assert found.narrowed == {"a": pytest.approx(1.0), "b": pytest.approx(0.2)}
+    assert (found.is_seen("a"), found.is_seen("b")) == (False, True)
+    assert found.distributions.laws["a"] == laws.laws["a"]
+    law = found.distributions.laws["b"]
+    assert (law.law, law.relative) == ("loguniform", False)
+    assert (law.low, law.high) == (pytest.approx(100**0.41), pytest.approx(100**0.59))
+    np.testing.assert_allclose(found.accepted["a"], 2.0 * np.linspace(0.5, 1.5, 101))
+    text = found.to_toml()
+    assert "# a: 100 % of the range given: the log does not determine it" in text
+    assert "# b: 20 % of the range given\n" in text
+    assert f"nominal machine 9.0000, best {best:.4f}, worst accepted {best + 1:.4f} of 101." in text
+
+
+def test_a_range_relative_to_the_machines_own_stays_so():
+    laws = Distributions({"a": Law("uniform", True, 0.5, 1.5)})
+    shares = np.linspace(0.2, 0.4, 101)[:, None]
+    law = module._result(laws, ["a"], {"a": 2.0}, shares, np.ones(101), 1.0).distributions.laws["a"]
+    assert (law.law, law.relative) == ("uniform", True)
+    assert (law.low, law.high) == (pytest.approx(0.71), pytest.approx(0.89))
+
+
+@pytest.mark.parametrize("narrowed", [0.8, 0.79])
+def test_from_four_fifths_of_its_range_on_a_parameter_is_not_determined(narrowed):
+    laws = Distributions({"a": Law("uniform", False, 0.0, 1.0)})
+    found = module.LogFit(laws, {}, np.ones(1), 1.0, {"a": narrowed})
+    assert found.is_seen("a") == (narrowed < 0.8)

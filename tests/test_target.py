@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -18,9 +19,10 @@ from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import refused
+from drive_env.motors import find_motor
 from mechanics.loads import LOADS
 from tuning.commands.options import TargetOptions, errors_as_exit_codes, open_target, parse_travel
-from tuning.target import FREE, emulated, on_bus, timed
+from tuning.target import FREE, Target, emulated, on_bus, timed
 
 TURN = 2.0 * math.pi
 
@@ -198,3 +200,72 @@ def test_errors_end_with_a_line_and_their_code(errors_as_exit_codes, error, code
 def test_a_mistake_of_ours_keeps_its_traceback():
     with pytest.raises(NotImplementedError), errors_as_exit_codes():
         raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("travel", "message"), [((1.0, 2.0), "must contain 0"), (((-1.0, 1.0),) * 2, "ranges of travel")]
+)
+def test_drives_of_a_bus_that_make_no_target_are_closed(travel, message, monkeypatch):
+    """Whoever opened them has nothing to close them by."""
+    closed = []
+    drives = SimpleNamespace(
+        num_axes=1, device=find_device("tmcm1636"), close=lambda: closed.append(1), safety=None,
+        read=lambda name: np.array([65536]),
+    )  # fmt: skip
+    monkeypatch.setattr("drive_env.master.open_drives.open_drives", lambda *arguments, **options: drives)
+    with pytest.raises(ValueError, match=message):
+        on_bus(channel="nowhere", travel=travel, safety=False)
+    assert closed == [1]
+    target = on_bus(
+        channel="nowhere", travel=(-1.0, 2.0), safety=False, nodes=(7,), bitrate=500_000, token="x", pace="lockstep"
+    )
+    assert closed == [1] and (target.low, target.high, target.linked, target.axes_per_machine) == (-1.0, 2.0, False, 1)
+    assert target.machine == "nowhere, node 7"
+    assert target.bus == {"channel": "nowhere", "nodes": [7], "bitrate": 500_000, "pace": "lockstep"}
+    target.close()
+    assert closed == [1, 1]
+
+
+@pytest.mark.parametrize("linked", [False, True])
+def test_axes_that_pull_at_one_thing_move_together(linked):
+    zero = np.zeros(4)
+    target = Target(
+        SimpleNamespace(num_axes=4), find_device("tmcm1636"), find_motor("qbl4208"), supply=zero + 24.0, low=zero - 1.0,
+        high=zero + 1.0, speed=10.0, current=1.0, axes_per_machine=2, linked=linked,
+    )  # fmt: skip
+    where = np.array([False, True, False, False])
+    assert target.together(where).tolist() == ([True, True, False, False] if linked else where.tolist())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"low": [0.0], "high": [0.0]},
+            "axis 0: travel 0 to 0 rad must contain 0, where the rotor is now, and must not be",
+        ),
+        ({"low": [0.1]}, "axis 0: travel 0.1 to 1 rad"),
+        ({"high": [-0.1]}, "axis 0"),
+        ({"low": [0.0]}, None),
+        ({"high": [0.0]}, None),
+        ({"low": [-np.inf], "high": [np.inf]}, None),
+        ({"low": [np.nan]}, "axis 0"),
+        ({"supply": [8.0]}, "supply 8 V lies outside"),
+        ({"supply": [100.0]}, "supply 100 V lies outside"),
+        ({"supply": [np.nan]}, "supply nan V"),
+        ({"supply": [24.0, 24.0]}, r"supply must have shape \(1,\), not \(2,\)"),
+        ({"speed": 0.0}, "speed 0 rad/s must be above 0 and finite"),
+        ({"speed": np.inf}, "speed inf"),
+        ({"current": 0.0}, "current 0 A must be above 0"),
+        ({"current": -1.0}, "current -1 A"),
+    ],
+)
+def test_limits_of_a_target(change, message):
+    given = {"supply": [24.0], "low": [-1.0], "high": [1.0], "speed": 10.0, "current": 1.0} | change
+    given = {name: np.array(value) if isinstance(value, list) else value for name, value in given.items()}
+    drives = SimpleNamespace(num_axes=1)
+    if message is None:
+        Target(drives, find_device("tmcm1636"), find_motor("qbl4208"), **given)
+        return
+    with pytest.raises(ValueError, match=message):
+        Target(drives, find_device("tmcm1636"), find_motor("qbl4208"), **given)

@@ -17,6 +17,7 @@ from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, counts_per_ampere
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import Observer
 from drive_env.drives.speeds import per_increment
@@ -75,8 +76,9 @@ class DriveAudit(Observer):
         self._slack = SLACK * scaler
         limit = target.speed * scaler / (2.0 * np.pi)
         counts = per_increment(drives, cia402.VELOCITY_ACTUAL)
+        self._ampere = ampere_per_count(drives)
         self._fastest = OVERSPEED * limit * counts
-        self._counter = MoveCounter(limit, target.current * 1e3, counts)
+        self._counter = MoveCounter(limit, target.current * counts_per_ampere(drives), counts)
         self._rated = target.motor.rated_current
         self._outside: Mask = np.zeros((len(KINDS), count), bool)
         self._last_current = np.zeros(count)
@@ -109,7 +111,7 @@ class DriveAudit(Observer):
         moved = self._counter.passed(round(duration / CYCLE), rows)
         self.seconds[moved] = self.elapsed
         self._watch(trace)
-        current = np.asarray(trace[cia402.TORQUE_ACTUAL], float) * 1e-3
+        current = np.asarray(trace[cia402.TORQUE_ACTUAL], float) * self._ampere
         if play:  # what is played is to shake the axis
             self._shaken[:] = 0
             self._squares[:], self._in_block, self._last_current = 0.0, 0, current[-1]

@@ -35,14 +35,14 @@ class MoveCounter:
 
     Args:
         speed: Fastest that axes may be turned [inc/s], shape (num_axes,).
-        current: Most that may be asked for [mA].
+        current: Most that may be asked for, in counts of a torque.
         per_increment: Counts of a speed per increment a second.
 
     Attributes:
         moves: Of each axis so far, (num_axes,).
     """
 
-    def __init__(self, speed: Floats, current: float, per_increment: Floats | float = 1.0) -> None:
+    def __init__(self, speed: Floats, current: Floats | float, per_increment: Floats | float = 1.0) -> None:
         count = len(speed)
         self.moves = np.zeros(count, np.int64)
         self._slow: dict[Key, Floats] = {

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
@@ -55,6 +56,7 @@ class OscillationWatch(Observer):
         self._where = where
         self.limit = limit
         self._least = CLEAR * noise
+        self._ampere: Floats | float | None = None  # of a count of the current
         self._shaken: Floats | None = None  # most current meanwhile [A RMS]
         self._window: list[Floats] = []  # currents since the last look, the one before it among them
         self.swung: Mask = np.zeros(len(where), bool)
@@ -72,7 +74,9 @@ class OscillationWatch(Observer):
         play: Mapping[ObjectName, ArrayLike] | None,
     ) -> None:
         """Look at the currents, and switch off what oscillates."""
-        self._look(below, np.asarray(trace[cia402.TORQUE_ACTUAL], float) * 1e-3)
+        if self._ampere is None:
+            self._ampere = ampere_per_count(below)
+        self._look(below, np.asarray(trace[cia402.TORQUE_ACTUAL], float) * self._ampere)
 
     @contextmanager
     def shaken(self, current: Floats) -> Iterator[None]:

@@ -16,6 +16,7 @@ from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import bus_of
 
 if TYPE_CHECKING:
@@ -283,7 +284,8 @@ def _envelope(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _limits(target: Target, axis: int) -> Iterator[Check]:
-    amperes, (index, _) = _read(target, Role.CURRENT_LIMIT, axis) * 1e-3, target.device.roles[Role.CURRENT_LIMIT]
+    ampere = float(np.broadcast_to(ampere_per_count(target.drives), target.num_axes)[axis])
+    amperes, (index, _) = _read(target, Role.CURRENT_LIMIT, axis) * ampere, target.device.roles[Role.CURRENT_LIMIT]
     text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded during identification"
     if amperes <= 0.0:
         yield Check("limits", NO, f"{text}; the drive's limit {index:04X}h is 0 A: set it to the motor's peak current")
@@ -319,7 +321,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     here = target.drives.read(cia402.POSITION_ACTUAL)
     finite = all(np.isfinite(end).all() for end in ends)
     way = f"{round(float(np.min(here + ends[0])))}...{round(float(np.max(here + ends[1])))}" if finite else "any"
-    amperes = round(1e3 * target.current)
+    amperes = int(np.max(to_counts(target.drives, target.current)))
     for gain in target.device.gains.rows:
         yield gain.key, f"1...{gain.highest}", f"gain on trial, {gain.title}", True
     yield (cia402.CONTROLWORD, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, reset a fault", False

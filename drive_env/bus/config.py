@@ -6,12 +6,15 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from drive_env.bus.faults import Faults
 from drive_env.bus.wire import BIT_RATE, Wire
 from drive_env.bus.world import World
 from mechanics.untrusted import read_toml
+
+if TYPE_CHECKING:  # MuJoCo takes long to import
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
 NO_MOTOR = "none"  # no machine is without one
 
@@ -92,31 +95,45 @@ def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
     Raises:
         BusConfigError: If it cannot be.
     """
-    from drive_env.emulator.emulated_drives import EmulatedDrives
-
-    if bus.seed < 0:
-        raise BusConfigError(f"seed = {bus.seed} must be 0 or more")
+    check_seed(bus)
     try:
         wire = Wire(bus.bit_rate, instant=lockstep or not own_wire, faults=bus.faults, seed=bus.seed)
         world = World(lockstep=lockstep, wire=wire)
-        store = None if bus.store is None else _folder(Path(bus.store))
+        store = store_folder(bus)
         for k, row in enumerate(bus.machines):
-            if row.motor == NO_MOTOR:
-                raise ValueError(
-                    "motor none: every machine has a motor; name it, and for a drive with factory values add --factory "
-                    "(in a file: commissioned = false)"
-                )
-            drives = EmulatedDrives(
-                row.device, row.load, row.motor, commissioned=row.commissioned, seed=bus.seed, first_machine=k,
-                ideal=row.ideal, parameters=row.parameters, num_threads=1,
-            )  # fmt: skip
-            world.add(drives, row.nodes, store)
+            world.add(build_drives(bus, k), row.nodes, store)
     except (ValueError, OSError) as error:
         raise BusConfigError(str(error)) from None
     return world
 
 
-def _folder(path: Path) -> Path:
+def build_drives(bus: Bus, k: int) -> EmulatedDrives:
+    """Return the emulated drives of machine `k` of a bus; ValueError if they cannot be."""
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
+    row = bus.machines[k]
+    if row.motor == NO_MOTOR:
+        raise ValueError(
+            "motor none: every machine has a motor; name it, and for a drive with factory values add --factory "
+            "(in a file: commissioned = false)"
+        )
+    return EmulatedDrives(
+        row.device, row.load, row.motor, commissioned=row.commissioned, seed=bus.seed, first_machine=k,
+        ideal=row.ideal, parameters=row.parameters, num_threads=1,
+    )  # fmt: skip
+
+
+def check_seed(bus: Bus) -> None:
+    """Raise BusConfigError for a seed that cannot be."""
+    if bus.seed < 0:
+        raise BusConfigError(f"seed = {bus.seed} must be 0 or more")
+
+
+def store_folder(bus: Bus) -> Path | None:
+    """Return the folder in which nodes keep what is saved, made where it was not; None: nodes keep it themselves."""
+    if bus.store is None:
+        return None
+    path = Path(bus.store)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

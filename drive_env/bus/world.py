@@ -108,7 +108,7 @@ class World:
                 f"{drives.device.name}, which drives {per_node} axes; {len(node_ids)} node identifiers were given"
             )
         left_over = needed * per_node - drives.num_axes
-        spare = _without_motors(drives, left_over) if left_over else None
+        spare = without_motors(drives, left_over) if left_over else None
         nodes: list[Node] = []
         for k, given in enumerate(node_ids):
             is_new = given == UNCONFIGURED and drives.device.canopen.services.lss
@@ -306,7 +306,7 @@ class World:
             self.nodes[sender].bus_off(self.time)
 
 
-def _without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
+def without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
     """Return as many axes of the same device as nobody has commissioned and no motor is connected to."""
     open_phases = {"motor.open_a": 1.0, "motor.open_b": 1.0}
     return EmulatedDrives(

@@ -1,45 +1,29 @@
-"""The objects that belong to the module and not to an axis: 1000h to 1FFFh, bit rate, node ID, boot loader.
-
-Each write is checked by the rule of its object before it changes anything; whoever owns the service behind an object is
-notified of the change.
-"""
+"""The objects of CANopen's communication, 1005h to 1FFFh, and the rule that a write of each keeps."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cache
-from pathlib import Path
-
-import numpy as np
+from collections.abc import Callable
+from functools import partial
 
 from drive_env.canopen import frames
 from drive_env.devices import Device
 from drive_env.devices.services import NodeQuirks, NodeServices
 from drive_env.dictionary.aborts import INCOMPATIBLE_PARAMETER, VALUE_RANGE, WRONG_STATE, ObjectAccessError
-from drive_env.dictionary.access import check_allowed, check_limits
-from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
-from drive_env.emulator.live_dictionary import check_supported
+from drive_env.dictionary.entries import Entry
 from drive_env.node import mapping
-from drive_env.node.axis import ObjectPort
-
-Key = tuple[int, int]
+from drive_env.node.node_objects import NodeObjects
 
 SYNC_ID = 0x1005
 SYNC_PERIOD = 0x1006
 SYNC_WINDOW = 0x1007
-ERROR_HISTORY = 0x1003
-ERROR_REGISTER = 0x1001
 GUARD_TIME = 0x100C
 LIFE_TIME_FACTOR = 0x100D
-STORE = 0x1010
-RESTORE = 0x1011
 TIME_ID = 0x1012
 TIME_STAMP = 0x1013
 EMERGENCY_ID = 0x1014
 EMERGENCY_INHIBIT = 0x1015
 CONSUMER_HEARTBEAT = 0x1016
 PRODUCER_HEARTBEAT = 0x1017
-IDENTITY = 0x1018
 SYNC_OVERFLOW = 0x1019
 STORE_EDS = 0x1021
 ERROR_BEHAVIOUR = 0x1029
@@ -52,84 +36,8 @@ TO_MAPPING = 0x200  # from a PDO's communication parameter to its mapping
 CYCLE_US = 1000  # a node does what it does by itself once in a communication cycle
 
 
-@cache
-def _factory(path: Path | EdsText, node_id: int) -> dict[Key, int | str]:
-    return {(entry.index, entry.sub): entry.default for entry in ObjectDictionary(path, node_id)}
-
-
-class ModuleObjects:
-    """Values of the module's objects.
-
-    Args:
-        device: Whose they are.
-        entries: Its dictionary.
-        changed: Told the index of an object that was written.
-    """
-
-    def __init__(self, device: Device, entries: ObjectDictionary, changed: Callable[[int], None]) -> None:
-        self._device = device
-        self._entries = entries
-        self._changed = changed
-        self._own = set(device.canopen.objects.values())
-        factory = _factory(entries.path, 1)
-        self._values: dict[Key, int | str] = {key: factory[key] for key in self._own}
-        # Objects whose value comes from a service, and those whose write is a command that stores no value.
-        self.readers: dict[Key, Callable[[], int | str]] = {}
-        self.commands: dict[Key, Callable[[int], None]] = {}
-
-    def owns(self, entry: Entry) -> bool:
-        """Return whether an object is the module's."""
-        return 0x1000 <= entry.index <= 0x1FFF or (entry.index, entry.sub) in self._own
-
-    def restore(self, node_id: int, stored: Mapping[Key, int]) -> None:
-        """Give the communication objects the values of a node that starts: the stored ones, else the factory's."""
-        factory = self.factory(node_id)
-        for entry in self._entries:
-            if 0x1000 <= entry.index <= 0x1FFF:
-                key = (entry.index, entry.sub)
-                self._values[key] = stored.get(key, factory[key])
-
-    def factory(self, node_id: int) -> Mapping[Key, int | str]:
-        """Return the factory's values of all objects, of the axes too; COB-IDs follow the node ID."""
-        return _factory(self._entries.path, node_id)
-
-    def set(self, role: str, raw: int | str) -> None:
-        """Set an object of the module by the role that the device's data gives it."""
-        self._values[self._device.canopen.objects[role]] = raw
-
-    def value(self, index: int, sub: int = 0) -> int:
-        """Return a number; 0 of an object that this device does not have."""
-        raw: int | str = self._values.get((index, sub), 0)
-        assert isinstance(raw, int), "a text is not a number"
-        return raw
-
-    def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to one of these objects."""
-        key = (entry.index, entry.sub)
-        values = self._values
-        read: Callable[[], int | str] = self.readers.get(key) or (lambda: values[key])
-        if key in self.commands:
-            command = self.commands[key]
-            return ObjectPort(entry, read, lambda raw: check_limits(entry, raw), command)
-        check = _rule(entry.index)
-
-        def write(raw: int) -> None:
-            values[key] = raw | self._fixed(entry)
-            self._changed(entry.index)
-
-        def checked(raw: int) -> None:
-            check_limits(entry, raw)
-            check_supported(self._device, entry)
-            # A device's data name the PDOs of the first axis; those of the others take the same values.
-            allowed = self._device.allowed_values.get((self._device.locate(entry.index)[1], entry.sub))
-            if allowed is not None:
-                check_allowed(entry, np.array([raw]), allowed)
-            if check is not None:
-                check(self, entry, raw)
-
-        if entry.bits is None:
-            return ObjectPort(entry, read, checked, write, "", lambda text: values.update({key: text}))
-        return ObjectPort(entry, read, checked, write)
+class ModuleObjects(NodeObjects):
+    """Values of the module's objects: those of a node, with the rules of CANopen."""
 
     @property
     def services(self) -> NodeServices:
@@ -141,29 +49,15 @@ class ModuleObjects:
         """Where the device differs from the standard."""
         return self._device.canopen.quirks
 
+    def _rule(self, entry: Entry) -> Callable[[int], None] | None:
+        rule = _rule(entry.index)
+        return None if rule is None else partial(rule, self, entry)
+
     def _fixed(self, entry: Entry) -> int:
         """Return the bits that are set whatever is written: bit 30 of a PDO's COB-ID, where the factory's has it."""
         if not is_pdo_id(entry) or (entry.index in RPDO and self.quirks.rpdo_bit_30 == "store"):
             return 0
         return self.factory_value(entry) & frames.NO_REMOTE
-
-    def factory_value(self, entry: Entry) -> int:
-        """Return the factory's number of an object, with node 1's COB-IDs."""
-        raw = self.factory(1)[entry.index, entry.sub]
-        assert isinstance(raw, int), "a text is not a number"
-        return raw
-
-    def find(self, index: int, sub: int) -> Entry:
-        """Return an entry of the device's dictionary; 06020000h or 06090011h if there is none."""
-        return self._entries.find((index, sub))
-
-    def has(self, index: int) -> bool:
-        """Return whether the device has an object."""
-        return (index, 0) in self._values
-
-    def subs(self, index: int) -> list[int]:
-        """Return the sub-indices above 0 of an object."""
-        return [entry.sub for entry in self._entries if entry.index == index and entry.sub > 0]
 
 
 # --- rules ------------------------------------------------------------------------------------------------------------
@@ -305,7 +199,7 @@ def _rule(index: int) -> Rule | None:
     return next((rule for indices, rule in _RULES if index in indices), None)
 
 
-# --- commands and bit rates -------------------------------------------------------------------------------------------
+# --- bit rates -------------------------------------------------------------------------------------------
 def known_bit_rate(device: Device, bit_rate: int) -> int:
     """Return a bit rate [bit/s] as 2704h counts it [kbit/s]; ValueError if the device does not have it.
 
@@ -317,14 +211,3 @@ def known_bit_rate(device: Device, bit_rate: int) -> int:
         rates = ", ".join(str(1000 * rate) for rate in known)
         raise ValueError(f"{device.name} has no bit rate of {bit_rate} bit/s; it has {rates}")
     return bit_rate // 1000
-
-
-def signed_command(signature: int, code: int, action: Callable[[], None]) -> Callable[[int], None]:
-    """Return a command that acts only on the right signature."""
-
-    def command(raw: int) -> None:
-        if raw != signature:
-            raise ObjectAccessError(code, f"{raw:08X}h is not the signature {signature:08X}h")
-        action()
-
-    return command

@@ -9,14 +9,12 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from drive_env.canopen import communication, frames, lss, nmt, time_of_day
-from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signed_command
+from drive_env.canopen.communication import ModuleObjects, known_bit_rate
 from drive_env.canopen.emergency import EPSILON, EmergencyProducer
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
@@ -26,20 +24,19 @@ from drive_env.canopen.nmt import Command, NmtState
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.canopen.sync import SyncProducer, SyncWindow
 from drive_env.canopen.time_of_day import Clock, TimeProducer
-from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
-from drive_env.dictionary.access import check_limits
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, VALUE_RANGE, ObjectAccessError
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.firmware.common.protection import CUT, STOP
-from drive_env.node.axis import Axis, QueuedEmergency
-from drive_env.node.error_history import CONDITIONS, OPTIONAL_CONDITIONS, ErrorCondition, ErrorHistory
+from drive_env.node.node_axes import NodeAxes
 from drive_env.node.node_dictionary import NodeDictionary
+from drive_env.node.node_errors import NodeErrors
+from drive_env.node.node_objects import ERROR_HISTORY, IDENTITY, signed_command
+from drive_env.node.parameters import Parameters
 from drive_env.node.sdo_server import SdoServer
-from drive_env.node.store import PowerLostError, Section, Store
+from drive_env.node.store import PowerLostError, Store
 
 logger = logging.getLogger(__name__)
 
 COMMUNICATION_ERROR, APPLICATION_ERROR = 1, 2  # sub-indices of 1029h
-FAULT_RESET = 0  # row of the firmware's causes
 SEGMENT_BITS = 135  # of a frame of eight bytes with its stuff bits
 # Section of the store, and its keys, of what LSS has stored; there is no object of index 0.
 LSS_SECTION, LSS_NODE_ID, LSS_BIT_RATE = "lss", (0, 1), (0, 2)
@@ -115,14 +112,22 @@ class Node:
         self._now = 0.0
         self._is_online = False
         self._leaves_for_bootloader = False
-        self._take_axes(drives, first_axis, spare)
+        self._axes = NodeAxes(drives, first_axis, spare)
         entries = self._objects.entries
         self._module = ModuleObjects(device, entries, self._configure)
-        self._add_services()
         self.dictionary = NodeDictionary(device, entries, self._module, self._axes)
         self._store = Store(store, device.name)
-        self._check_store(store)
-        self._prepare_restart()
+        self._parameters = Parameters(
+            device, self._module, self._axes, self.dictionary, self._store, lambda: self.node_id, self._works_on_store
+        )
+        self._parameters.replaces["bus"] = LSS_SECTION
+        self._emergency = EmergencyProducer(self._transmit, device.num_axes)
+        depth = len(self._module.subs(ERROR_HISTORY))
+        react = partial(self._react, APPLICATION_ERROR)
+        self._errors = NodeErrors(device, self._axes, depth, self._emergency, self._flush, react)
+        self._add_services()
+        self._parameters.check(store, self._is_of_lss)
+        self._parameters.prepare_restart()
         self._restore_bus()
         self._module.restore(self._factory_id, {})
 
@@ -145,22 +150,6 @@ class Node:
         self._came = 0.0  # when the frame under way came [s]
         self._has_lost = False  # frames, since its receive buffer was last half empty
 
-    def _take_axes(self, drives: EmulatedDrives, first_axis: int, spare: EmulatedDrives | None) -> None:
-        """Take the node's axes, in their order, and remember which of the drives' they are."""
-        number = self._device.num_axes - (0 if spare is None else spare.num_axes)
-        if not 0 <= first_axis <= drives.num_axes - number:
-            raise ValueError(
-                f"first_axis={first_axis}: {self._device.name} has {number} of the {drives.num_axes} axes there are; "
-                f"use 0 to {drives.num_axes - number}"
-            )
-        mask = np.zeros(drives.num_axes, bool)
-        mask[first_axis : first_axis + number] = True
-        self._axes = [Axis(self._objects, int(k)) for k in np.flatnonzero(mask)]
-        self._sets = [(self._objects, mask)]
-        if spare is not None:
-            self._axes += [Axis(spare.inside.objects, k) for k in range(spare.num_axes)]
-            self._sets.append((spare.inside.objects, np.ones(spare.num_axes, bool)))
-
     def _make_services(self, indices: Sequence[int]) -> None:
         """Make SDO server, emergencies, error control and the PDOs of the dictionary's indices."""
         device = self._device
@@ -172,10 +161,6 @@ class Node:
         self._sync_producer = SyncProducer()
         self._window = SyncWindow()
         self._time_producer = TimeProducer(services.time_period)
-        self._emergency = EmergencyProducer(self._transmit, device.num_axes)
-        self._told_last = 0  # axis of the last emergency
-        self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
-        self._conditions: dict[Hashable, ErrorCondition] = {}
         self._heartbeat = HeartbeatProducer()
         self._guarding = NodeGuarding()
         self._consumers: list[HeartbeatConsumer] = []
@@ -256,7 +241,7 @@ class Node:
         if frame.rtr:  # the device supports remote frames for guarding alone
             if self._heartbeat.period == 0.0:
                 self._transmit(Frame(frame.can_id, self._guarding.answer(self.state, now)))
-                self._conditions.pop("guarding", None)
+                self._errors.conditions.pop("guarding", None)
             return
         for handler in self._handlers.get(frame.can_id, ()):
             handler(frame.data, now)
@@ -305,13 +290,7 @@ class Node:
         self._now = now
         if not self._is_online:
             return
-        for axis in self._axes:
-            for emergency in axis.take_emergencies():
-                self._tell_of(axis, emergency, now)
-        if self._emergency.told and not self._error_register():
-            # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
-            reset = self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name]
-            self._emergency.push(reset.of_axis(self._told_last), 0)
+        self._errors.collect(now)
         self._flush(now)
         if nmt.SERVICES[self.state].pdo:
             for pdo in self._event_tpdos:
@@ -337,7 +316,7 @@ class Node:
         """Return what its lamps show; `error_counter` is its controller's."""
         boots = self.state is NmtState.INITIALISING
         is_lss = self.node_id == UNCONFIGURED or (self._lss is not None and self._lss.is_configuring)
-        return leds_of(self.state, not self._is_online and not boots, self._conditions, error_counter, is_lss)
+        return leds_of(self.state, not self._is_online and not boots, self._errors.conditions, error_counter, is_lss)
 
     @property
     def clock(self) -> Clock:
@@ -353,8 +332,7 @@ class Node:
         self._is_online = False
         self._received.clear()
         self._clear_answers()
-        for axis in self._axes:
-            axis.trip()
+        self._axes.trip()
         self._react(COMMUNICATION_ERROR)
 
     def bus_on(self, now: float) -> None:
@@ -363,32 +341,25 @@ class Node:
         if self._is_online or self._boots_at is not None or self.state is NmtState.INITIALISING:
             return
         self._is_online = True
-        self._raise("bus_off_recovered", now)
+        self._errors.condition("bus_off_recovered", now)
 
     def overrun(self, now: float, buffer: str = "controller") -> None:
         """Tell it that frames were lost in a buffer: "controller", "transmit" or "receive"."""
         self._now = now
-        self._raise(f"{buffer}_overflow", now)
+        self._errors.condition(f"{buffer}_overflow", now)
 
     def error_passive(self, now: float) -> None:
         """Tell it that its controller has become error passive."""
         self._now = now
-        self._raise("error_passive", now)
+        self._errors.condition("error_passive", now)
 
     # --- resets ---------------------------------------------------------------------------------------------------
     def _reset_application(self, now: float) -> None:
         """Start the module anew: bit rate and node ID that were stored, the axes' stored values, then communication."""
         self._restore_bus()
         self._take_bit_rate("stored")
-        self._restart_axes()
+        self._axes.restart()
         self._reset_communication(now)
-
-    def _restart_axes(self) -> None:
-        """Restore the stored values of the axes and start their firmware anew; the motors are off."""
-        for objects, mask in self._sets:
-            objects.restart(mask)
-        for axis in self._axes:
-            axis.forget_texts()
 
     def _take_bit_rate(self, origin: str) -> None:
         """Be on the bus if its bit rate is the node's."""
@@ -446,13 +417,11 @@ class Node:
         self.state = NmtState.INITIALISING
         if self._take_pending_node_id():
             # Whoever commanded it, and watched it, knows it no more by its new number.
-            for axis in self._axes:
-                axis.trip()
+            self._axes.trip()
         self._leaves_for_bootloader = False
         self._received.clear()
         self._close_sdo()
-        self._emergency.clear()
-        self._conditions.clear()
+        self._errors.restart()
         self._guarding.reset()
         self._window.forget()
         self._sync_producer.restart()
@@ -550,7 +519,7 @@ class Node:
             self._enter(NmtState.PRE_OPERATIONAL)
             self._flush(now)
         elif command is Command.RESET_NODE:
-            self._restart_axes()  # at once, however long it takes to boot: no firmware drives the motor
+            self._axes.restart()  # at once, however long it takes to boot: no firmware drives the motor
             self._restart(self._reset_application, now)
         elif command is Command.RESET_COMMUNICATION:
             self._restart(self._reset_communication, now)
@@ -581,9 +550,8 @@ class Node:
         elif state is NmtState.STOPPED:
             self._close_sdo()
             # The one link between the two automata (manual, section 2.2). A stop after an error has been told already.
-            tripped = [axis.trip() for axis in self._axes]
-            if any(tripped) and is_commanded:
-                self._raise("communication_error", self._now)
+            if self._axes.trip() and is_commanded:
+                self._errors.condition("communication_error", self._now)
 
     def _on_sdo(self, data: bytes, now: float) -> None:
         if not nmt.SERVICES[self.state].sdo:
@@ -606,7 +574,7 @@ class Node:
             # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
             self._is_online = False
             self.state = NmtState.INITIALISING
-            self._restart_axes()
+            self._axes.restart()
 
     def _answer(self, frame: Frame, now: float) -> None:
         """Send an answer, now or after the time that it takes."""
@@ -648,9 +616,9 @@ class Node:
         if self._module.has(communication.SYNC_OVERFLOW):
             counts = self._module.value(communication.SYNC_OVERFLOW) != 0
             if len(data) != counts:
-                self._tell_if_known("sync_length", now)
+                self._errors.condition_if_known("sync_length", now)
                 return
-            self._conditions.pop("sync_length", None)
+            self._errors.conditions.pop("sync_length", None)
         self._window.open(self._came)
         for received in self._sync_rpdos:
             self._judge(received, received.latch(), now)
@@ -666,72 +634,27 @@ class Node:
         if not nmt.SERVICES[self.state].pdo:
             return
         if pdo.is_synchronous and self._window.is_over(self._came):
-            self._tell_if_known("sync_window_missed", now)
+            self._errors.condition_if_known("sync_window_missed", now)
             return
-        self._conditions.pop("sync_window_missed", None)
+        self._errors.conditions.pop("sync_window_missed", None)
         self._judge(pdo, pdo.receive(data), now)
 
     def _on_heartbeat(self, consumer: HeartbeatConsumer, data: bytes, now: float) -> None:
         if len(data) == 1:
             consumer.receive(now)
-            self._conditions.pop(("heartbeat", consumer.node_id), None)
+            self._errors.conditions.pop(("heartbeat", consumer.node_id), None)
 
     # --- errors ---------------------------------------------------------------------------------------------------
     def _judge(self, pdo: ReceivePdo, condition: str | None, now: float) -> None:
         """Tell of a PDO that could not be processed, once until a good one comes (CiA 301: once per error event)."""
         if condition is not None:
-            self._raise(condition, now, pdo.index)
-        elif pdo.index in self._conditions:
-            del self._conditions[pdo.index]
+            self._errors.condition(condition, now, pdo.index)
+        elif pdo.index in self._errors.conditions:
+            del self._errors.conditions[pdo.index]
 
     def _lose(self, service: str, node_id: int, now: float) -> None:
-        self._raise("heartbeat_lost", now, "guarding" if service == "guarding" else (service, node_id))
+        self._errors.condition("heartbeat_lost", now, "guarding" if service == "guarding" else (service, node_id))
         self._react(COMMUNICATION_ERROR)
-
-    def _raise(self, name: str, now: float, key: Hashable = None) -> None:
-        """Tell of a condition of the bus, unless it is known already."""
-        condition = CONDITIONS.get(name) or OPTIONAL_CONDITIONS[name]
-        key = name if key is None else key
-        if self._conditions.get(key) is condition:
-            return
-        if condition.lasts:
-            self._conditions[key] = condition
-        emergency = self._device.emergencies[name].of_axis(0)
-        self._told_last = 0
-        self._emergency.push(emergency, self._error_register() | condition.error_register)
-        self._history.add(emergency.code)
-        self._flush(now)
-
-    def _tell_if_known(self, name: str, now: float) -> None:
-        """Tell of a condition that a device's table of emergencies may lack, since the standard leaves it open."""
-        if name in self._device.emergencies:
-            self._raise(name, now)
-
-    def _tell_of(self, axis: Axis, queued: QueuedEmergency, now: float) -> None:
-        """Pass an axis' emergency on, with the error register of its moment, and react to a fault."""
-        cause = self._device.firmware.causes[queued.row]
-        if queued.row == FAULT_RESET:
-            self._conditions.clear()
-        register = queued.error_register | self._error_register(without=axis)
-        self._told_last = self._axes.index(axis)
-        emergency = self._device.emergencies[cause.name].of_axis(self._told_last)
-        if not self._is_told_of_module(queued.row, now):
-            self._emergency.push(emergency, register)
-            self._history.add(emergency.code, self._told_last)
-        if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
-            self._flush(now)
-            self._react(APPLICATION_ERROR)
-
-    def _is_told_of_module(self, row: int, now: float) -> bool:
-        """Return whether another axis has told of the same thing of the module in this cycle, and note it if not.
-
-        A switch of the whole module is one event for all of its axes, and CiA 301 wants one message for an event.
-        """
-        if not self._device.is_of_module(self._device.firmware.causes[row].name):
-            return False
-        told = self._module_told.get(row) == now
-        self._module_told[row] = now
-        return told
 
     def _react(self, error_class: int) -> None:
         """Do what 1029h says of an error that is detected in operational."""
@@ -741,15 +664,6 @@ class Node:
         target = self._device.canopen.error_behaviour.get(raw, "stay")
         if target != "stay":
             self._enter(NmtState[target])
-
-    def _error_register(self, without: Axis | None = None) -> int:
-        register = 0
-        for axis in self._axes:
-            if axis is not without:
-                register |= axis.error_register
-        for condition in self._conditions.values():
-            register |= condition.error_register
-        return register
 
     def _flush(self, now: float) -> None:
         if self._is_online and nmt.SERVICES[self.state].emergency:
@@ -763,31 +677,21 @@ class Node:
     def _add_services(self) -> None:
         """Put the services behind the objects whose value they are, or whose write commands them."""
         module, canopen = self._module, self._device.canopen
-        module.readers[communication.ERROR_REGISTER, 0] = self._error_register
-        for sub, names in canopen.store_groups.items():
-            save, load = partial(self._save, names), partial(self._load, names)
-            module.commands[communication.STORE, sub] = signed_command(canopen.save_signature, CANNOT_BE_STORED, save)
-            module.commands[communication.RESTORE, sub] = signed_command(canopen.load_signature, CANNOT_BE_STORED, load)
+        self._errors.add_objects(module)
+        self._parameters.add_commands()
         for role, signature, code, action in (
-            ("store_bus", canopen.save_signature, CANNOT_BE_STORED, partial(self._save, ("bus",))),
+            ("store_bus", canopen.save_signature, CANNOT_BE_STORED, partial(self._parameters.save, ("bus",))),
             ("bootloader", canopen.bootloader_signature, VALUE_RANGE, self._leave_for_bootloader),
         ):
             if role in canopen.objects:
                 module.commands[canopen.objects[role]] = signed_command(signature, code, action)
         serial = canopen.objects.get("serial_number")
         if serial is not None:
-            for objects, mask in self._sets:
-                objects.engrave(serial, self._serial, mask)
+            self._axes.engrave(serial, self._serial)
             module.readers[serial] = lambda: int(self._objects.read(serial)[self.first_axis])
         module.readers[communication.STORE_EDS, 0] = self._eds_text
         module.readers[communication.TIME_STAMP, 0] = lambda: self._clock.microseconds(self._now)
         module.commands[communication.TIME_STAMP, 0] = lambda raw: self._clock.set_microseconds(raw, self._came)
-        subs = module.subs(communication.ERROR_HISTORY)
-        self._history = ErrorHistory(len(subs))
-        if subs:
-            for sub in (0, *subs):
-                module.readers[communication.ERROR_HISTORY, sub] = partial(self._history.read, sub)
-            module.commands[communication.ERROR_HISTORY, 0] = self._history.write
 
     def _eds_text(self) -> str:
         """Return what 1021h holds, each byte a character: the EDS as it is, which 1022h says is not compressed."""
@@ -796,55 +700,15 @@ class Node:
     def _leave_for_bootloader(self) -> None:
         self._leaves_for_bootloader = True
 
-    def _save(self, names: tuple[str, ...]) -> None:
-        """Save sections as they are now; what has its factory value follows the factory, so COB-IDs the node ID."""
-        factory = self._module.factory(self.node_id)
-        changed: dict[str, Section] = {name: {} for name in names}
-        for entry in self.dictionary.entries:
-            name = self.dictionary.section(entry)
-            if name in changed:
-                key = (entry.index, entry.sub)
-                raw = self.dictionary.port(*key).read()
-                assert isinstance(raw, int), "a parameter is a number"
-                if name == "bus" or raw != factory[key]:
-                    changed[name][key] = raw
-        self._commit(changed)
-
-    def _load(self, names: tuple[str, ...]) -> None:
-        """Bring sections back to the factory's values, from the next reset on."""
-        self._commit({name: {} for name in names})
-
-    def _commit(self, changed: dict[str, Section]) -> None:
-        if "bus" in changed and LSS_SECTION in self._store.sections:
-            changed[LSS_SECTION] = {}  # what is stored last counts
+    def _works_on_store(self) -> None:
         self._work = self._device.canopen.store_time
-        try:
-            self._store.save(changed)
-        except OSError as error:
-            raise ObjectAccessError(HARDWARE_ERROR, f"the parameters cannot be stored: {error}") from error
-        self._prepare_restart()
 
-    def _prepare_restart(self) -> None:
-        """Tell the axes what a restart restores."""
-        values: list[dict[tuple[int, int], int]] = [{} for _ in self._axes]
-        for entry in self.dictionary.entries:
-            section = self._store.sections.get(self.dictionary.section(entry) or "")
-            if section is not None and not self._module.owns(entry) and isinstance(entry.default, int):
-                axis, base = self._device.locate(entry.index)
-                values[axis][base, entry.sub] = section.get((entry.index, entry.sub), entry.default)
-        for served, stored in zip(self._axes, values, strict=True):
-            served.store(stored)
-
-    def _check_store(self, path: Path | None) -> None:
-        for name, section in self._store.sections.items():
-            for (index, sub), raw in section.items():
-                try:
-                    if name == LSS_SECTION:
-                        self._check_lss((index, sub), raw)
-                        continue
-                    check_limits(self._module.find(index, sub), raw)
-                except ObjectAccessError as error:
-                    raise ValueError(f"{path} does not fit {self._device.name}: {error}; delete it") from error
+    def _is_of_lss(self, section: str, key: tuple[int, int], raw: int) -> bool:
+        """Return whether a stored value is LSS's; ObjectAccessError for one that it cannot have stored."""
+        if section != LSS_SECTION:
+            return False
+        self._check_lss(key, raw)
+        return True
 
     def _check_lss(self, key: tuple[int, int], raw: int) -> None:
         services = self._device.canopen.services
@@ -855,9 +719,9 @@ class Node:
     # --- what LSS asks for (drive_env/canopen/lss.py) -----------------------------------------------------------------
     def identity(self) -> LssIdentity:
         """Return vendor, product, revision and serial number, 0 for what the device lacks."""
-        has = self._module.subs(communication.IDENTITY)
+        has = self._module.subs(IDENTITY)
         port = self.dictionary.port
-        parts = [port(communication.IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]
+        parts = [port(IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]
         return LssIdentity(*(part if isinstance(part, int) else 0 for part in parts))
 
     def active_node_id(self) -> int:
@@ -887,8 +751,7 @@ class Node:
         """Stop the axes and fall silent; have the pending bit rate after `delay` [s], and speak after as long again."""
         if self._pending_bit_rate is None:
             return
-        for axis in self._axes:  # nobody can stop them over a bus whose nodes change their bit rate
-            axis.trip()
+        self._axes.trip()  # nobody can stop them over a bus whose nodes change their bit rate
         self._is_online = False
         self._received.clear()
         self._close_sdo()

@@ -9,6 +9,9 @@ import typer
 from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.eds import print_eds
+from drive_env.commands.esi import print_esi
+from drive_env.commands.ethercat import ethercat_app
+from drive_env.commands.export import export
 from drive_env.commands.fault import fault
 from drive_env.commands.get import get, set_object
 from drive_env.commands.jog import jog
@@ -17,6 +20,7 @@ from drive_env.commands.lss import lss_app
 from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
+from drive_env.commands.new import new_from_eds
 from drive_env.commands.options import INTERRUPTED
 from drive_env.commands.parameters import backup, commission, diff, restore
 from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
@@ -43,12 +47,25 @@ PANELS = {
         ("scope", scope),
         ("jog", jog),
     ),
-    "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
-    "This installation": (("list", list_names), ("eds", print_eds), ("compile", compile_kernels)),
+    "Parameters": (
+        ("backup", backup),
+        ("diff", diff),
+        ("restore", restore),
+        ("commission", commission),
+        ("export", export),
+    ),
+    "This installation": (
+        ("list", list_names),
+        ("eds", print_eds),
+        ("esi", print_esi),
+        ("new", new_from_eds),
+        ("compile", compile_kernels),
+    ),
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }
 app.add_typer(lss_app, name="lss", rich_help_panel="Drives on a bus")
+app.add_typer(ethercat_app, name="ethercat", rich_help_panel="Emulated drives")
 app.add_typer(motor_app, name="motor", rich_help_panel="This installation")
 for panel, commands in PANELS.items():
     for name, function in commands:

@@ -1,4 +1,4 @@
-"""`drive-env serve`: emulated drives on a CAN bus that any master can join."""
+"""`drive-env serve`: emulated drives on a CAN bus that any master can join, or as slaves of an EtherCAT master."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from drive_env.bus.config import Bus
     from drive_env.bus.server import Server
     from drive_env.bus.transport import Transport
+    from drive_env.ethercat.ethercat_server import EtherCatServer
     from drive_env.faults.control import Control
 
 PORT = 29636  # no service is registered there, and no system gives it to others
@@ -28,6 +29,7 @@ LOOPBACK = "127.0.0.1"
 AUTO = "auto"  # as --token
 NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of what is not named as its option
 NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
+ETHERCAT = ("ethercat", "ethercat-udp")
 TOKEN_BYTES = 12  # of chance: 16 characters
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
 WARM_UP_REQUESTS = tuple(
@@ -60,15 +62,23 @@ def serve(
         typer.Option(help="What clients of the hub must present: 8 to 48 letters, digits, - and _; auto: makes one."),
     ] = None,
     interface: Annotated[
-        str | None, typer.Option("--interface", "-i", help="python-can interface instead of the hub, e.g. socketcan.")
+        str | None,
+        typer.Option(
+            "--interface",
+            "-i",
+            help="Instead of the hub: ethercat, ethercat-udp, or one of python-can, e.g. socketcan.",
+        ),
     ] = None,
     channel: Annotated[
-        str | None, typer.Option("--channel", "-c", help="Channel of that interface, e.g. vcan0.")
+        str | None, typer.Option("--channel", "-c", help="Channel of that interface, e.g. vcan0; veth1; a UDP port.")
     ] = None,
     bitrate: Annotated[int | None, typer.Option(help="Bit rate of the bus [bit/s]; 1,000,000 by default.")] = None,
     real_time: Annotated[
         bool,
-        typer.Option("--real-time/--lockstep", help="Time passes in real time, or by 1 ms with each SYNC (lockstep)."),
+        typer.Option(
+            "--real-time/--lockstep",
+            help="Time passes in real time, or by 1 ms with each SYNC or, on EtherCAT, process data (lockstep).",
+        ),
     ] = True,
     store: Annotated[
         Path | None,
@@ -86,9 +96,12 @@ def serve(
         typer.Option(help="Inject a fault: 'encoder_stuck at=2 duration=0.1 node=1'; may be repeated."),
     ] = None,
     control: Annotated[int | None, typer.Option(help="Loopback port for `drive-env fault`; 0 for a free one.")] = None,
+    pcap: Annotated[
+        Path | None, typer.Option(help="Write all frames to this file, for Wireshark; on EtherCAT alone.")
+    ] = None,
 ) -> None:
-    """Put emulated drives on a CAN bus for python-can, python-canopen and drive-env itself."""
-    server: list[Server] = []
+    """Put emulated drives on a CAN bus for python-can, python-canopen and drive-env, or on EtherCAT for its masters."""
+    server: list[Server | EtherCatServer] = []
     previous = [(number, signal.signal(number, _ender(server))) for number in (signal.SIGINT, signal.SIGTERM)]
     logging.basicConfig(format="drive-env: %(message)s", level=logging.WARNING)
     try:
@@ -99,6 +112,12 @@ def serve(
         bus = _bus(machine, config, bitrate, store, seed)
         if duration is not None and not duration > 0.0:
             _fail(f"--duration {duration:g} s must be above 0 s")
+        if interface in ETHERCAT:
+            theirs = {"node": node, "token": token, "bitrate": bitrate, "fault": fault, "control": control}
+            _serve_ethercat(server, bus, real_time, interface, channel, duration, pcap, stats, theirs)
+            return
+        if pcap is not None:
+            _fail(f"--pcap {pcap} is for --interface ethercat; on CAN drive-env log writes frames")
         if token == AUTO:
             token = secrets.token_urlsafe(TOKEN_BYTES)
         made = _server(bus, real_time, port, listen, token, interface, channel)
@@ -140,6 +159,35 @@ def _bus(one: Mapping[str, Any], config: Path | None, bitrate: int | None, store
         return replace(bus, machines=tuple(replace(row, **one) for row in bus.machines), **every)
     except BusConfigError as error:
         _fail(str(error))
+
+
+def _serve_ethercat(
+    server: list[Server | EtherCatServer],
+    bus: Bus,
+    real_time: bool,
+    interface: str,
+    channel: str | None,
+    duration: float | None,
+    pcap: Path | None,
+    stats: bool,
+    of_can: Mapping[str, object],
+) -> None:
+    """Serve on EtherCAT; `of_can` are options that it has not."""
+    from drive_env.commands.options import check_free
+    from drive_env.commands.serve_ethercat import open_ethercat, run_ethercat
+
+    for name, value in of_can.items():
+        if value is not None and value != []:
+            _fail(f"--{name} is for CAN; a slave on --interface {interface} has none: leave it out")
+    if pcap is not None:
+        try:
+            check_free(pcap)
+        except ValueError as error:
+            _fail(str(error))
+    made = open_ethercat(bus, real_time, interface, channel, _fail)
+    server.append(made)
+    run_ethercat(made, bus, duration, pcap, stats)
+    print("drive-env: stopped", flush=True)
 
 
 def _server(
@@ -295,7 +343,7 @@ def _statistics(server: Server) -> str:
     return "\n".join(lines)
 
 
-def _ender(server: list[Server]) -> Any:
+def _ender(server: list[Server | EtherCatServer]) -> Any:
     """Return a signal handler that ends the server, or the process where there is none yet."""
 
     def end(*_: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -11,6 +12,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drive_env import cia402
+from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
+from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
@@ -25,15 +28,17 @@ from drive_env.devices.variants import (
 )
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
+from drive_env.dictionary.parts import Part, parts_of
 from drive_env.dictionary.roles import Role
 from drive_env.firmware import checked_firmware, default_motor, find_firmware, motor_kinds
-from drive_env.motors import KINDS, MOTORS, Motor, motors_of
+from drive_env.motors import EXTRA_LOW_VOLTAGE, KINDS, MOTORS, Motor, is_extra_low, motors_of
 from mechanics.near_names import did_you_mean
 
 if TYPE_CHECKING:
     from drive_env.firmware.cycle import Firmware
 
 FOLDER = Path(__file__).parent
+STANDARD_COMMISSIONING = "standard"
 
 
 class StageParameter(NamedTuple):
@@ -178,7 +183,15 @@ class Device(NamedTuple):
     gains: GainSet
     firmware_name: str
     variant_of: str = ""
+    quirks: DriveQuirks = DriveQuirks()
+    rated_current: float = math.nan  # [A] of peak i_q, the base of thousandths of the rated current or torque
+    commissioning: str = ""  # "standard": presets follow from the motor's data by the rule of any CiA 402 drive
+    ethercat: EtherCatBehaviour | None = None
     about: str = ""  # what a reader of its page must know besides its data
+    parts: Mapping[tuple[int, int], Part] = MappingProxyType({})  # objects that show a part of another
+    shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
+    num_outputs: int = 4
+    mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
 
     @property
     def firmware(self) -> Firmware:
@@ -187,21 +200,29 @@ class Device(NamedTuple):
 
     @property
     def motors(self) -> dict[str, Motor]:
-        """The motors of the catalogue that it can turn, by name."""
-        return motors_of(motor_kinds(self.firmware_name))
+        """The motors of the catalogue that it can turn, by name: of a kind and a voltage class that fit it."""
+        return motors_of(motor_kinds(self.firmware_name), self.highest_supply)
 
     @property
     def default_motor(self) -> str:
-        """The motor that its machines have where nothing is said."""
-        return default_motor(self.firmware_name)
+        """The motor that its machines have where nothing is said: its firmware's, or the first one that fits it."""
+        usual, known = default_motor(self.firmware_name), self.motors
+        return usual if usual in known else next(iter(known), usual)
 
     def check_motor(self, motor: Motor) -> None:
-        """Raise ValueError, with the motors that it turns, for one that is of another kind than these."""
+        """Raise ValueError, with the motors that it turns, for one of another kind or voltage class than these."""
         kinds = motor_kinds(self.firmware_name)
         if motor.kind not in kinds:
             raise ValueError(
                 f"{self.name} turns {' and '.join(KINDS[kind] for kind in kinds)} motors; {motor.name} is a "
                 f"{KINDS[motor.kind]} motor: take {', '.join(self.motors)}, or a device that turns it"
+            )
+        if is_extra_low(motor.voltage) != is_extra_low(self.highest_supply):
+            side = "above" if is_extra_low(self.highest_supply) else "up to"
+            raise ValueError(
+                f"{self.name} is built for {self.highest_supply:g} V; {motor.name} is a motor for {motor.voltage:g} V, "
+                f"{side} the {EXTRA_LOW_VOLTAGE:g} V between their classes: take {', '.join(self.motors)}, or a device "
+                "that turns it"
             )
 
     def supply_of(self, motor: Motor) -> float:
@@ -252,6 +273,9 @@ class Device(NamedTuple):
         preset: dict[str, int]
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+        elif self.commissioning == STANDARD_COMMISSIONING:
+            rule = importlib.import_module("drive_env.devices.standard_commissioning")
+            preset = rule.preset(self, motor)
         elif self.presets.parent.parent != FOLDER:
             raise ValueError(
                 f"{self.name} has no preset for a {motor.name}; write {path} with [objects], name = integer, or take a "
@@ -393,7 +417,15 @@ def _device(
         gains=gains,
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
+        quirks=drive_quirks_of(data),
+        rated_current=data["current"].get("rated", data["current"]["nominal"]),
+        commissioning=data.get("commissioning", ""),
+        ethercat=ethercat_of(data.get("ethercat")),
         about=data.get("about", "").strip(),
+        parts=parts_of({parse_key(text): row for text, row in data.get("parts", {}).items()}, parse_key),
+        shared_values=frozenset(parse_key(text) for text in data.get("shared_values", [])),
+        num_outputs=data.get("outputs", 4),
+        mode_gate={int(mode): needed for mode, needed in data.get("mode_gate", {}).items()},
     )
 
 

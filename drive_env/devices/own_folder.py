@@ -20,7 +20,7 @@ from typing import Any
 
 from drive_env.devices.variants import Key, parse_key
 from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.units import UNITS
+from drive_env.dictionary.units import UNITS, find_unit
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
 
@@ -56,8 +56,10 @@ def own_bindings(folder: Path) -> dict[Key, Binding]:
     bindings = {}
     for text, row in rows.items():
         bindings[parse_key(text)] = binding = Binding(*parse_key(text), **row)
-        if binding.unit not in UNITS:
-            raise ValueError(f"{text} has no unit {binding.unit!r}{did_you_mean(binding.unit, UNITS)}")
+        try:
+            find_unit(binding.unit)
+        except ValueError:
+            raise ValueError(f"{text} has no unit {binding.unit!r}{did_you_mean(binding.unit, UNITS)}") from None
     return bindings
 
 

@@ -50,11 +50,17 @@ class NodeQuirks(NamedTuple):
         rpdo_bit_30: What comes of bit 30 in the COB-ID of an RPDO, which CiA 301 does not define there: "keep": what is
             written is ignored, and it reads as the factory's; "refuse": a value with another bit 30 than the factory's
             is refused with 06090030h; "store": it reads as it was written.
+        history_tells_number: 1003h has the first additional byte of the emergency in bits 24 to 29.
+        further_axis_bit: Bits of 1001h that are set while an axis other than the first has an error.
+        stores_mapped: 1010h stores what a PDO can carry, too, unless it commands something.
         pdo_changes_while_on: A PDO's identifier and inhibit time can be written without setting its bit 31 before.
     """
 
     rpdo_bit_30: str = "keep"
     pdo_changes_while_on: bool = False
+    history_tells_number: bool = False
+    further_axis_bit: int = 0
+    stores_mapped: bool = False
 
 
 def services_of(data: Mapping[str, Any]) -> NodeServices:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from drive_env import cia402
+from drive_env.devices.drive_quirks import NO_SWITCH
 from drive_env.devices.services import OPTIONAL_EMERGENCIES
 from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
@@ -123,7 +124,12 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
     emergencies, canopen = base["emergencies"], base["canopen"]
     more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
     objects = {"serial_number": "1018:4", **canopen["objects"]}
-    return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
+    return {
+        **base,
+        "emergencies": {**more, **emergencies},
+        "canopen": {**canopen, "objects": objects},
+        "quirks": {**NO_SWITCH, **base["quirks"]},
+    }
 
 
 def check_rates(rates: Mapping[str, float]) -> None:
@@ -213,8 +219,8 @@ def converted_preset(
     for name, raw in preset.items():
         key = keys[name]
         if key in before and before[key].unit != after[key].unit:
-            si = raw * units.UNITS[before[key].unit].factor(context)
-            raw = round(si / units.UNITS[after[key].unit].factor(context))
+            si = raw * units.find_unit(before[key].unit).factor(context)
+            raw = round(si / units.find_unit(after[key].unit).factor(context))
         result[name] = raw
     return result
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import Entry
-from drive_env.dictionary.units import UNITS, Context
+from drive_env.dictionary.units import Context, find_unit
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -26,7 +26,7 @@ class Code(NamedTuple):
 
     Attributes:
         field, part: Where in the record: a field, and the part of a deep one.
-        unit: Row of `UNITS`, whose factor is SI per integer.
+        unit: Name of a unit (`find_unit`), whose factor is SI per integer.
         event: What a write sets off in the firmware, as in the binding.
         low, high: Least and greatest integer; what lies beyond saturates, integers of `specials` excepted.
         period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
@@ -47,7 +47,7 @@ class Code(NamedTuple):
     def factor(self, context: Context) -> Any:
         """Return SI per integer, of one axis or of all; a scale of 0 gives infinity."""
         try:
-            return UNITS[self.unit].factor(context)
+            return find_unit(self.unit).factor(context)
         except ZeroDivisionError:
             return math.inf
 
@@ -65,7 +65,7 @@ class Code(NamedTuple):
 def code_of(entry: Entry, binding: Binding) -> Code:
     """Return the row of a bound object."""
     assert entry.low is not None and entry.high is not None, "only numbers are bound"
-    unit = UNITS[binding.unit]
+    unit = find_unit(binding.unit)
     return Code(binding.field, binding.part, binding.unit, binding.event, entry.low, entry.high, unit.period,
                 unit.specials, unit.follows_scale)  # fmt: skip
 

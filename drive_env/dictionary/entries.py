@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import io
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ import numpy as np
 from canopen.objectdictionary import ODVariable, datatypes
 
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
+from drive_env.dictionary.eds_file import EdsFile, parse_eds
 from drive_env.dictionary.roles import Role
 from mechanics.untrusted import read_bytes
 
@@ -68,21 +71,48 @@ class EdsText:
 
 
 def read_eds(path: Path | EdsText, node_id: int = 1) -> canopen.ObjectDictionary:
-    """Return python-canopen's model of an EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are.
+    """Return python-canopen's model of an EDS, put right first: real files are not as CiA 306 has them."""
+    return _model(eds_file(path, node_id), path.name if isinstance(path, EdsText) else str(path), node_id)
 
-    Bytes that cp1252 lacks stand in names and comments alone, where they are shown as unknown.
+
+def eds_file(path: Path | EdsText, node_id: int = 1) -> EdsFile:
+    """Return what an EDS says, and what had to be put right in it.
+
+    A file that is not UTF-8 is read as cp1252, which many vendors' are; bytes that cp1252 lacks stand in names and
+    comments alone, where they are shown as unknown.
     """
-    source = io.StringIO(path.text if isinstance(path, EdsText) else _read_text(path))
-    source.name = path.name if isinstance(path, EdsText) else str(path)
+    return parse_eds(path.text if isinstance(path, EdsText) else _read_text(path), node_id)
+
+
+def _model(file: EdsFile, name: str, node_id: int) -> canopen.ObjectDictionary:
+    source = io.StringIO(file.text())
+    source.name = name if name.lower().endswith((".eds", ".dcf")) else f"{name}.eds"
     return canopen.import_od(source, node_id)
 
 
 def _read_text(path: Path) -> str:
     raw = read_bytes(path)
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16", errors="replace")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         return raw.decode("cp1252", errors="replace")
+
+
+def _content(variable: ODVariable) -> str:
+    """Return the factory's content of a text, a domain or a float; of those each byte is a character."""
+    if variable.data_type in datatypes.FLOAT_TYPES:
+        content = struct.pack("<f" if variable.data_type == datatypes.REAL32 else "<d", float(variable.default or 0.0))
+        return content.decode("latin-1")
+    return variable.default.decode("latin-1") if isinstance(variable.default, bytes) else str(variable.default or "")
+
+
+def _as_key(name: str) -> tuple[int, int] | None:
+    """Return index and sub-index of "6081:0", as the files of a device write them; None of another text."""
+    index, colon, sub = name.partition(":")
+    is_key = bool(colon) and len(index) == 4 and all(letter in "0123456789abcdefABCDEF" for letter in index)
+    return (int(index, 16), int(sub)) if is_key and sub.isdecimal() else None
 
 
 class ObjectDictionary:
@@ -133,7 +163,9 @@ class ObjectDictionary:
                 raise ObjectAccessError(NO_SUCH_OBJECT, f"this drive has no {name.value}")
             name = self.roles[name]
         if isinstance(name, str):
-            key = self._names.get(name.strip().casefold())
+            key = self._names.get(name.strip().casefold()) or _as_key(name)
+            if key is not None and key not in self._entries:
+                return self.find(key)
             if key is None:
                 near = difflib.get_close_matches(name.casefold(), self._names, 3, 0.5)
                 hint = "; did you mean " + " or ".join(repr(self._entries[self._names[n]].name) for n in near)
@@ -155,6 +187,15 @@ class ObjectDictionary:
             )
         raise ObjectAccessError(NO_SUCH_OBJECT, f"object {index:04X}h does not exist in {self.path.name}")
 
+    def without(self, prefix: str) -> ObjectDictionary:
+        """Return the dictionary less the objects whose names begin with `prefix`; with "", all of it."""
+        if not prefix:
+            return self
+        other = copy.copy(self)
+        other._entries = {key: one for key, one in self._entries.items() if not one.name.startswith(prefix)}
+        other._names = {name: key for name, key in self._names.items() if key in other._entries}
+        return other
+
     def _add(self, variable: ODVariable, name: str) -> None:
         kind = INTEGER_TYPES.get(variable.data_type or 0)
         low: int | None
@@ -163,7 +204,7 @@ class ObjectDictionary:
         if kind is None:
             bits = low = high = None
             signed = False
-            default = str(variable.default or "")
+            default = _content(variable)
         else:
             bits, low, high = kind
             signed = low < 0

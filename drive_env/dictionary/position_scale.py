@@ -1,7 +1,8 @@
 """How many increments of position a revolution has: one object says it, or two whose values make it.
 
 A servo drive has an object of its own for it (Role.POSITION_SCALE). A stepper counts microsteps: full steps of a turn,
-times two to the power of the resolution.
+times two to the power of the resolution. Of CiA 402 are the encoder's resolution (608Fh), and feed constant over gear
+ratio (6092h, 6091h), each a fraction of two objects.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Key = tuple[int, int]
 
 
 class PositionScale(NamedTuple):
-    """The objects that say it, and the increments of a revolution that their values make, of any shape."""
+    """The objects that say a scale, and what their values make: the increments of a revolution, of any shape."""
 
     keys: tuple[Key, ...]
     increments: Callable[[Sequence[Floats]], Floats]
@@ -29,9 +30,43 @@ def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
     """Return what a drive with these roles counts positions in; None of one that does not say."""
     if Role.POSITION_SCALE in roles:
         return PositionScale((roles[Role.POSITION_SCALE],), lambda values: values[0])
+    inside = (Role.TURN_INSIDE, Role.POSITION_NUMERATOR, Role.POSITION_DIVISOR)
+    if all(role in roles for role in inside):
+        return PositionScale(tuple(roles[role] for role in inside), _units_of_turn)
     if Role.FULL_STEPS in roles and Role.MICROSTEPS in roles:
         return PositionScale((roles[Role.FULL_STEPS], roles[Role.MICROSTEPS]), _microsteps)
+    for parts, increments in ((_GEARED_FEED, _per_motor_turn), (_FEED, _quotient), (_RESOLUTION, _quotient)):
+        if all(part in roles for part in parts):
+            return PositionScale(tuple(roles[part] for part in parts), increments)
     return None
+
+
+_RESOLUTION = (Role.ENCODER_INCREMENTS, Role.ENCODER_TURNS)
+_FEED = (Role.FEED, Role.FEED_TURNS)
+_GEARED_FEED = (*_FEED, Role.GEAR_MOTOR, Role.GEAR_SHAFT)
+
+
+def _quotient(values: Sequence[Floats]) -> Floats:
+    number, turns = values
+    return number / turns
+
+
+def _per_motor_turn(values: Sequence[Floats]) -> Floats:
+    units, turns, motor, shaft = values
+    return units / turns * shaft / motor
+
+
+def velocity_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
+    """Return the objects that say the rpm of a velocity unit, and what they make of it; None of other drives."""
+    parts = (Role.VELOCITY_NUMERATOR, Role.VELOCITY_DIVISOR)
+    if not all(role in roles for role in parts):
+        return None
+    return PositionScale(tuple(roles[role] for role in parts), lambda values: values[0] / values[1])
+
+
+def _units_of_turn(values: Sequence[Floats]) -> Floats:
+    turn, numerator, divisor = values
+    return turn * divisor / numerator
 
 
 def _microsteps(values: Sequence[Floats]) -> Floats:

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mechanics.near_names import did_you_mean
 
 Floats = NDArray[np.float64]
 TWO_PI = 2.0 * np.pi
@@ -20,8 +23,11 @@ TWO_PI = 2.0 * np.pi
 class Context(NamedTuple):
     """What factors depend on, one value per axis or one for all."""
 
-    position_scaler: Floats | float  # [inc/rev]
+    position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
+    rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
+    velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
+    peak_current: Any = math.nan  # of the motor [A], where torques are told in its parts
 
 
 class Unit(NamedTuple):
@@ -30,8 +36,8 @@ class Unit(NamedTuple):
     Attributes:
         period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
-        follows_scale: Whether the factor follows the scale of positions: what is stored in such a unit is kept in raw
-            integers when the scale changes.
+        follows_scale: Whether the factor follows a scale, of positions, velocities or torques: what is stored in such a
+            unit is kept in raw integers when a scale changes.
     """
 
     name: str
@@ -81,12 +87,33 @@ UNITS: dict[str, Unit] = {
             specials=((2**31 - 1, math.inf), (-(2**31), -math.inf)),
             follows_scale=True,
         ),
+        Unit("1/1000 rated", "thousandths of the rated current or torque", lambda c: 1e-3 * c.rated_current),
         Unit("0.1V", "tenths of a volt", lambda c: 0.1),
+        Unit("mV", "millivolts", lambda c: 1e-3),
         Unit("pps", "increments per second", _angle, follows_scale=True),
         Unit("pps^2", "increments per second squared", _angle, follows_scale=True),
         Unit("pps^3", "increments per second cubed", _angle, follows_scale=True),
         Unit("rpm", "revolutions per minute", lambda c: RPM),
         Unit("rpm/s", "revolutions per minute, per second", lambda c: RPM),
+        Unit(
+            "velocity unit",
+            "rpm times numerator over divisor of the velocity encoder resolution",
+            lambda c: RPM * c.velocity_ratio,
+            follows_scale=True,
+        ),
+        Unit(
+            "velocity unit/s",
+            "velocity units per second",
+            lambda c: RPM * c.velocity_ratio,
+            follows_scale=True,
+        ),
+        Unit(
+            "1/32767 M-Ipeak",
+            "parts of the motor's peak current, of which 32767 are the whole",
+            lambda c: c.peak_current / 32767.0,
+            follows_scale=True,
+        ),
+        Unit("inc 64", "increments of the position inside, 2^28 a revolution", lambda c: TWO_PI / 2.0**28),
         Unit("1/1000", "thousandths", lambda c: 1e-3),
         Unit("1/65536 rev", "1/65536 revolution", lambda c: TWO_PI / 65536.0),
         Unit("current P", "Q8.8: duty LSB per current LSB", lambda c: 1.0 / (256.0 * 32768.0 * c.current_lsb)),
@@ -99,6 +126,35 @@ UNITS: dict[str, Unit] = {
         Unit("1/65536 turn", "electrical angle, wraps at half a turn", lambda c: TWO_PI / 65536.0, period=65536.0),
     )
 }
+
+
+def split_unit(name: str) -> tuple[float, str]:
+    """Return how many of which unit one is: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
+    number, _, base = name.partition(" ")
+    if name in UNITS or base not in UNITS:
+        return 1.0, name
+    try:
+        return float(number), base
+    except ValueError:
+        return 1.0, name
+
+
+@cache
+def find_unit(name: str) -> Unit:
+    """Return a row by its name, or so many of one: "0.1 rpm", "10 pps^2".
+
+    Raises:
+        ValueError: For a unit that there is not, with a near one.
+    """
+    if name in UNITS:
+        return UNITS[name]
+    number, base = split_unit(name)
+    if base not in UNITS or not 0.0 < number < math.inf or UNITS[base].specials or UNITS[base].period:
+        raise ValueError(f"there is no unit {name!r}{did_you_mean(base, UNITS)}")
+    row = UNITS[base]
+    return Unit(
+        name, f"{number:g} times: {row.meaning}", lambda c: number * row.factor(c), follows_scale=row.follows_scale
+    )
 
 
 def wrap(value: NDArray[Any], bits: int = 32) -> Floats:

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import BasicDrives
 
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+
 Mask = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+WIDEST = 2**31  # increments: a window of more is a switch
 
 STEP = 0.001  # time between two looks at the statusword [s]
+MODE_PATIENCE = 0.25  # s for which a mode may be asked for before something must be done about it
+TAKEN_BACK = 0.05  # s after which a set-point whose acknowledge stays is in a drive's buffer
+REST = 0.25  # s at the target, or at home, after which a drive without bit 10 has got there
+NEAR = 10  # increments around a target, where the drive has no window of its own
+STOP_TIMEOUT = 5.0  # s, for the stop of an axis whose own mode was changed while it was enabled
 
 
 def wait_for(
@@ -50,13 +65,109 @@ def wait_for(
 
 
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
-    """Select a mode of operation by abbreviation on the axes that are not in it yet."""
+    """Select a mode of operation by abbreviation on the axes that are not in it yet.
+
+    Of a drive whose own mode must fit it, that is written, too. It stops an axis that is enabled where it sees the one
+    without the other, as on a bus; such an axis is enabled again.
+    """
     if mode not in cia402.MODES:
         raise ValueError(f"no mode is named {mode!r}; there are {', '.join(cia402.MODES)}")
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    other = axes & (drives.read(cia402.MODE) != cia402.MODES[mode])
+    number = cia402.MODES[mode]
+    other = axes & (drives.read(cia402.MODE) != number)
+    needed = _own_modes(drives).get(number)
+    closed = axes & False if needed is None else axes & (drives.read(Role.MODE_GATE) != needed)
+    if not (other | closed).any():
+        return
+    was_on = closed & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if other.any():
-        drives.write(cia402.MODE, cia402.MODES[mode], where=other)
+        drives.write(cia402.MODE, number, where=other)
+    if needed is not None and closed.any():
+        drives.write(Role.MODE_GATE, needed, where=closed)
+    if was_on.any():
+        _enable_again(drives, was_on)
+    _await_mode(drives, mode, axes)
+
+
+def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0) -> None:
+    """Let time pass until 6061h shows a mode.
+
+    A drive may be slow; it may change modes at a halt alone, so that enabled axes that do not show the mode are halted
+    until they do; and it may show a mode only once it is enabled, so that a disabled axis is not waited for for long.
+
+    Raises:
+        TimeoutError: If an enabled axis does not get into the mode; it is halted then.
+    """
+    late = _not_in_mode(drives, mode, axes)
+    waited = 0.0
+    while late.any() and waited < MODE_PATIENCE:
+        drives.advance(STEP)
+        waited += STEP
+        late = _not_in_mode(drives, mode, late)
+    halted = late & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED) if late.any() else late
+    if not halted.any():
+        return
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=halted)
+    waited, late = 0.0, halted
+    while late.any():
+        if waited >= timeout:
+            axis = int(np.flatnonzero(late)[0])
+            raise TimeoutError(
+                f"axis {axis} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
+                "mode, and the axis is halted; disable it, then select the mode"
+            )
+        drives.advance(STEP)
+        waited += STEP
+        late = _not_in_mode(drives, mode, late)
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=halted)
+
+
+def _not_in_mode(drives: BasicDrives, mode: str, axes: Mask) -> Mask:
+    """Return the axes that show another mode; none where a drive does not show its mode."""
+    shown = _shown_modes(drives)
+    return np.zeros_like(axes) if shown is None else np.asarray(axes & (shown != cia402.MODES[mode]))
+
+
+def _shown_modes(drives: BasicDrives) -> Integers | None:
+    """Return what 6061h shows, None of drives that have none."""
+    try:
+        return drives.read(cia402.MODE_DISPLAY)
+    except ObjectAccessError:
+        return None
+
+
+def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
+    """Return the drive's own mode that each mode of operation needs; empty of drives that have no such thing."""
+    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know what they are
+    return {} if device is None else device.mode_gate
+
+
+def _enable_again(drives: BasicDrives, axes: Mask) -> None:
+    """Enable axes that the change of their own mode has stopped."""
+    drives.advance(STEP)
+    lost = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+    if lost.any():
+        wait_for(drives, cia402.SWITCH_ON_DISABLED, STOP_TIMEOUT, "the end of the stop for its own mode", lost)
+        enable(drives, where=lost)
+
+
+def take_command(drives: BasicDrives, where: Mask | None = None) -> None:
+    """Have axes take commands that ignore them, since their own mode does not fit the mode of operation.
+
+    Whatever stops an axis calls it first: a command that is ignored stops nothing.
+    """
+    own_modes = _own_modes(drives)
+    if not own_modes:
+        return
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    ignores = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
+    if not ignores.any():
+        return
+    needed = np.array([own_modes.get(int(mode), -1) for mode in drives.read(cia402.MODE)])
+    known = ignores & (needed >= 0)
+    if known.any():
+        drives.write(Role.MODE_GATE, np.maximum(needed, 0), where=known)
+        drives.advance(STEP)  # the drive looks at it once in a period
 
 
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
@@ -69,14 +180,17 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         timeout: Longest wait for each state [s]; a drive that waits for its brake needs its delays, and more.
 
     Raises:
-        TimeoutError: If a state is not reached in time. An axis that is late is not left on its way there.
+        TimeoutError: If a state, or the mode, is not reached in time. An axis that is late is not left on its way
+            there.
     """
     status = drives.read(cia402.STATUSWORD)
     axes = np.ones(drives.num_axes, bool) if where is None else where
     in_fault = axes & cia402.matches(status, cia402.FAULT)
     if in_fault.any():
         reset_fault(drives, where=in_fault, timeout=timeout)
-    if mode is not None:
+    if mode is None:
+        take_command(drives, where)
+    else:
         select_mode(drives, mode, where)
     stopped = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.QUICK_STOP_ACTIVE)
     if stopped.any():
@@ -98,16 +212,24 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
             late = not_enabled & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
             drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=late)
             raise
+    if mode is not None:
+        try:
+            _await_mode(drives, mode, not_enabled)
+        except TimeoutError:
+            drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=not_enabled)
+            raise
 
 
 def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Switch the voltage off; the axis coasts."""
+    take_command(drives, where)
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
     wait_for(drives, cia402.SWITCH_ON_DISABLED, timeout, "switch on disabled", where)
 
 
 def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
     """Command a quick stop; what follows the ramp is 605Ah's."""
+    take_command(drives, where)
     drives.write(cia402.CONTROLWORD, cia402.QUICK_STOP, where=where)
 
 
@@ -117,6 +239,7 @@ def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float =
     Raises:
         TimeoutError: If the cause is still there.
     """
+    take_command(drives, where)
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
     drives.write(cia402.CONTROLWORD, cia402.FAULT_RESET, where=where)
     axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -138,6 +261,8 @@ def start_move(
 ) -> None:
     """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12.
 
+    A drive that would put the set-point into a buffer, until the move before has ended, gets it with bit 5: at once.
+
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
         TimeoutError: If the drive does not take the set-point within `timeout` [s].
@@ -148,7 +273,25 @@ def start_move(
     drives.write(cia402.CONTROLWORD, word | cia402.NEW_SET_POINT, where=where)
     wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", where)
     drives.write(cia402.CONTROLWORD, word, where=where)
+    kept = _still_acknowledged(drives, where)
+    if kept.any() and not relative:  # a relative one ends at the same place from the buffer, and must not go twice
+        at_once = word | cia402.CHANGE_AT_ONCE
+        drives.write(cia402.CONTROLWORD, at_once | cia402.NEW_SET_POINT, where=kept)
+        wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", kept)
+        drives.write(cia402.CONTROLWORD, word, where=kept)
     wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
+
+
+def _still_acknowledged(drives: BasicDrives, where: Mask | None) -> Mask:
+    """Return the axes whose acknowledge stays though bit 4 of the controlword is back."""
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    waited = 0.0
+    while True:
+        kept = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.SET_POINT_ACKNOWLEDGED)
+        if not kept.any() or waited >= TAKEN_BACK:
+            return np.asarray(kept)
+        drives.advance(STEP)
+        waited += STEP
 
 
 def move_to(
@@ -161,17 +304,55 @@ def move_to(
 ) -> None:
     """Move in pp to a position [inc] and wait until it is reached.
 
+    A drive that never shows bit 10 is there once it has stood at its target for a while.
+
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
         TimeoutError: If the target is not reached within `timeout` [s].
     """
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    goal = np.broadcast_to(np.asarray(position), (drives.num_axes,))
+    if relative:
+        goal = goal + drives.read(cia402.POSITION_ACTUAL)
     start_move(drives, position, relative=relative, where=where)
-    wait_for(drives, cia402.TARGET_REACHED, timeout, "target reached", where)
+    waited = 0.0
+    while axes.any() and waited < timeout:
+        step = min(REST, timeout - waited)
+        try:
+            wait_for(drives, cia402.TARGET_REACHED, step, "target reached", axes)
+            return
+        except TimeoutError:
+            waited += step
+        axes = axes & ~_stands_at(drives, goal, axes)
+    wait_for(drives, cia402.TARGET_REACHED, 0.0, f"target reached after {waited:g} s", axes)
+
+
+def _stands_at(drives: BasicDrives, goal: Integers, axes: Mask) -> Mask:
+    """Let a while pass, and return the axes that stand at their target without saying so; none if one may move."""
+    before = drives.read(cia402.POSITION_ACTUAL)
+    near = max(NEAR, _window(drives))
+    if not np.any(axes & (np.abs(before - goal) <= near)):
+        return np.zeros_like(axes)
+    drives.advance(REST)
+    after = drives.read(cia402.POSITION_ACTUAL)
+    reached = cia402.matches(drives.read(cia402.STATUSWORD), cia402.TARGET_REACHED)
+    stands = (np.abs(after - goal) <= near) & (np.abs(after - before) <= NEAR)
+    return np.asarray(axes & (reached | stands))
+
+
+def _window(drives: BasicDrives) -> int:
+    """Return the widest position window of the axes [inc]; 0 where there is none, or it is switched off."""
+    try:
+        window = int(drives.read(cia402.POSITION_WINDOW).max())
+    except ObjectAccessError:
+        return 0
+    return window if window < WIDEST else 0
 
 
 def _check_can_move(drives: BasicDrives, where: Mask | None) -> None:
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    status, mode = drives.read(cia402.STATUSWORD), drives.read(cia402.MODE_DISPLAY)
+    status, shown = drives.read(cia402.STATUSWORD), _shown_modes(drives)
+    mode = drives.read(cia402.MODE) if shown is None else shown
     off = axes & ~cia402.matches(status, cia402.OPERATION_ENABLED)
     other = axes & (mode != cia402.MODES["pp"])
     for wrong, what in ((off, "is not enabled"), (other, "is not in pp")):
@@ -194,7 +375,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
     enable(drives, mode="hm", where=where)
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
-    waited = 0.0
+    waited, silent = 0.0, 0
     while True:
         drives.advance(2 * STEP)  # the first look comes after the drive has begun
         waited += 2 * STEP
@@ -208,9 +389,21 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
             raise RuntimeError(
                 f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
             )
-        if not np.any(axes & (bits != cia402.HOMED)):
+        still = axes & (bits != cia402.HOMED)
+        if not still.any():
+            break
+        # Bit 12 alone is home that is left again for where the axis rests, or home on a drive without bit 10.
+        silent = silent + 1 if np.all(bits[still] == cia402.HOMING_UNDER_WAY[1]) else 0
+        if silent * 2 * STEP >= REST and _rests(drives, still):
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])
             raise TimeoutError(f"axis {axis} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)
+
+
+def _rests(drives: BasicDrives, axes: Mask) -> bool:
+    """Let a while pass, and return whether axes have stood through it."""
+    before = drives.read(cia402.POSITION_ACTUAL)
+    drives.advance(REST)
+    return bool(np.all(np.abs(drives.read(cia402.POSITION_ACTUAL) - before)[axes] <= NEAR))

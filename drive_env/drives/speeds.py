@@ -1,14 +1,17 @@
-"""How drives count speeds and accelerations: in increments of position, or in rpm."""
+"""How drives count speeds and accelerations: in increments of position, in rpm, or in a unit of their own."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.position_scale import velocity_ratio
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import split_unit
 from drive_env.drives.interface import Drives
 
 _BY_MINUTE = ("rpm", "rpm/s")
+_BY_RATIO = ("velocity unit", "velocity unit/s")  # a drive's own, so many rpm as two of its objects say
 
 
 def per_increment(drives: Drives, name: int | tuple[int, int]) -> NDArray[np.float64] | float:
@@ -22,11 +25,26 @@ def per_increment(drives: Drives, name: int | tuple[int, int]) -> NDArray[np.flo
     """
     device = drives.device
     key = name if isinstance(name, tuple) else (name, 0)
-    if device is None or device.bindings[key].unit not in _BY_MINUTE:
-        return 1.0
-    return 60.0 / np.asarray(drives.read(Role.POSITION_SCALE), float)
+    unit = "" if device is None else device.bindings[key].unit
+    number, base = split_unit(unit)
+    if base not in _BY_MINUTE + _BY_RATIO:
+        return 1.0 / number
+    rpm = 60.0 / np.asarray(drives.read(Role.POSITION_SCALE), float) / number
+    return rpm if base in _BY_MINUTE else rpm / rpm_of_unit(drives)
 
 
-def per_increment_of(unit: str, scaler: float) -> float:
-    """Return the same for a unit, and a scale of positions [inc/rev]."""
-    return 60.0 / scaler if unit in _BY_MINUTE else 1.0
+def rpm_of_unit(drives: Drives) -> NDArray[np.float64]:
+    """Return the rpm of a velocity unit, shape (num_axes,); 1 of drives that have no such unit."""
+    device = drives.device
+    ratio = None if device is None else velocity_ratio(device.roles)
+    if ratio is None:
+        return np.ones(drives.num_axes)
+    return ratio.increments([np.asarray(drives.read(key), float) for key in ratio.keys])
+
+
+def per_increment_of(unit: str, scaler: float, ratio: float = 1.0) -> float:
+    """Return the same for a unit, a scale of positions [inc/rev], and the rpm of a velocity unit."""
+    number, base = split_unit(unit)
+    if base in _BY_RATIO:
+        return 60.0 / scaler / ratio / number
+    return (60.0 / scaler if base in _BY_MINUTE else 1.0) / number

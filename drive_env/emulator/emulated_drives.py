@@ -271,7 +271,7 @@ class EmulatedDrives:
         self._run(cycles, call_of(values, played, samples, sampled, every))
         result: dict[tuple[int, int], Integers] = {}
         for k, (key, code) in enumerate(live.items()):
-            result[key] = self._objects.to_od(code, samples[:, k])
+            result[key] = self._objects.recorded(known.find(key), code, samples[:, k])
         for key in codes:
             if key not in result:
                 result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))
@@ -374,7 +374,13 @@ class EmulatedDrives:
             wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
             set_lanes(records, "wired", wired | (1 << kind), axes)
         records["supply_voltage"] = supply
+        records["mode_delay"] = device.quirks.mode_display_delay
+        records["mode_needs_halt"] = device.quirks.mode_change_needs_halt
+        records["absent_status_bits"] = device.quirks.absent_status_bits
+        records["set_point_buffer"] = device.quirks.set_point_buffer
         self._kind.set_constants(records, device, self.motor)
+        if self._kind.connect is not None:
+            self._kind.connect(records, self.load.num_axes)
         self._set_noise(np.ones(self.num_axes, bool))
 
     def _set_noise(self, axes: Mask) -> None:

@@ -5,7 +5,7 @@ Reading and writing check type, access, range and state exactly as the bus does;
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -19,10 +19,17 @@ from drive_env.dictionary.aborts import CANNOT_BE_STORED, WRONG_STATE, ObjectAcc
 from drive_env.dictionary.access import check_allowed, check_in_range, check_readable, check_writable, checked_values
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
-from drive_env.emulator.prepared_record import SCALE_FIELD, SCALES, PreparedObject, PreparedRecord
+from drive_env.emulator.prepared_record import (
+    PEAK_FIELD,
+    RATIO_FIELD,
+    SCALE_FIELD,
+    SCALES,
+    PreparedObject,
+    PreparedRecord,
+)
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.common.modes import MODES
@@ -31,10 +38,11 @@ from drive_env.firmware.record import get_lanes, set_lanes
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Key = tuple[int, int]
 
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
-MODE_OF_OPERATION = (cia402.MODE, 0)
+MODE_OF_OPERATION, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 
 
 class LiveDictionary:
@@ -53,8 +61,14 @@ class LiveDictionary:
     ) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
-        self._scale = position_scale(device.roles)
-        self.scale_keys = () if self._scale is None else self._scale.keys  # whose write gives positions another scale
+        found = {SCALE_FIELD: position_scale(device.roles), RATIO_FIELD: velocity_ratio(device.roles)}
+        # Fields of scales that objects make, as far as the device has them.
+        self._scales: dict[str, PositionScale] = {name: scale for name, scale in found.items() if scale is not None}
+        # Objects whose write gives what is stored another meaning.
+        self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
+        if Role.PEAK_CURRENT in device.roles:
+            self.scale_keys += (device.roles[Role.PEAK_CURRENT],)
+        self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
         self._parameters = frozenset(field.name for field in self._layout.parameters)
@@ -67,9 +81,11 @@ class LiveDictionary:
 
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
-        if name is Role.POSITION_SCALE and len(self.scale_keys) > 1:  # no object has it: several make it
-            return np.rint(self._context().position_scaler).astype(np.int64)
+        if name is Role.POSITION_SCALE and len(self._position_keys) > 1:  # no object has it: several make it
+            return np.asarray(np.rint(self.context().position_scaler), np.int64)
         entry = self.entries.find(name)
+        if entry.access == "wo" and (entry.index, entry.sub) == MODE_OF_OPERATION and self.entries.has(MODE_DISPLAY):
+            entry = self.entries.find(MODE_DISPLAY)  # which shows it (CiA 402)
         check_readable(entry)
         return self._read(entry)
 
@@ -100,7 +116,7 @@ class LiveDictionary:
 
     def restart(self, axes: Mask) -> None:
         """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
-        before = self._context()
+        before = self.context()
         if self._snapshot is None:
             self._snapshot = self._stored_snapshot()
         self._snapshot.restore(axes)
@@ -108,8 +124,8 @@ class LiveDictionary:
             values = self._values.get(key)
             if isinstance(values, np.ndarray):
                 np.copyto(values, raw, where=axes)
-        after = self._context()
-        if np.any(before.position_scaler != after.position_scaler):
+        after = self.context()
+        if any(np.any(one != other) for one, other in zip(before, after, strict=True)):
             self._scale_changes += 1
         self.device.firmware.power_on(self._records, axes)
 
@@ -133,6 +149,23 @@ class LiveDictionary:
                 self._stored[key] = np.repeat(self._stored[key], self.num_axes)
             self._stored[key][axis] = raw
         self._snapshot = None
+
+    def part(self, entry: Entry, read: Callable[[Key], Integers] | None = None) -> Integers:
+        """Return an object that shows a part of another, whose values `read` returns, axes last; by default those now.
+
+        An axis of the node that is not there shows what the dictionary says.
+        """
+        part = self.device.parts[entry.index, entry.sub]
+        read = read or (lambda key: self._read(self.entries.find(key)))
+        number = np.arange(self.num_axes)
+        within = number % self.device.num_axes
+        source = number if part.axis is None else number - within + part.axis
+        there = (source < self.num_axes) & ((part.axis or 0) < self.device.num_axes)
+        values: Integers = np.stack([read(key) for key in part.of])
+        which = within % len(part.of)
+        shown = part.shown(values[which, ..., np.where(there, source, 0)]).T
+        assert isinstance(entry.default, int), "parts are numbers"
+        return np.asarray(np.where(there, shown, entry.default), np.int64)
 
     def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
         """Write an object of one axis that was checked before."""
@@ -173,13 +206,21 @@ class LiveDictionary:
         key = (entry.index, entry.sub)
         code = self.codes[key]
         return PreparedObject(
-            key, code, np.array(np.broadcast_to(code.factor(self._context()), (self.num_axes,)), float)
+            key, code, np.array(np.broadcast_to(code.factor(self.context()), (self.num_axes,)), float)
         )
 
     def recordable(self, entry: Entry) -> Code | None:
         """Return where the value of an entry is that changes by itself, None of one that only a write changes."""
         check_readable(entry)
-        return self.codes.get((entry.index, entry.sub))
+        key = (entry.index, entry.sub)
+        if key in self.device.parts:
+            key = self.device.parts[key].of[0]
+        return self.codes.get(key)
+
+    def recorded(self, entry: Entry, code: Code, values: Floats) -> Integers:
+        """Return what an object was, of SI values of where `recordable` has it, axes last."""
+        raw = self.to_od(code, values)
+        return self.part(entry, lambda _: raw) if (entry.index, entry.sub) in self.device.parts else raw
 
     def plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
         """Return SI values, shape (cycles, objects, num_axes), and the fields that they go to.
@@ -218,12 +259,13 @@ class LiveDictionary:
             if isinstance(entry.default, str):
                 self._values[entry.index, entry.sub] = entry.default
             else:
-                stored[entry.index, entry.sub] = np.array([entry.default], np.int64)
+                stored[entry.index, entry.sub] = self._defaults(entry)
         taken = allowed_values(self.device, self.entries.find(MODE_OF_OPERATION)) or ()
         modes = sum(
             1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None and mode.number in taken
         )
-        stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
+        if self.entries.has(cia402.SUPPORTED_MODES):
+            stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
         for name, value in preset.items():
             entry = self.entries.find(name)
             raw = checked_values(entry, value, 1)
@@ -231,8 +273,17 @@ class LiveDictionary:
             stored[entry.index, entry.sub] = raw.copy()
         for key, raw in stored.items():
             if not self._is_bound(self.entries.find(key)):
-                self._values[key] = np.repeat(raw, self.num_axes)
+                self._values[key] = np.array(np.broadcast_to(raw, self.num_axes))
         return stored
+
+    def _defaults(self, entry: Entry) -> Integers:
+        """Return an object's factory value, one of all axes, or one per axis where those of a node differ."""
+        step = next((one.step for one in self.device.axis_offsets if one.first <= entry.index <= one.last), 0)
+        keys = [(entry.index + k * step, entry.sub) for k in range(self.device.num_axes if step else 1)]
+        found = [self.entries.find(key).default if self.entries.has(key) else entry.default for key in keys]
+        if len(set(found)) == 1:
+            return np.array(found[:1], np.int64)
+        return np.resize(np.array(found, np.int64), self.num_axes)
 
     def _stored_snapshot(self) -> RecordSnapshot:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
@@ -240,11 +291,15 @@ class LiveDictionary:
         What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
         """
         length = max(map(len, self._stored.values()))
-        context = self._context()
-        scaler = None
-        if self._scale is not None:
-            scaler = self._scale.increments([self._stored[key].astype(float) for key in self.scale_keys])
-            context = context._replace(position_scaler=scaler)
+        context = self.context()
+        made: dict[str, Any] = {
+            name: scale.increments([self._stored[key].astype(float) for key in scale.keys])
+            for name, scale in self._scales.items()
+        }
+        context = context._replace(**made)
+        peak = self.device.roles.get(Role.PEAK_CURRENT)
+        if peak is not None:
+            context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
         bound = [
             key
             for key in self._stored
@@ -253,9 +308,10 @@ class LiveDictionary:
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
-        if scaler is not None and (SCALE_FIELD, 0) not in fields:
-            values.append(scaler)
-            fields.append((SCALE_FIELD, 0))
+        for name, scale in made.items():
+            if (name, 0) not in fields:
+                values.append(scale)
+                fields.append((name, 0))
         return RecordSnapshot(
             self._layout, self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values])
         )
@@ -263,26 +319,37 @@ class LiveDictionary:
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.codes
 
-    def _context(self) -> units.Context:
-        device = self.device
-        return units.Context(
-            position_scaler=get_lanes(self._records, SCALE_FIELD, self.num_axes).astype(float),
-            current_lsb=device.current_full_scale / 32768.0,
+    def context(self) -> units.Context:
+        """Return what the factors of units depend on now, one value per axis."""
+        scales = units.Context(
+            position_scaler=self._scale_field(SCALE_FIELD),
+            current_lsb=self.device.current_full_scale / 32768.0,
+            rated_current=self.device.rated_current,
         )
+        if not self._layout.has(RATIO_FIELD):
+            return scales
+        return scales._replace(
+            velocity_ratio=self._scale_field(RATIO_FIELD), peak_current=self._scale_field(PEAK_FIELD)
+        )
+
+    def _scale_field(self, name: str) -> Floats:
+        return get_lanes(self._records, name, self.num_axes).astype(float)
 
     def _read(self, entry: Entry) -> Integers:
         if self._is_bound(entry):
             code = self.codes[entry.index, entry.sub]
             return self.to_od(code, get_lanes(self._records, code.field, self.num_axes, code.part).astype(float))
+        if (entry.index, entry.sub) in self.device.parts:
+            return self.part(entry)
         stored = self._values[entry.index, entry.sub]
         return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
 
     def to_od(self, code: Code, value: Floats) -> Integers:
         """Return integers on the wire of SI values; axes are the last dimension."""
-        return encode(code, value, code.factor(self._context()))
+        return encode(code, value, code.factor(self.context()))
 
     def _from_od(self, code: Code, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
-        return decode(code, raw, code.factor(self._context() if context is None else context))
+        return decode(code, raw, code.factor(self.context() if context is None else context))
 
     def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
         self._check_value(entry, raw[where])
@@ -307,6 +374,11 @@ class LiveDictionary:
         if key in self.scale_keys:
             self._rescale(entry, raw, where)
             return
+        if key in self.device.parts:
+            part = self.device.parts[key]
+            whole = self.entries.find(part.of[0])
+            self._write(whole, part.put(self._read(whole), raw), where)
+            return
         if not self._is_bound(entry):
             self._set_value(entry, raw, where)
             return
@@ -320,8 +392,7 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
 
     def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Change the scale of positions: what is stored in increments keeps its integers, whose SI value changes."""
-        assert self._scale is not None, "an object of the scale was written"
+        """Change a scale: what is stored in units that follow it keeps its integers, whose SI value changes."""
         kept = [
             (other, self._read(other))
             for other in self.entries
@@ -333,8 +404,9 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
         else:
             self._set_value(entry, raw, where)
-        made = self._scale.increments([self._read(self.entries.find(key)).astype(float) for key in self.scale_keys])
-        set_lanes(self._records, SCALE_FIELD, made, where)
+        for name, scale in self._scales.items():
+            made = scale.increments([self._read(self.entries.find(key)).astype(float) for key in scale.keys])
+            set_lanes(self._records, name, made, where)
         self._scale_changes += 1
         for other, value in kept:
             self._set_field(other, value, where)
@@ -348,6 +420,11 @@ class LiveDictionary:
     def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
         before = self._values.get(key)
+        if key in self.device.shared_values:
+            node = np.arange(self.num_axes) // self.device.num_axes
+            for first in np.flatnonzero(where):
+                raw = np.where(node == node[first], raw[first], raw)
+            where = np.isin(node, node[where])
         self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
 _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
@@ -225,7 +226,8 @@ class Machines:
     def outputs(self) -> NDArray[np.int64]:
         """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,)."""
         read = self._drives.read
-        return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & 0xF
+        pins = (1 << self._drives.device.num_outputs) - 1
+        return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & pins
 
     @property
     def digital_inputs(self) -> NDArray[np.int64]:
@@ -240,7 +242,12 @@ class Machines:
         values = np.broadcast_to(np.asarray(value), (self._drives.num_axes,))
         if values.dtype.kind not in "iu" or np.any((values < 0) | (values > 0xFF)):
             raise ValueError(f"digital inputs are whole numbers of 0 to 255, a bit for each, not {value!r}")
-        self._drives._objects.impose(Role.DIGITAL_INPUTS, values.astype(np.int64) << INPUTS_SHIFT)
+        drives = self._drives
+        records = drives.inside.objects.records
+        if drives.device.firmware.layout.has(INPUTS_FIELD):  # the firmware adds its switches
+            set_lanes(records, INPUTS_FIELD, values)
+        else:
+            drives._objects.impose(Role.DIGITAL_INPUTS, values.astype(np.int64) << INPUTS_SHIFT)
 
     @property
     def analog_inputs(self) -> NDArray[np.int64]:

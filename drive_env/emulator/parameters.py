@@ -48,6 +48,7 @@ class MachineKind(NamedTuple):
         set_constants: (records, device, motor): writes the fields that no parameter is.
         apply: (records, device, motor, name, values, axes): brings a parameter's values, one per axis, into records.
         noise: Field that is the state of the axes' noise generator; "" without one.
+        connect: (records, axes of a machine): connects what the axes of a machine have in common; None: nothing.
     """
 
     motor_parameters: Callable[[Motor], list[MachineParameter]]
@@ -56,6 +57,7 @@ class MachineKind(NamedTuple):
     set_constants: Callable[[Records, Device, Motor], None]
     apply: Callable[[Records, Device, Motor, str, Floats, Mask], None]
     noise: str
+    connect: Callable[[Records, int], None] | None = None
 
 
 def parameter_table(
@@ -134,7 +136,7 @@ _SIGNED = ("offset", "error", "phase", "ambient", "index_angle")
 _MAY_VANISH = (
     "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
     "short_conductance", "short_a", "short_b", "index_inverted", "brake_opens_in", "brake_closes_in", "noise",
-    "dead_time", "resistance", "supply_sinks",
+    "dead_time", "resistance", "supply_sinks", "idle_power", "emergency_stop",
 )  # fmt: skip
 
 

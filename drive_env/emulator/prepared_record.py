@@ -31,7 +31,9 @@ Integers = NDArray[np.int64]
 
 # Fields that factors depend on: played, they would change between two rows.
 SCALE_FIELD = "position_scaler"  # increments of a revolution
-SCALES = frozenset({SCALE_FIELD})
+RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit; of drives that have such
+PEAK_FIELD = "peak_current"  # of the motor [A]; of drives that tell torques in its parts
+SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, PEAK_FIELD})
 
 
 class PreparedObject(NamedTuple):

@@ -17,6 +17,7 @@ from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays
@@ -345,6 +346,7 @@ class GainScheduling(VectorEnvironment):
         self._speed_scale = np.tile(self.reach.speed, self.num_envs)
         self._acceleration_scale = np.tile(self.reach.acceleration, self.num_envs)
         self._rated_current = motor.rated_current
+        self._ampere = ampere_per_count(self.drives)
         self._per_rad = self.drives.read(Role.POSITION_SCALE) / (2.0 * np.pi)
         self._speed_counts = self._per_rad * per_increment(self.drives, VELOCITY)
         self._counts = self._per_rad if self.config.mode == "csp" else self._speed_counts  # of the set-point
@@ -429,7 +431,7 @@ class GainScheduling(VectorEnvironment):
         velocity = np.asarray(rows[VELOCITY] / self._speed_counts, float)
         actual = rows[POSITION] if self.config.mode == "csp" else rows[VELOCITY]
         error = np.asarray((due.reshape(self._cycles, -1) - actual) / self._counts, float)
-        return error, velocity, np.asarray(rows[CURRENT] * 1e-3, float)
+        return error, velocity, np.asarray(rows[CURRENT] * self._ampere, float)
 
     def _seen(self, error: Floats, velocity: Floats, current: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the same as they reach the master."""

@@ -16,6 +16,7 @@ from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
+from drive_env.drives.currents import counts_per_ampere
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control
@@ -383,7 +384,7 @@ class Tracking(VectorEnvironment):
         self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
 
     def _profile_scales(self) -> Floats:
-        """Return raw units of the target per unit of the reference's row: 1, in cst mA per inc/s^2."""
+        """Return raw units of the target per unit of the reference's row: 1, in cst counts of torque per inc/s^2."""
         config, drives = self.config, self.drives
         if config.mode != "cst":
             return np.ones(drives.num_axes)
@@ -391,7 +392,8 @@ class Tracking(VectorEnvironment):
         assert config.motor is not None
         motor = find_motor(config.motor)
         inertia = cycle.COMMISSIONED_INERTIA * motor.inertia
-        return 1e3 * inertia / motor.torque_constant * 2.0 * np.pi / np.repeat(self._per_turn, self._axes)
+        per_rad = counts_per_ampere(drives) * inertia / motor.torque_constant
+        return np.asarray(per_rad * 2.0 * np.pi / np.repeat(self._per_turn, self._axes))
 
     # --- an episode -----------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:

@@ -102,6 +102,8 @@ class FirmwareStages:
         tick: Stages (drive, rates, k): current loop and power stage, in tick k of a window.
         power_on: Stages (drive, lane) that begin anew what belongs to its own fields.
         halt: Stages (drive, lane) that take its own fields of a machine that left physics back to finite numbers.
+        remote: Stage (drive, lane) -> whether the axis takes commands; one that does not ignores the controlword, and
+            statusword bit 9 is 0. None: always.
     """
 
     name: str
@@ -117,6 +119,7 @@ class FirmwareStages:
     tick: Sequence[Stage]
     power_on: Sequence[Stage]
     halt: Sequence[Stage]
+    remote: Stage | None = None
 
 
 class Firmware(NamedTuple):
@@ -279,6 +282,8 @@ def reset_shared_state(drive, lane):
     drive.stopping[lane] = 0
     drive.set_point_valid[lane] = 0
     drive.set_point_acknowledged[lane] = 0
+    drive.set_point_waiting[lane] = 0
+    drive.mode_wait[lane] = 0.0
     drive.target_reached[lane] = 0
     drive.drive_function[lane] = 0.0
     drive.stage_on[lane] = 0.0
@@ -316,15 +321,25 @@ class _Events(NamedTuple):
     write_mode: Stage
 
 
-def _events(causes_gone: Stage, cause_bits: Stage) -> _Events:
+@inlined
+def _always(drive, lane):
+    return True
+
+
+def _events(causes_gone: Stage, cause_bits: Stage, remote: Stage) -> _Events:
     @inlined
     def tell_state(drive, lane):
         """Write the statusword."""
         fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane) | cause_bits(drive, lane))
+        if not remote(drive, lane):
+            drive.statusword[lane] &= ~cia402.REMOTE.value
 
     @stage
     def write_controlword(drive, lane, word):
         """Process a write of 6040h completely: fault reset edge, state commands, new set-point, statusword."""
+        if not remote(drive, lane):
+            tell_state(drive, lane)
+            return
         before = drive.controlword[lane]
         drive.controlword[lane] = word
         if word & cia402.FAULT_RESET and not before & cia402.FAULT_RESET:
@@ -338,10 +353,8 @@ def _events(causes_gone: Stage, cause_bits: Stage) -> _Events:
 
     @stage
     def write_mode(drive, lane, mode):
-        """Process a write of 6060h: the mode changes at once."""
-        drive.mode[lane] = mode
-        if mode != drive.mode_display[lane]:
-            modes.change_mode(drive, lane)
+        """Process a write of 6060h."""
+        modes.request_mode(drive, lane, mode)
         tell_state(drive, lane)
 
     return _Events(tell_state, write_controlword, write_mode)
@@ -587,7 +600,7 @@ def compose(stages: FirmwareStages, source: str) -> Firmware:
     layout = RecordLayout((*fields.PARAMETERS, *stages.parameters), (*fields.STATE, *stages.state))
     machinery = _machinery(stages.name, layout, source)
     guard = protection_of(stages.causes)
-    events = _events(guard.causes_gone, guard.statusword_bits)
+    events = _events(guard.causes_gone, guard.statusword_bits, stages.remote or _always)
     supervise = _supervise(stages, guard.protect, events.tell_state)
     start_window, tick = in_turn(stages.window, 2), in_turn(stages.tick, 3)
     window = _window(start_window, tick)

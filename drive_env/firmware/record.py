@@ -77,6 +77,10 @@ class RecordLayout:
         set_lanes(records, "live", np.ones(num_axes, np.int32))
         return records
 
+    def has(self, name: str) -> bool:
+        """Return whether the records have a field of that name."""
+        return name in (self.dtype.names or ())
+
     def place(self, name: str, part: int = 0) -> tuple[bool, int]:
         """Return whether a field is real, and the index of its lane 0 among the record's numbers of that kind."""
         dtype, start = self.dtype.fields[name][:2]  # type: ignore[index]

@@ -15,7 +15,8 @@ from canopen.objectdictionary import ODVariable, datatypes
 from drive_env import cia402
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
-from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, Entry, ObjectDictionary, ObjectName, read_eds
+from drive_env.dictionary.drive_eds import axes_of, read_types
+from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role
 
 Key = tuple[int, int]
@@ -44,13 +45,6 @@ EMERGENCY_NAMES = {
 # Of a drive that is known by its EDS alone. CiA 301: 0 to 240 wait for the next SYNC, and 1 is what every device with
 # synchronous RPDOs takes. CiA 402: maximum current 6073h, in the thousandths of 6077h. Stores and restores erase flash,
 # for which users of python-canopen report up to seconds.
-# Objects whose integers are taken apart bit by bit, or tell where an axis is and goes: their length [bits] by CiA 402.
-_BITS = {
-    8: (cia402.MODE, cia402.MODE_DISPLAY),
-    16: (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.TORQUE_ACTUAL, cia402.TARGET_TORQUE, cia402.QUICK_STOP_OPTION),
-    32: (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TARGET_POSITION, cia402.TARGET_VELOCITY),
-}
-KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
 MODE, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and a wait of 1e300 s is none that an operating system knows
 CIA_402 = MasterHints(rpdo_type=1, timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
@@ -205,42 +199,17 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
             known,
             known.master,
             cycle=1.0 / known.communication_rate,
-            _types=_read_types(known.eds),
+            _types=read_types(known.eds),
         )
     path = Path(eds)
     if not path.is_file():
         raise ValueError(f"there is no EDS at {path}; give the path of the drive's .eds file")
     try:
-        dictionary, types = ObjectDictionary(path, roles=CIA_402_ROLES), _read_types(path)
+        dictionary, types = ObjectDictionary(path, roles=CIA_402_ROLES), read_types(path)
     except Exception as error:  # the reader raises whatever the broken line leads to
         raise ValueError(f"{path} cannot be read as an EDS: {error}; see whether CiA 306 allows that line") from error
-    axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(8))
-    if axes == 0:
-        raise ValueError(f"{path} describes no CiA 402 drive: it has no statusword 6041h")
-    _check_kinds(path, types, axes)
+    axes = axes_of(path, types)
     return Description(path.stem, dictionary, axes, None, CIA_402, _types=types)
-
-
-def _check_kinds(path: Path, types: dict[Key, ODVariable], axes: int) -> None:
-    """Raise ValueError for objects that decide what a drive does and are no integers of CiA 402's length."""
-    for axis in range(axes):
-        for (index, sub), bits in KINDS.items():
-            variable = types.get((index + cia402.AXIS_OFFSET * axis, sub))
-            found = None if variable is None else INTEGER_TYPES.get(variable.data_type or 0)
-            if variable is not None and (found is None or found[0] != bits):
-                said = "of no integer type" if found is None else f"an integer of {found[0]} bits"
-                raise ValueError(
-                    f"{path}: {variable.index:04X}h {variable.name} is {said} ({variable.data_type or 0:04X}h), and "
-                    f"CiA 402 has it with {bits} bits; correct its DataType"
-                )
-
-
-def _read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
-    types = {}
-    for item in read_eds(path).values():
-        for variable in [item] if isinstance(item, ODVariable) else item.values():
-            types[variable.index, variable.subindex] = variable
-    return types
 
 
 def check_timeout(timeout: float) -> float:

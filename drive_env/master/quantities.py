@@ -17,6 +17,7 @@ from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import split_unit
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -62,7 +63,11 @@ def find_unit(name: str, increments: float | None) -> EnteredUnit | None:
     """Return a unit by name; `increments` per revolution, None where they are unknown."""
     if name in INCREMENTAL:
         return None if not increments else EnteredUnit(INCREMENTAL[name], 1.0 / increments)
-    return UNITS.get(name)
+    if name in UNITS:
+        return UNITS[name]
+    number, base = split_unit(name)
+    row = None if base == name else find_unit(base, increments)
+    return None if row is None else row._replace(factor=number * row.factor)
 
 
 def increments_per_revolution(drives: BusDrives) -> list[float | None]:

@@ -100,6 +100,9 @@ class Motor(NamedTuple):
         return 1.5 if self.kind == "pmsm" else 1.0  # two phases, or one, add up as they are
 
 
+# IEC 60449: up to 120 V of direct current is band I, extra-low voltage; a winding for it is not insulated for band II,
+# and one for band II hardly turns on band I.
+EXTRA_LOW_VOLTAGE = 120.0
 COPPER = 0.00393  # 1/K, relative change of a winding's resistance
 RATED_RISE = 80.0  # K, a class of insulation's common limit at 40 degC ambient
 RPM = 0.10471975511965977  # rad/s
@@ -473,9 +476,18 @@ def _rated_current(values: Mapping[str, float], torque: float, k: float | None, 
     return torque / k
 
 
-def motors_of(kinds: Collection[str]) -> dict[str, Motor]:
-    """Return the motors of the catalogue that are of one of these kinds, by name."""
-    return {name: motor for name, motor in MOTORS.items() if motor.kind in kinds}
+def is_extra_low(voltage: float) -> bool:
+    """Return whether a voltage [V] is of the class of 24 to 48 V drives, else that of drives on mains."""
+    return voltage <= EXTRA_LOW_VOLTAGE
+
+
+def motors_of(kinds: Collection[str], voltage: float | None = None) -> dict[str, Motor]:
+    """Return the motors of the catalogue of one of these kinds, and of a voltage's class [V] if given, by name."""
+    return {
+        name: motor
+        for name, motor in MOTORS.items()
+        if motor.kind in kinds and (voltage is None or is_extra_low(motor.voltage) == is_extra_low(voltage))
+    }
 
 
 MOTORS: dict[str, Motor] = {path.stem: load_motor(path) for path in sorted(FOLDER.glob("*.toml"))}

@@ -24,6 +24,7 @@ from drive_env.emulator.live_dictionary import (
     check_supported,
     refuse_same_mode,
 )
+from drive_env.emulator.prepared_record import PEAK_FIELD, RATIO_FIELD, SCALE_FIELD
 from drive_env.firmware import cycle
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
@@ -74,7 +75,10 @@ class Axis:
         self._queue = [self._place("emergency", k)[1] for k in range(EMERGENCY_QUEUE)]
         self._fsa = self._place("fsa")[1]
         self._fresh = self._place("set_point_fresh")[1]
-        self._scaler = self._place("position_scaler")[1]
+        layout = self._device.firmware.layout
+        self._scaler = self._place(SCALE_FIELD)[1]
+        names = (RATIO_FIELD, PEAK_FIELD) if layout.has(RATIO_FIELD) else ()
+        self._other_scales = {name: self._place(name)[1] for name in names}
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
         self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew
@@ -164,6 +168,8 @@ class Axis:
 
     def _unbound_reader(self, entry: Entry) -> Callable[[], int | str]:
         objects, number = self._objects, self.number
+        if (entry.index, entry.sub) in self._device.parts:
+            return lambda: int(objects.part(entry)[number])
 
         def read() -> int | str:
             values = objects.unbound(entry)
@@ -173,6 +179,8 @@ class Axis:
 
     def _unbound_writer(self, entry: Entry) -> Callable[[int], None]:
         objects, number = self._objects, self.number
+        if (entry.index, entry.sub) in {*self._device.parts, *self._device.shared_values}:
+            return lambda raw: objects.write_checked(entry, raw, number)
 
         def write(raw: int) -> None:
             values = objects.unbound(entry)
@@ -183,7 +191,11 @@ class Axis:
         return write
 
     def _factor(self, code: Code) -> float:
-        return float(code.factor(Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)))
+        device = self._device
+        others = {name: self._reals[place] for name, place in self._other_scales.items()}
+        lsb = device.current_full_scale / 32768.0
+        context = Context(self._reals[self._scaler], lsb, rated_current=device.rated_current, **others)
+        return float(code.factor(context))
 
     def _reader(self, code: Code) -> Callable[[], int]:
         memory, place = self._place(code.field, code.part)

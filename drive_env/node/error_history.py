@@ -47,7 +47,7 @@ OPTIONAL_CONDITIONS = {
 
 
 class ErrorHistory:
-    """Object 1003h: the last errors, the newest first; code in the lower word, the axis above.
+    """Object 1003h: the last errors, the newest first; code in the lower word, axis and number of the error above.
 
     Args:
         depth: Number of sub-indices.
@@ -56,10 +56,10 @@ class ErrorHistory:
     def __init__(self, depth: int) -> None:
         self._errors: deque[int] = deque(maxlen=depth)
 
-    def add(self, code: int, axis: int = 0) -> None:
-        """Note an error; code 0000h is none."""
+    def add(self, code: int, axis: int = 0, number: int = 0) -> None:
+        """Note an error; code 0000h is none. `number` is the device's own of the error."""
         if code:
-            self._errors.appendleft(code | axis << 16)
+            self._errors.appendleft(code | axis << 16 | (number & 0x3F) << 24)
 
     def read(self, sub: int) -> int:
         """Return a sub-index; 08000024h of one that holds no error yet."""

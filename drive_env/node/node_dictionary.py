@@ -66,7 +66,10 @@ class NodeDictionary:
             return "bus"
         key = (entry.index, entry.sub)
         is_command = key in self._module.commands or key in self._device.unsupported
-        if entry.access != "rw" or entry.bits is None or entry.pdo_mappable or is_command:
+        stores_mapped = self._device.canopen.quirks.stores_mapped
+        if entry.pdo_mappable and not (stores_mapped and not self._commands(entry.index)):
+            return None
+        if entry.access != "rw" or entry.bits is None or is_command:
             return None
         if 0x1000 <= entry.index <= 0x1FFF:
             return "communication"
@@ -74,6 +77,11 @@ class NodeDictionary:
             return "module"
         axis, base = self._device.locate(entry.index)
         return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
+
+    def _commands(self, index: int) -> bool:
+        """Return whether an object that a PDO can carry commands something."""
+        axis_0 = self._device.locate(index)[1]
+        return axis_0 in cia402.COMMANDED or axis_0 in self._device.master.commands
 
     def _make(self, entry: Entry) -> ObjectPort:
         if self._module.owns(entry):

@@ -14,6 +14,11 @@ from drive_env.node.axis import ObjectPort
 _RANK = {"": 0, "set_point": 0, "mode": 1, "controlword": 2}
 
 
+def order_of_writing(events: Sequence[str]) -> list[int]:
+    """Return the order in which objects take effect whose writes set off these events."""
+    return sorted(range(len(events)), key=lambda k: _RANK[events[k]])
+
+
 class MappedObjects:
     """Objects in the order in which they travel.
 
@@ -29,8 +34,7 @@ class MappedObjects:
         self._layout = struct.Struct("<" + "".join(letters))
         self.size = self._layout.size
         self._readers = [port.read for port in ports]
-        order = sorted(range(len(ports)), key=lambda k: _RANK[ports[k].event])
-        self._plan = [(k, ports[k]) for k in order]
+        self._plan = [(k, ports[k]) for k in order_of_writing([port.event for port in ports])]
         self._modes = [(k, port) for k, port in self._plan if port.event == "mode"]
 
     def __len__(self) -> int:

@@ -2,17 +2,19 @@
 
 Sync manager 2 carries what the master sends (outputs), sync manager 3 what the drive answers (inputs). 1C12h and 1C13h
 name the mapping objects that each carries, and those the objects, one behind the other without gaps. An image is not
-bound to the 8 bytes of a frame on CAN. It is changed from the outside in: no assignment (1C12h:00 = 0), no entries
+bound to the 8 bytes of a frame on CAN. Some devices have images that are ready-made (`fixed_images.py`), and no mapping
+objects: 1C12h and 1C13h name one of these. It is changed from the outside in: no assignment (1C12h:00 = 0), no entries
 (1600h:00 = 0), entries, their number, the assignment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
+from drive_env.devices import Device
 from drive_env.dictionary.aborts import (
     SUB_INDEX_ZERO_IN_USE,
     UNSUPPORTED_ACCESS,
@@ -20,53 +22,44 @@ from drive_env.dictionary.aborts import (
     WRONG_STATE,
     ObjectAccessError,
 )
-from drive_env.dictionary.access import check_allowed, check_limits
-from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.access import check_allowed, check_limits, check_writable
+from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.node import mapping
 from drive_env.node.axis import Axis, ObjectPort
+from drive_env.node.fixed_images import PackedFields, fixed_images
 from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.process_data import MappedObjects
 
 SYNC_MANAGER_TYPES = 0x1C00
 OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+SYNCHRONISATION = (0x1C32, 0x1C33)  # of both
 ASSIGNMENTS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}  # and the mappings that each can
 
 
-class ProcessImage:
-    """The process image of a device with sync managers, in front of the axes of an emulated one.
+class ImageObjects:
+    """The objects of a process image, and the image as they make it; for use after `connect`.
 
     Args:
-        drives: The emulated drives.
-        first_axis: Number of the device's first axis among the drives'.
+        device: Whose they are.
+        entries: Its dictionary.
         may_change: Tells whether the image may be changed now; a node of EtherCAT allows it in pre-operational alone.
 
     Raises:
-        ValueError: For a device without sync managers, or axes that the drives do not have.
-
-    Attributes:
-        dictionary: All objects by index and sub-index; the image's among them.
-        commands: Objects whose write commands something: none.
+        ValueError: For a device without sync managers.
     """
 
-    def __init__(
-        self, drives: EmulatedDrives, first_axis: int = 0, may_change: Callable[[], bool] = lambda: True
-    ) -> None:
-        device, objects = drives.device, drives.inside.objects
-        entries = objects.entries
+    def __init__(self, device: Device, entries: ObjectDictionary, may_change: Callable[[], bool]) -> None:
         missing = [index for index in ASSIGNMENTS if not entries.has(index)]
         if missing:
             raise ValueError(
                 f"{device.name} has no process image: its dictionary lacks {missing[0]:04X}h; its process data are PDOs"
             )
-        if not 0 <= first_axis <= drives.num_axes - device.num_axes:
-            raise ValueError(
-                f"the image of {device.name} carries {device.num_axes} axes from first_axis={first_axis} on, and there "
-                f"are {drives.num_axes}: take a load, or a number of machines, with {device.num_axes} axes"
-            )
-        self.commands: dict[tuple[int, int], Callable[[int], None]] = {}
         self._may_change = may_change
         self._allowed = device.allowed_values
+        self._entries = entries
+        self._roles = device.roles
         carried = {direction: [i for i in indices if entries.has(i)] for direction, indices in ASSIGNMENTS.items()}
         # Of CANopen's PDOs, which the device may have too, each has a communication parameter 200h below its mapping.
         self._mappings = {
@@ -75,11 +68,14 @@ class ProcessImage:
             for index in indices
             if not entries.has(index - 0x200)
         }
-        owned = {SYNC_MANAGER_TYPES, *ASSIGNMENTS, *self._mappings}
+        self._fixed = fixed_images(device.presets.parent)
+        owned = {SYNC_MANAGER_TYPES, *ASSIGNMENTS, *SYNCHRONISATION, *self._mappings}
         self._factory = {(entry.index, entry.sub): _number(entry) for entry in entries if entry.index in owned}
         self._values = dict(self._factory)
-        axes = [Axis(objects, first_axis + k) for k in range(device.num_axes)]
-        self.dictionary = NodeDictionary(device, entries, self, axes)
+
+    def connect(self, port: Callable[[int, int], ObjectPort]) -> None:
+        """Take the objects that are mapped from the node's dictionary, by index and sub-index."""
+        self._port_of = port
         self._configure()
 
     # --- the image --------------------------------------------------------------------------------------------------
@@ -114,6 +110,12 @@ class ProcessImage:
     def restart(self) -> None:
         """Bring the factory's image back, as a device does that is switched on."""
         self._values.update(self._factory)
+        for direction, role in ((OUTPUTS, Role.OUTPUT_IMAGE), (INPUTS, Role.INPUT_IMAGE)):
+            key = self._roles.get(role)
+            if key is not None:  # a register of the device's own says which image it begins with
+                raw = self._port_of(*key).read()
+                assert isinstance(raw, int), "the number of an image"
+                self._values[direction, 1] = raw
         self._configure()
 
     # --- the objects ------------------------------------------------------------------------------------------------
@@ -131,18 +133,49 @@ class ProcessImage:
 
         return ObjectPort(entry, lambda: self._values[key], partial(self._check, entry), write)
 
+    def write_whole(self, index: int, raws: Sequence[int]) -> None:
+        """Replace an object's sub-indices from 1 on by some; a refusal leaves them as they were.
+
+        Raises:
+            ObjectAccessError: As for writes one by one, number of entries 0 before and their number after.
+        """
+        before = dict(self._values)
+        try:
+            for sub, raw in ((0, 0), *enumerate(raws, 1), (0, len(raws))):
+                port = self.port(self._find(index, sub))
+                check_writable(port.entry)
+                port.check(raw)
+                self._values[index, sub] = raw
+        except ObjectAccessError:
+            self._values = before
+            raise
+        self._configure()
+
+    def writes_whole(self, index: int) -> bool:
+        """Return whether an object's number of entries can be written: mapping and assignment."""
+        return index in ASSIGNMENTS or index in self._mappings
+
+    def mapped(self, direction: int) -> list[tuple[int, list[int]]]:
+        """Return what `OUTPUTS` or `INPUTS` carry: mapping objects, and the entries of each as they are written.
+
+        A ready-made image has no mapping object, and so no entries.
+        """
+        return [
+            (index, [self._values[index, sub] for sub in range(1, self._values.get((index, 0), 0) + 1)])
+            for index in self._assigned(direction)
+        ]
+
     # --- inside -----------------------------------------------------------------------------------------------------
     def _configure(self) -> None:
         """Take over what the objects say."""
         self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
 
-    def _image(self, direction: int) -> MappedObjects:
-        mapped = [
-            mapping.parse(self._values[index, sub])
-            for index in self._assigned(direction)
-            for sub in range(1, self._values[index, 0] + 1)
-        ]
-        return MappedObjects([self.dictionary.port(index, sub) for index, sub, _ in mapped])
+    def _image(self, direction: int) -> MappedObjects | PackedFields:
+        assigned = self._assigned(direction)
+        if assigned and assigned[0] in self._fixed:
+            return PackedFields(self._fixed[assigned[0]].fields, self._port_of)
+        mapped = [mapping.parse(raw) for _, raws in self.mapped(direction) for raw in raws]
+        return MappedObjects([self._port_of(index, sub) for index, sub, _ in mapped])
 
     def _assigned(self, direction: int) -> list[int]:
         return [self._values[direction, sub] for sub in range(1, self._values[direction, 0] + 1)]
@@ -163,9 +196,15 @@ class ProcessImage:
         direction = entry.index
         self._check_sub_index(entry)
         for index in [self._values[direction, sub] for sub in range(1, raw + 1)] if entry.sub == 0 else [raw]:
-            if self._mappings.get(index) != direction:
-                known = ", ".join(f"{one:04X}h" for one, way in self._mappings.items() if way == direction)
+            if not self._can_carry(direction, index):
+                numbers = [one for one in (*self._mappings, *self._fixed) if self._can_carry(direction, one)]
+                known = ", ".join(f"{one:04X}h" for one in numbers)
                 raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {index:04X}h; there is {known}")
+
+    def _can_carry(self, direction: int, index: int) -> bool:
+        """Return whether there is an image of that number, for that way."""
+        fixed = self._fixed.get(index)
+        return fixed.is_output == (direction == OUTPUTS) if fixed else self._mappings.get(index) == direction
 
     def _check_mapping(self, entry: Entry, raw: int) -> None:
         direction = self._mappings[entry.index]
@@ -187,7 +226,39 @@ class ProcessImage:
             )
 
     def _find(self, index: int, sub: int) -> Entry:
-        return self.dictionary.entries.find((index, sub))
+        return self._entries.find((index, sub))
+
+
+class ProcessImage(ImageObjects):
+    """The process image of a device with sync managers, in front of the axes of an emulated one.
+
+    Args:
+        drives: The emulated drives.
+        first_axis: Number of the device's first axis among the drives'.
+        may_change: Tells whether the image may be changed now.
+
+    Raises:
+        ValueError: For a device without sync managers, or axes that the drives do not have.
+
+    Attributes:
+        dictionary: All objects by index and sub-index; the image's among them.
+        commands: Objects whose write commands something: none.
+    """
+
+    def __init__(
+        self, drives: EmulatedDrives, first_axis: int = 0, may_change: Callable[[], bool] = lambda: True
+    ) -> None:
+        device, objects = drives.device, drives.inside.objects
+        super().__init__(device, objects.entries, may_change)
+        if not 0 <= first_axis <= drives.num_axes - device.num_axes:
+            raise ValueError(
+                f"the image of {device.name} carries {device.num_axes} axes from first_axis={first_axis} on, and there "
+                f"are {drives.num_axes}: take a load, or a number of machines, with {device.num_axes} axes"
+            )
+        self.commands: dict[tuple[int, int], Callable[[int], None]] = {}
+        axes = [Axis(objects, first_axis + k) for k in range(device.num_axes)]
+        self.dictionary = NodeDictionary(device, objects.entries, self, axes)
+        self.connect(self.dictionary.port)
 
 
 def _number(entry: Entry) -> int:

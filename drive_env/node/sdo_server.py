@@ -172,9 +172,9 @@ class SdoServer:
         check_writable(entry)
         is_expedited, has_size = data[0] & 0x02, data[0] & 0x01
         if is_expedited:
-            size = 4 - (data[0] >> 2 & 0x03) if has_size else _size(entry) or 4
+            size = 4 - (data[0] >> 2 & 0x03) if has_size else size_of(entry) or 4
             self._check_length(entry, size)
-            _store(port, data[4 : 4 + size])
+            take(port, data[4 : 4 + size])
         else:
             expected = int.from_bytes(data[4:8], "little") if has_size else None
             if expected is not None:
@@ -190,7 +190,7 @@ class SdoServer:
             self._check_length(transfer.entry, len(transfer.data))
         if data[0] & 0x01:
             self._check_length(transfer.entry, len(transfer.data), transfer.expected)
-            _store(transfer.port, bytes(transfer.data))
+            take(transfer.port, bytes(transfer.data))
             self._open = None
         toggle = transfer.toggle
         transfer.toggle ^= TOGGLE
@@ -236,7 +236,7 @@ class SdoServer:
             port = self._block_port
             assert port is not None
             self._check_length(port.entry, len(answer.data), self._block_size_said)
-            _store(port, answer.data)
+            take(port, answer.data)
         except ObjectAccessError as error:
             self._leftover = block.position
             self.block = None
@@ -258,7 +258,7 @@ class SdoServer:
 
     def _room(self, entry: Entry) -> int:
         """Return how many bytes an object takes at most."""
-        return self._longest_text if entry.bits is None else _size(entry)
+        return self._longest_text if entry.bits is None else size_of(entry)
 
     def _check_length(self, entry: Entry, size: int, expected: int | None = None) -> None:
         """Raise 0607xxxxh for data of another length [bytes] than the object's, or than the client announced."""
@@ -268,7 +268,7 @@ class SdoServer:
                     OUT_OF_MEMORY, f"{entry.label} has room for {self._longest_text} bytes, not {size}"
                 )
         else:
-            _check_length(entry, size)
+            check_length(entry, size)
         if expected is not None and size != expected:
             raise ObjectAccessError(
                 TOO_LONG if size > expected else TOO_SHORT, f"{size} bytes came, {expected} were announced"
@@ -290,25 +290,26 @@ def encode(entry: Entry, value: int | str) -> bytes:
     if isinstance(value, str):
         return value.encode("latin-1", "replace")
     assert entry.bits is not None, "a number has a width"
-    return value.to_bytes(_size(entry), "little", signed=entry.signed)
+    return value.to_bytes(size_of(entry), "little", signed=entry.signed)
 
 
-def _size(entry: Entry) -> int:
+def size_of(entry: Entry) -> int:
     """Return the length [bytes] of an object; 0 of a text, which is as long as it is."""
     return 0 if entry.bits is None else (entry.bits + 7) // 8
 
 
-def _check_length(entry: Entry, size: int) -> None:
+def check_length(entry: Entry, size: int) -> None:
     """Raise 06070012h or 06070013h for data of another length [bytes] than the object's."""
     if entry.bits is None:
         raise ObjectAccessError(WRONG_TYPE, f"{entry.label} is a text; only numbers can be written")
-    if size > _size(entry):
-        raise ObjectAccessError(TOO_LONG, f"{entry.label} has {_size(entry)} bytes, not {size}")
-    if size < _size(entry):
-        raise ObjectAccessError(TOO_SHORT, f"{entry.label} has {_size(entry)} bytes, not {size}")
+    if size > size_of(entry):
+        raise ObjectAccessError(TOO_LONG, f"{entry.label} has {size_of(entry)} bytes, not {size}")
+    if size < size_of(entry):
+        raise ObjectAccessError(TOO_SHORT, f"{entry.label} has {size_of(entry)} bytes, not {size}")
 
 
-def _store(port: ObjectPort, content: bytes) -> None:
+def take(port: ObjectPort, content: bytes) -> None:
+    """Write what the wire carries, of the object's length, to an object; ObjectAccessError if it does not take it."""
     if port.entry.bits is None:
         if port.write_text is None:
             raise ObjectAccessError(CANNOT_BE_STORED, f"{port.entry.label} is a text that cannot be written")

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,6 @@ from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
-from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -184,7 +183,6 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
-    return units.Context(
-        position_scaler=drives.read(Role.POSITION_SCALE)[axes].astype(float),
-        current_lsb=drives.device.current_full_scale / 32768.0,
-    )
+    whole = drives.inside.objects.context()
+    here: dict[str, Any] = {name: one[axes] for name, one in whole._asdict().items() if isinstance(one, np.ndarray)}
+    return whole._replace(**here)

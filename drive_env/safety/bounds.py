@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import split_unit
 from drive_env.master.description import Key
 from drive_env.master.errors import RefusedError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
@@ -36,6 +37,7 @@ ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (
     (cia402.QUICK_STOP_DECELERATION, 0),
 )
 COUNTED = "pps"  # speeds in increments per second
+BY_RATIO = ("velocity unit", "velocity unit/s")  # of which two objects say how many rpm they are
 BY_MINUTE = ("rpm", "rpm/s")  # which the scale of positions turns into increments; other units are not set off
 # A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
 SETTLED, SETTLED_TURNS = 200.0, 0.02
@@ -116,7 +118,7 @@ def rotor_limits(limits: Limits, drives: BusDrives, rotor: RotorAngle, here: Int
     return RotorLimits(
         turns + (given(low, count) - here) / rotor.scale,
         turns + (given(high, count) - here) / rotor.scale,
-        given(limits.velocity, count) * increments_per_count(_speed_unit(drives), rotor.scale) / scale,
+        given(limits.velocity, count) * increments_per_count(_speed_unit(drives), rotor) / scale,
         given(limits.following_error, count) / scale,
     )
 
@@ -147,14 +149,14 @@ def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors:
 
     known_scale = rotor.scale > 1.0
     unit = _speed_unit(drives)
-    count = increments_per_count(unit, rotor.scale)
+    count = increments_per_count(unit, rotor)
     told = ~np.isnan(count)
     top = _at_scale(given(limits.velocity, drives.num_axes), of_rotors.velocity * rotor.scale / count)
     velocity = _magnitude(drives, top, MAX_PROFILE_VELOCITY)
     ours = (velocity >= NO_LIMIT) & known_scale & told
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
-    braking = _rate(drives, QUICK_STOP_DECELERATION, rotor.scale)
+    braking = _rate(drives, QUICK_STOP_DECELERATION, rotor)
     # What a revolution counts may be mistaken: a speed in rpm is told by positions, too.
     by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
@@ -173,7 +175,7 @@ def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors:
             FOLLOWING_WINDOW,
         ),
         braking,
-        np.maximum.reduce([braking, *(_rate(drives, key, rotor.scale) for key in (ACCELERATION, DECELERATION))]),
+        np.maximum.reduce([braking, *(_rate(drives, key, rotor) for key in (ACCELERATION, DECELERATION))]),
         np.where(known_scale, REST_TURNS * rotor.scale, REST_INCREMENTS),
         ours,
         np.where(known_scale & (unit != COUNTED), np.maximum(DEFAULT_SPEED * rotor.scale, by_position), np.inf),
@@ -221,24 +223,28 @@ def _magnitude(drives: BusDrives, user: Floats, key: Key | None) -> Integers:
     return result
 
 
-def increments_per_count(unit: str, scale: Floats) -> Floats:
+def increments_per_count(unit: str, rotor: RotorAngle) -> Floats:
     """Return the increments a second (or second squared) of a count of a speed (or an acceleration), nan if unknown.
 
     Args:
         unit: As the EDS names it.
-        scale: Increments of a revolution, shape (num_axes,); 1 and less where they are not known.
+        rotor: Its scale: increments of a revolution, 1 and less where they are not known.
     """
-    if unit in (COUNTED, f"{COUNTED}^2"):
-        return np.ones(len(scale))
-    return np.where(scale > 1.0, scale / 60.0, np.nan) if unit in BY_MINUTE else np.full(len(scale), np.nan)
+    number, base = split_unit(unit)
+    scale = rotor.scale
+    if base in (COUNTED, f"{COUNTED}^2"):
+        return np.full(len(scale), number)
+    if base in BY_RATIO:
+        return np.where(scale > 1.0, number * scale / 60.0 * rotor.ratio, np.nan)
+    return np.where(scale > 1.0, number * scale / 60.0, np.nan) if base in BY_MINUTE else np.full(len(scale), np.nan)
 
 
-def _rate(drives: BusDrives, key: Key, scale: Floats) -> Floats:
+def _rate(drives: BusDrives, key: Key, rotor: RotorAngle) -> Floats:
     """Return a deceleration [inc/s^2]; 0 where the drive has none, or counts it in units that we do not know."""
     known = drives.description
     if not known.has(key):
         return np.zeros(drives.num_axes)
-    count = increments_per_count(known.dictionary.find(key).unit, scale)
+    count = increments_per_count(known.dictionary.find(key).unit, rotor)
     if np.isnan(count).all():
         return np.zeros(drives.num_axes)
     return np.asarray(read_own(drives, key, 0) * np.nan_to_num(count), float)

@@ -287,7 +287,7 @@ class Commands:
 
     def _check_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Raise SafetyError for a ramp that would let an axis that is turning run on."""
-        count = increments_per_count(entry.unit, self._axes.rotor.scale)
+        count = increments_per_count(entry.unit, self._axes.rotor)
         where = where & ~np.isnan(count)
         if not where.any():
             return
@@ -391,7 +391,7 @@ class Commands:
 
     def _ramp_count(self) -> NDArray[np.float64]:
         """Return the increments per second squared of a count of 6085h; nan where its unit tells none."""
-        return increments_per_count(self._known.find(QUICK_STOP_DECELERATION).unit, self._axes.rotor.scale)
+        return increments_per_count(self._known.find(QUICK_STOP_DECELERATION).unit, self._axes.rotor)
 
     def _refuse_mode(self, wrong: Mask, ramp: Integers | NDArray[np.float64]) -> None:
         for axis in np.flatnonzero(wrong).tolist():

@@ -71,10 +71,8 @@ class Limits:
         low, high = (None, None) if self.position is None else self.position
         given = {"position": low, "position's upper end": high}
         for name, value in (given | {n: getattr(self, n) for n in ("velocity", "current", "following_error")}).items():
-            if np.ndim(_values(value, 0.0)) and len(_values(value, 0.0)) not in (1, num_axes):
-                raise ValueError(
-                    f"{name} has {len(_values(value, 0.0))} values for {num_axes} axes; give one for all, or one each"
-                )
+            if (count := np.size(value)) not in (1, num_axes):  # type: ignore[arg-type]
+                raise ValueError(f"{name} has {count} values for {num_axes} axes; give one for all, or one each")
 
 
 def given(value: PerAxis | None, num_axes: int) -> NDArray[np.float64]:

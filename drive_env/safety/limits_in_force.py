@@ -27,7 +27,7 @@ from drive_env.safety.bounds import (
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT, Limits
 from drive_env.safety.objects import POSITION
-from drive_env.safety.rotor import HOME_OFFSET, read_scale
+from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -83,7 +83,9 @@ class LimitsInForce:
     def keep_place(self) -> None:
         """Note where the rotors are before an object is written that moves their scale; `place` is called after it."""
         position, scale = read_own(self._drives, POSITION, 0), read_scale(self._drives)
+        ratio = read_ratio(self._drives)
         with self._axes.lock:
+            self._axes.rotor.ratio = ratio
             self._axes.place(position, scale)
             self._axes.keep_place()
 
@@ -102,8 +104,9 @@ class LimitsInForce:
     def place(self) -> None:
         """Read where the rotors are and what a revolution counts; what moved scale or zero has not moved them."""
         position = read_own(self._drives, POSITION, 0)
-        scale = read_scale(self._drives)
+        scale, ratio = read_scale(self._drives), read_ratio(self._drives)
         with self._axes.lock:
+            self._axes.rotor.ratio = ratio
             self._axes.place(position, scale)
             self._must_place = False
             self.forget()
@@ -161,12 +164,25 @@ class LimitsInForce:
         except RefusedError:  # the EDS lists what the drive has not: the envelope alone watches then
             return
         switched_off = own == 0 and key in (FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED)
+        # An empty range becomes one by either end: the other is lent as well, if need be as far as the type goes.
+        no_range = key in (POSITION_LOW, POSITION_HIGH) and self._has_no_range(axis)
         value = max(min(limit, float(entry.high)), float(entry.low))
-        tighter = switched_off or (value < own if is_upper else value > own)
-        if tighter and math.isfinite(limit):
+        tighter = value < own if is_upper else value > own
+        if no_range or ((switched_off or tighter) and math.isfinite(limit)):
             self._lending.lend(key, axis, round(value))
         elif self._lending.is_lent(key, axis):
             self._lending.lend(key, axis, own)
+
+    def _has_no_range(self, axis: int) -> bool:
+        """Return whether an axis' own range is empty, which is none: any travel is tighter."""
+        known = self._drives.description.dictionary
+        if not all(self._drives.description.has(key) for key in (POSITION_LOW, POSITION_HIGH)):
+            return False
+        try:
+            low, high = (int(self._drives.read_axis(known.find(key), axis)) for key in (POSITION_LOW, POSITION_HIGH))
+        except RefusedError:
+            return False
+        return low >= high
 
     def _last_offset(self) -> Integers:
         if self.user.position is None:

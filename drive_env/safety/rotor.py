@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.dictionary.position_scale import PositionScale, position_scale
+from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import RefusedError
 
@@ -40,6 +40,7 @@ class RotorAngle:
         self._increments = np.zeros(num_axes, np.int64)
         self._turns = np.zeros(num_axes)
         self.scale = np.ones(num_axes)  # increments per revolution; 1 where the drive does not say
+        self.ratio = np.ones(num_axes)  # rpm of a velocity unit, of drives that have such
         self.is_placed = False
 
     def place(self, increments: Integers, scale: Floats, turns: Floats | None = None) -> None:
@@ -67,6 +68,26 @@ def _own_scale(description: Description) -> PositionScale | None:
 
 
 def scale_objects(description: Description) -> tuple[Key, ...]:
+    """Return the objects that say how many increments a revolution has, and how many rpm a velocity unit."""
+    ratio = _own_ratio(description)
+    return _position_objects(description) + (() if ratio is None else ratio.keys)
+
+
+def _own_ratio(description: Description) -> PositionScale | None:
+    ratio = velocity_ratio(description.dictionary.roles)
+    return ratio if ratio is not None and all(description.has(key) for key in ratio.keys) else None
+
+
+def read_ratio(drives: BusDrives) -> Floats:
+    """Return the rpm of a velocity unit of every axis; 1 of drives that have no such unit."""
+    ratio = _own_ratio(drives.description)
+    if ratio is None:
+        return np.ones(drives.num_axes)
+    known = drives.description.dictionary
+    return ratio.increments([drives.read_entry(known.find(key)).astype(float) for key in ratio.keys])
+
+
+def _position_objects(description: Description) -> tuple[Key, ...]:
     """Return the objects that say how many increments a revolution has."""
     own = _own_scale(description)
     if own is not None:
@@ -80,7 +101,7 @@ def scale_objects(description: Description) -> tuple[Key, ...]:
 
 def read_scale(drives: BusDrives) -> Floats:
     """Return the increments of a revolution of every axis; nan where the drive does not say."""
-    keys = scale_objects(drives.description)
+    keys = _position_objects(drives.description)
     known = drives.description.dictionary
     try:
         values = [drives.read_entry(known.find(key)).astype(float) for key in keys]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import increments_per_count, read_own
@@ -84,6 +85,7 @@ class StopRunner:
         self._cease = cease
         self._woken_at = 0.0
         self._told_of: set[int] = set()  # axes that are held under a weight
+        self._opened: set[int] = set()  # axes that were told last to take commands, not which
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
     def make_sure_of_ramps(self) -> None:
@@ -166,7 +168,7 @@ class StopRunner:
         for key, modes in SLOW_DOWN_RAMPS.items():
             if not self._drives.description.has(key):
                 continue
-            count = increments_per_count(self._known.find(key).unit, self._axes.rotor.scale)
+            count = increments_per_count(self._known.find(key).unit, self._axes.rotor)
             own = read_own(self._drives, key, 0) * np.nan_to_num(count)
             counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode without a ramp of its own has 6084h
             ramp = np.where(counts & np.isin(self._axes.mode, modes or self._axes.mode), np.minimum(ramp, own), ramp)
@@ -258,10 +260,24 @@ class StopRunner:
 
     def _send(self, axis: int, word: int) -> None:
         """Send a controlword without waiting for an answer."""
-        node, part = divmod(axis, self._drives.description.num_axes)
-        index, sub = self._drives.description.key(self._known.find(CONTROLWORD), part)
+        known = self._drives.description
+        node, part = divmod(axis, known.num_axes)
+        entry, value = self._known.find(CONTROLWORD), word
+        own_mode = self._own_mode(axis)
+        if own_mode is not None and axis not in self._opened:  # by turns, until it is heard
+            self._opened.add(axis)
+            entry, value = self._known.find(Role.MODE_GATE), own_mode
+        else:
+            self._opened.discard(axis)
         with logged():
-            self._drives.sdo(node).command(index, sub, word.to_bytes(2, "little"))
+            self._drives.sdo(node).command(*known.key(entry, part), known.encode(entry, value))
+
+    def _own_mode(self, axis: int) -> int | None:
+        """Return the drive's own mode with which an axis that ignores commands takes them; None of one that does."""
+        device = self._drives.device
+        if device is None or not device.mode_gate or cia402.matches(int(self._axes.status[axis]), cia402.REMOTE):
+            return None
+        return device.mode_gate.get(int(self._axes.mode[axis]))
 
     def _sample(self, axis: int) -> Sample:
         return Sample(float(self._axes.seen[axis]), int(self._axes.status[axis]), float(self._axes.speed[axis]))

@@ -16,6 +16,7 @@ from drive_env import cia402
 from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains
@@ -140,7 +141,7 @@ class Trials:
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
         speed = velocity / (scaler * per_increment(drives, cia402.VELOCITY_ACTUAL)) * 2.0 * np.pi
-        return momentum_balance(angle, speed, current * 1e-3, self._motor), origin
+        return momentum_balance(angle, speed, current * ampere_per_count(drives), self._motor), origin
 
     def run(
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
@@ -175,7 +176,7 @@ class Trials:
             aborted[phase] = stopped
             sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
             settling[phase], noise[phase], overshoot[phase] = move_terms(
-                position, current * 1e-3, move, self._t_0, self._motor.rated_current, target, sign
+                position, current * ampere_per_count(drives), move, self._t_0, self._motor.rated_current, target, sign
             )
             size = np.maximum(np.abs(move.distance), 1)
             error = wrapped(demand - position) / size
@@ -227,7 +228,7 @@ class Trials:
                 trace = self._record(objects, WATCH)
             traces.append(trace)
             down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
-            shaking = shakes(trace[cia402.TORQUE_ACTUAL], self._motor.rated_current)
+            shaking = shakes(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives), self._motor.rated_current)
             new = self._whole_lanes(down | shaking) & where & ~stopped
             if new.any():
                 write_gains(drives, incumbent, new)

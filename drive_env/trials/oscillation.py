@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 OSCILLATION = 0.4
 
 
-def shakes(milliamperes: NDArray[np.integer], rated_current: float) -> NDArray[np.bool_]:
+def shakes(current: NDArray[np.floating], rated_current: float) -> NDArray[np.bool_]:
     """Return which axes oscillate.
 
     Args:
-        milliamperes: Torque-producing current, a sample per millisecond [mA], shape (n, axes).
+        current: Torque-producing current, a sample per millisecond [A], shape (n, axes).
         rated_current: Of the motor [A].
     """
-    change = np.diff(milliamperes, axis=0) * 1e-3
+    change = np.diff(current, axis=0)
     return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated_current)

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.emulator.parameters import WIRING
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.trials.positioning import (
@@ -279,7 +280,7 @@ class RobustScore:
             free = drives.record(objects, SETTLED * CYCLE)
             drives.machine.load_torque = self._constant + self._load_torque
             loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
-        current = (free[cia402.TORQUE_ACTUAL] + free[Role.TORQUE_ERROR]) * 1e-3
+        current = (free[cia402.TORQUE_ACTUAL] + free[Role.TORQUE_ERROR]) * ampere_per_count(drives)
         direction = np.where(move.distance < 0, -1, 1)
         settling, noise, overshoot = move_terms(
             free[cia402.POSITION_ACTUAL].astype(float),
@@ -298,7 +299,7 @@ class RobustScore:
         least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         shape = self._axes
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
-        swings = swing(free[cia402.TORQUE_ACTUAL].astype(float) * 1e-3, drives.motor.rated_current)
+        swings = swing(free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives), drives.motor.rated_current)
         return (
             terms.each(lambda value: value.reshape(shape)),
             np.maximum(error, least).reshape(shape),

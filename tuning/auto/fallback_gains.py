@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
@@ -44,6 +45,7 @@ class FallbackGains(Observer):
         self.calm: Integers | None = None
         self.calmed: Mask = np.zeros(num_axes, bool)
         self._rated = rated_current
+        self._ampere: Floats | float | None = None  # of a count of the current
         self._most = windows
         self._windows = np.zeros(num_axes, np.int64)
 
@@ -63,7 +65,9 @@ class FallbackGains(Observer):
         """Give slow gains to axes that have shaken too long."""
         if self.calm is None or cia402.TORQUE_ACTUAL not in asked or len(trace) != WATCH:
             return
-        shaking = shakes(trace[cia402.TORQUE_ACTUAL], self._rated)
+        if self._ampere is None:
+            self._ampere = ampere_per_count(below)
+        shaking = shakes(trace[cia402.TORQUE_ACTUAL] * self._ampere, self._rated)
         self._windows = np.where(shaking, self._windows + 1, 0)
         late = self._windows >= self._most
         if late.any():

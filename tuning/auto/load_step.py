@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import detrend
 
 from drive_env import cia402, motion
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import machine_of
 from drive_env.trials import response
 from drive_env.trials.positioning import CYCLE, wrapped
@@ -43,6 +44,7 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     from mechanics.shaft import one, way
 
     drives = target.drives
+    per_count = ampere_per_count(drives)
     machines = where.reshape(-1, target.axes_per_machine).all(axis=1)
     axes = np.repeat(machines, target.axes_per_machine)
     if not axes.any():
@@ -69,11 +71,11 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     loaded = windows[0]
     raw = np.concatenate([rest[cia402.POSITION_ACTUAL], loaded[cia402.POSITION_ACTUAL]])
     angle = wrapped(raw - raw[0]) / target.increments()
-    current = np.concatenate([rest[cia402.TORQUE_ACTUAL], loaded[cia402.TORQUE_ACTUAL]]) * 1e-3
+    current = np.concatenate([rest[cia402.TORQUE_ACTUAL], loaded[cia402.TORQUE_ACTUAL]]) * per_count
     t = np.arange(len(angle), dtype=np.float64) * CYCLE
     # An integrator that is still on its way is no swing.
     ends = [
-        detrend(1e-3 * window[cia402.TORQUE_ACTUAL][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0)
+        detrend(per_count * window[cia402.TORQUE_ACTUAL][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0)
         for window in windows
     ]
     swing = np.max(ends, axis=0) / target.motor.rated_current

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
@@ -140,6 +141,7 @@ class ProvingGround:
         low, high = room
         self.reach: Floats = np.where(high >= -low, high, low)
         motor, drives = target.motor, target.drives
+        self._ampere = ampere_per_count(drives)
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
         if target.linked:
             # What pulls at one thing goes as far and as fast as its slowest end.
@@ -238,7 +240,7 @@ class ProvingGround:
         size = np.maximum(np.abs(self.move.distance), 1)
         reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
         settling, noise, overshoot = move_terms(
-            position.astype(float), current * 1e-3, self.move, self._t_0, rated, away, way
+            position.astype(float), current * self._ampere, self.move, self._t_0, rated, away, way
         )
         # Of axes that take no part the gains may be none.
         known = self.target.device.gains
@@ -249,7 +251,7 @@ class ProvingGround:
         self._origin = np.where(where, away, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
-        return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing, measured)
+        return Shown(t, demand, actual, current * self._ampere, where, reason, costs, swing, measured)
 
     def noise(self, gains: Integers, where: Mask) -> Floats:
         """Return what the measurement of their current makes of the swing at rest of axes, over the rated one (RMS).
@@ -277,7 +279,7 @@ class ProvingGround:
         slow[:, outer] = self.safe[:, outer]
         write_gains(drives, slow, where)
         drives.advance(QUIETENING * CYCLE)
-        current = drives.record([cia402.TORQUE_ACTUAL], NOISE_CYCLES * CYCLE)[cia402.TORQUE_ACTUAL] * 1e-3
+        current = drives.record([cia402.TORQUE_ACTUAL], NOISE_CYCLES * CYCLE)[cia402.TORQUE_ACTUAL] * self._ampere
         change = np.sqrt(0.5 * np.mean(np.diff(current, axis=0) ** 2, axis=0))
         write_gains(drives, gains, where)
         return np.where(where, np.minimum(current.std(axis=0), change) / self.target.motor.rated_current, noise)
@@ -304,7 +306,7 @@ class ProvingGround:
                 worst[stopped] = OSCILLATION
                 self._shaken |= stopped
                 seen.append(window[cia402.TORQUE_ACTUAL])
-            worst = np.maximum(worst, np.concatenate(seen[SETTLED:]).std(axis=0) * 1e-3 / rated)
+            worst = np.maximum(worst, np.concatenate(seen[SETTLED:]).std(axis=0) * self._ampere / rated)
         return worst
 
     def _hold_still(self, where: Mask) -> None:
@@ -325,7 +327,7 @@ class ProvingGround:
 
     def _shakes(self, seen: Trace) -> Mask:
         """Return which axes oscillated in a recording, or are off at its end."""
-        shaking = shakes(seen[cia402.TORQUE_ACTUAL], self.target.motor.rated_current)
+        shaking = shakes(seen[cia402.TORQUE_ACTUAL] * self._ampere, self.target.motor.rated_current)
         return np.asarray(shaking | ~cia402.matches(seen[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED))
 
     def _stop(self, where: Mask) -> Mask:

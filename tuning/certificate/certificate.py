@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.whole_file import content_hash
 
 if TYPE_CHECKING:
@@ -239,7 +240,7 @@ def envelope(target: Target) -> dict[str, float]:
         "current during identification [A]": np.full(target.num_axes, target.current),
     }
     if (limit := target.device.roles.get(Role.CURRENT_LIMIT)) is not None:
-        rows[f"current in moves, {limit[0]:04X}h [A]"] = target.drives.read(limit) * 1e-3
+        rows[f"current in moves, {limit[0]:04X}h [A]"] = target.drives.read(limit) * ampere_per_count(target.drives)
     names = [""] if target.num_axes == 1 else [f"axis {axis}: " for axis in range(target.num_axes)]
     return {f"{name}{what}": float(row[axis]) for axis, name in enumerate(names) for what, row in rows.items()}
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import to_counts
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.wiring import Halls, judge_halls
@@ -116,7 +117,7 @@ def _push(working: Working) -> list[Estimate]:
             for share, quarter in PUSHES:
                 # As much forth as back, so that the rotor ends at rest and where it was.
                 sign = np.concatenate([np.repeat((1.0, -1.0, -1.0, 1.0), quarter), np.zeros(quarter)])
-                raw = np.where(waiting, sign[:, None] * np.rint(1e3 * share * working.current), 0).astype(np.int64)
+                raw = np.where(waiting, sign[:, None] * to_counts(drives, share * working.current), 0).astype(np.int64)
                 angle = working.angle(
                     drives.record([cia402.POSITION_ACTUAL], len(raw) * CYCLE, play={cia402.TARGET_TORQUE: raw})[
                         cia402.POSITION_ACTUAL

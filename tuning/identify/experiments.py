@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
 from drive_env.safety.envelope import swinging_allowed
@@ -233,7 +234,7 @@ class Experiments:
         causes = [] if alive.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where & ~alive):
             self.refuse(int(k), NAMES[4:], f"the drive switched off while it held the axis: {causes[k]}")
-        return np.asarray(trace[cia402.TORQUE_ACTUAL][-STEADY:].mean(axis=0) * 1e-3)
+        return np.asarray(trace[cia402.TORQUE_ACTUAL][-STEADY:].mean(axis=0) * ampere_per_count(drives))
 
     def take_windings(self, working: Working, windings: list[Winding]) -> None:
         """Take resistance and inductance."""

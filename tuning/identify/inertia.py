@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.units import RPM
+from drive_env.drives.currents import ampere_per_count
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import as_chip, write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
@@ -190,7 +191,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
             play={cia402.TARGET_VELOCITY: raw},
         )
         angles.append(working.angle(trace[cia402.POSITION_ACTUAL]))
-        currents.append(trace[cia402.TORQUE_ACTUAL] * 1e-3)
+        currents.append(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives))
         alive &= still_enabled(working, trace[cia402.STATUSWORD][-1])
         error = way[k + len(raw) - 1] - angles[-1][-1]
     return np.concatenate(angles), np.concatenate(currents), alive
@@ -232,7 +233,8 @@ def are_linked(working: Working) -> bool:
             [cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], len(raw) * CYCLE, play={cia402.TARGET_VELOCITY: raw}
         )
         if sign > 0.0:
-            current, angle = trace[cia402.TORQUE_ACTUAL] * 1e-3, working.angle(trace[cia402.POSITION_ACTUAL])
+            current = trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives)
+            angle = working.angle(trace[cia402.POSITION_ACTUAL])
             rise = current[-STILL // 2 :].mean(axis=0) - current[: STILL // 2].mean(axis=0)
             pulled = np.abs(rise) > LINKED_CURRENT * working.current
             pulled |= np.abs(angle[-1] - angle[0]) > LINKED_WAY * np.abs(way)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.gains import cascade_columns, per_chip
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
@@ -111,6 +112,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
     room = np.maximum(working.current - np.abs(holding), 0.0)
     levels, blocks = _levels(repeats)
     in_real_time = not drives.time_waits
+    per_count = ampere_per_count(drives)
     # Where time does not wait for the reads, first only: how long do they take?
     for played in (np.zeros(PROBE), levels) if in_real_time else (levels,):
         rows = len(played)
@@ -124,19 +126,19 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
             speed = (angle[k] - angle[max(k - 2, 0)]) / (2 * CYCLE)
             steer = -stiffness * (angle[k] - working.base) - damping * speed
             asked = np.clip(holding + played[k] * room + steer, -working.current, working.current)
-            raw = np.where(working.where, np.rint(1e3 * asked), 0).astype(np.int64)
-            demand[k] = raw * 1e-3
+            raw = np.where(working.where, to_counts(drives, asked), 0)
+            demand[k] = raw * per_count
             trace = drives.record(
                 [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], CYCLE, play={cia402.TARGET_TORQUE: raw[None, :]}
             )
-            current[k] = trace[cia402.TORQUE_ACTUAL][0] * 1e-3
+            current[k] = trace[cia402.TORQUE_ACTUAL][0] * per_count
             duty_sum[k + 1] = drives.read(Role.TORQUE_ERROR_SUM)
             angle[k + 1] = working.angle(drives.read(cia402.POSITION_ACTUAL))
             times[k + 1] = time.perf_counter()
         late = float(np.mean(np.diff(times) > LATE * CYCLE)) if in_real_time else 0.0
         if late > MOST_LATE:
             break
-    current[rows] = drives.read(cia402.TORQUE_ACTUAL) * 1e-3
+    current[rows] = drives.read(cia402.TORQUE_ACTUAL) * per_count
     alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     step = (times[-1] - times[0]) / rows if late > MOST_LATE else CYCLE
     return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks[:rows], alive, step)
@@ -443,5 +445,5 @@ def _none(reason: str) -> Winding:
 def to_torque_mode(working: Working, holding: Floats) -> None:
     """Go from a velocity mode to cst, with the currents that hold the axes [A]."""
     drives = working.target.drives
-    drives.write(cia402.TARGET_TORQUE, np.rint(1e3 * holding).astype(np.int64), where=working.where)
+    drives.write(cia402.TARGET_TORQUE, to_counts(drives, holding), where=working.where)
     motion.select_mode(drives, "cst", working.where)

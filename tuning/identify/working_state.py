@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import bandwidth_gains, write_gains
@@ -159,9 +160,9 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
         # No axis is at both ends: switches that say so are not there.
         unwired = fresh & (drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
         drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
-    own = before[Role.CURRENT_LIMIT] * 1e-3
+    own = before[Role.CURRENT_LIMIT] * ampere_per_count(drives)
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
-    drives.write(Role.CURRENT_LIMIT, np.rint(current * 1e3).astype(np.int64), where=axes)
+    drives.write(Role.CURRENT_LIMIT, to_counts(drives, current), where=axes)
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.trials.positioning import wrapped
@@ -151,13 +152,14 @@ class Shaker:
         if fast is not None:
             within = np.repeat(inside, windows)
             quick = [(signal - np.repeat(path, windows, axis=0))[within] for signal in fast]
+        ampere = ampere_per_count(self._drives)
         return Pass(
             played[chosen],
             (answer * self.per_count - path)[chosen],
-            np.asarray(seen[cia402.TORQUE_ACTUAL][chosen] * 1e-3),
+            np.asarray(seen[cia402.TORQUE_ACTUAL][chosen] * ampere),
             quick[0],
             quick[1],
-            np.abs(seen[cia402.TORQUE_ACTUAL]).max(axis=0) * 1e-3,
+            np.abs(seen[cia402.TORQUE_ACTUAL]).max(axis=0) * ampere,
             enabled,
         )
 
@@ -203,7 +205,7 @@ class Shaker:
         fast = trace_loops(self._drives, [*names, "torque_meas"], duration, play).signals
         windows = len(fast[names[0]]) // len(raw)
         seen = {SEEN[self._loop]: np.rint(fast[names[1]][::windows] / self.per_count).astype(np.int64)}
-        seen[cia402.TORQUE_ACTUAL] = np.rint(fast["torque_meas"][::windows] * 1e3).astype(np.int64)
+        seen[cia402.TORQUE_ACTUAL] = to_counts(self._drives, fast["torque_meas"][::windows])
         return seen, (fast[names[0]], fast[names[1]]), _enabled(self._drives)
 
     def _go_back(self, where: Mask) -> None:

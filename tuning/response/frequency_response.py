@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.gains import check_linear_model, read_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.dead_time import dead_time_resistance
@@ -228,7 +229,7 @@ class _Measurement:
     # --- how strongly ---------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
         """Return what may flow [A]: the user's limit, or the drive's own."""
-        own = self._target.drives.read(Role.CURRENT_LIMIT) * 1e-3
+        own = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)
         return np.asarray(np.minimum(self._target.current, own))
 
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
@@ -321,7 +322,7 @@ class _Measurement:
         return velocity_noise(self._device, plant)
 
     def _note_limits(self, peak: Floats, where: Mask) -> None:
-        limit = self._target.drives.read(Role.CURRENT_LIMIT) * 1e-3
+        limit = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)
         for axis in np.flatnonzero(where & (peak > 0.98 * limit)):
             self._notes[axis].append(
                 f"the current reached its limit, {limit[axis]:.2f} A, more than the excitation: the loop oscillates, "

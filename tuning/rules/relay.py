@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.rules.lags import slow_enough, velocity_lag
 from tuning.rules.optima import take_current
@@ -136,7 +137,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     drives, n = target.drives, target.num_axes
     axes = np.ones(n, bool) if where is None else where
     dry = np.zeros(n) if coulomb is None else np.nan_to_num(np.asarray(coulomb, float))
-    limit = OF_LIMIT * drives.read(Role.CURRENT_LIMIT) * 1e-3
+    limit = OF_LIMIT * drives.read(Role.CURRENT_LIMIT) * ampere_per_count(drives)
     height = np.minimum(
         np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
     )
@@ -145,18 +146,19 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     drives.write(cia402.TARGET_TORQUE, 0, where=axes)
     motion.enable(drives, mode="cst", where=axes)
     cycles = round(TIME / CYCLE)
+    per_count = ampere_per_count(drives)
     speed, current = np.zeros((cycles, n)), np.zeros((cycles, n))
     inside = axes & (height > 0.0)
     bias = np.zeros(n)
     torque = np.where(inside, height, 0.0)
     try:
         for k in range(cycles):
-            played = {cia402.TARGET_TORQUE: np.rint(1e3 * torque)[None].astype(np.int64)}
+            played = {cia402.TARGET_TORQUE: to_counts(drives, torque)[None]}
             trace = drives.record(
                 [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], CYCLE, play=played
             )
             speed[k] = trace[cia402.VELOCITY_ACTUAL][0] / counts
-            current[k] = trace[cia402.TORQUE_ACTUAL][0] * 1e-3
+            current[k] = trace[cia402.TORQUE_ACTUAL][0] * per_count
             way = wrapped(trace[cia402.POSITION_ACTUAL][0] - origin)
             inside &= (way > low) & (way < high)
             # A constant load shifts the swing; what holds it is the mean current that keeps the mean speed at 0.

@@ -19,7 +19,7 @@ from drive_env.devices import Device, find_device
 from drive_env.devices.gain_set import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
-from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
 from drive_env.drives.speeds import per_increment_of
 from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
@@ -72,13 +72,13 @@ class Excitation:
     acceleration_rpm_per_s: float | None = None
     acceleration_pps2: float | None = None
 
-    def raw_velocity(self, entry: Entry, position_scaler: int) -> int:
-        """Return the step as 60FFh wants it, for a scaler [inc/rev]."""
-        return _raw(self.velocity_rpm, self.velocity_pps, entry, position_scaler)
+    def raw_velocity(self, entry: Entry, position_scaler: int, ratio: float = 1.0) -> int:
+        """Return the step as 60FFh wants it, for a scaler [inc/rev] and the rpm of a velocity unit."""
+        return _raw(self.velocity_rpm, self.velocity_pps, entry, position_scaler, ratio)
 
-    def raw_acceleration(self, entry: Entry, position_scaler: int) -> int:
+    def raw_acceleration(self, entry: Entry, position_scaler: int, ratio: float = 1.0) -> int:
         """Return the profile acceleration as 6083h wants it."""
-        return _raw(self.acceleration_rpm_per_s, self.acceleration_pps2, entry, position_scaler)
+        return _raw(self.acceleration_rpm_per_s, self.acceleration_pps2, entry, position_scaler, ratio)
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,7 @@ class Resolved(NamedTuple):
     position_scaler: int  # inc/rev
     velocity: int  # as 60FFh counts it
     acceleration: int  # as 6083h does
+    velocity_ratio: float = 1.0  # rpm of a velocity unit
 
     @property
     def swept(self) -> tuple[Key, ...]:
@@ -221,8 +222,9 @@ def resolve(experiment: Experiment) -> Resolved:
     _check_metric(experiment.metric, device, [(entry.index, entry.sub) for entry in entries])
     _check_times(experiment.excitation, 1.0 / device.communication_rate)
     scaler = _position_scale(device, dictionary, preset)
-    velocity = experiment.excitation.raw_velocity(dictionary.find(TARGET_VELOCITY), scaler)
-    acceleration = experiment.excitation.raw_acceleration(dictionary.find(ACCELERATION), scaler)
+    ratio = _velocity_ratio(device, dictionary, preset)
+    velocity = experiment.excitation.raw_velocity(dictionary.find(TARGET_VELOCITY), scaler, ratio)
+    acceleration = experiment.excitation.raw_acceleration(dictionary.find(ACCELERATION), scaler, ratio)
     for key, raw, target in (("velocity", velocity, TARGET_VELOCITY), ("acceleration", acceleration, ACCELERATION)):
         entry = dictionary.find(target)
         assert entry.low is not None and entry.high is not None, "both are numbers"
@@ -235,7 +237,7 @@ def resolve(experiment: Experiment) -> Resolved:
             f"excitation: velocity is {velocity} and acceleration {acceleration} as raw integers; a step needs a "
             "velocity other than 0 and an acceleration above 0"
         )
-    return Resolved(device, entries, scaler, velocity, acceleration)
+    return Resolved(device, entries, scaler, velocity, acceleration, ratio)
 
 
 def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> int:
@@ -243,10 +245,21 @@ def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mappin
     scale = position_scale(device.roles)
     if scale is None:
         raise ExperimentError(f"{device.name} does not say how many increments a turn has, in its roles.toml")
+    return int(_made(scale, dictionary, preset))
+
+
+def _velocity_ratio(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
+    """Return the rpm of a velocity unit of such a drive; 1 of one that has no such unit."""
+    scale = velocity_ratio(device.roles)
+    return 1.0 if scale is None else _made(scale, dictionary, preset)
+
+
+def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
+    """Return what a scale's objects make, of a preset, else by default."""
     given = {dictionary.find(name).label: value for name, value in preset.items()}
     entries = [dictionary.find(key) for key in scale.keys]
     values = [np.array([given.get(entry.label, entry.default)], float) for entry in entries]
-    return int(scale.increments(values)[0])
+    return float(scale.increments(values)[0])
 
 
 def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
@@ -390,11 +403,11 @@ def _is_multiple(value: float, unit: float) -> bool:
     return abs(round(value / unit) * unit - value) < 1e-9
 
 
-def _raw(in_rpm: float | None, in_pps: float | None, entry: Entry, position_scaler: int) -> int:
+def _raw(in_rpm: float | None, in_pps: float | None, entry: Entry, position_scaler: int, ratio: float) -> int:
     """Return a speed in rpm or pps, or an acceleration in rpm/s or pps^2, as the object counts it."""
     value = in_rpm * position_scaler / 60.0 if in_rpm is not None else in_pps
     assert value is not None, "the parser lets exactly one through"
-    return round(value * per_increment_of(entry.unit, position_scaler))
+    return round(value * per_increment_of(entry.unit, position_scaler, ratio))
 
 
 def _default_weights(name: str, sweep: tuple[SweptObject, ...]) -> Mapping[str, float]:

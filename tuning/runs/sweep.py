@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.speeds import per_increment_of
 from drive_env.drives.trace import Trace
 from drive_env.phase_current import run_and_standby
@@ -340,15 +341,16 @@ def _record(
         report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
     velocity_unit = resolved.device.bindings[cia402.VELOCITY_ACTUAL, 0].unit
-    rpm = 60.0 / resolved.position_scaler / per_increment_of(velocity_unit, resolved.position_scaler)
+    scaler = resolved.position_scaler
+    rpm = 60.0 / scaler / per_increment_of(velocity_unit, scaler, resolved.velocity_ratio)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
     if is_open_loop:
         signals = _stepper_signals(drives, traces, period, resolved.closes_loop)
     else:
         signals = {
             "speed_rpm": np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
-            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
-            "current_limit": drives.read(Role.CURRENT_LIMIT).astype(np.float64) * 1e-3,
+            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * ampere_per_count(drives),
+            "current_limit": drives.read(Role.CURRENT_LIMIT).astype(np.float64) * ampere_per_count(drives),
         }
     recording = MoveRecording(
         t=t,
@@ -397,7 +399,7 @@ def _stepper_signals(
     if closes_loop:
         return {
             "speed_rpm": np.gradient(way, period, axis=0) * 60.0 / scale,
-            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
+            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * ampere_per_count(drives),
             "current_limit": np.asarray(run),
             "lag": wrapped(demand - actual) / full_step,
             "full_steps": np.full(drives.num_axes, TOOTH * drives.motor.n_p),

@@ -75,7 +75,7 @@ REACTING = int(State.FAULT_REACTION_ACTIVE)
 FAULTED = int(State.FAULT)
 ENABLE_MASK, ENABLE_VALUE = int(ENABLE_OPERATION.mask), int(ENABLE_OPERATION.value)
 
-WARNING_BIT = cia402.WARNING.value
+WARNING_BIT, REMOTE_BIT = cia402.WARNING.value, cia402.REMOTE.value
 
 # Rows of every device's emergency table that the automaton itself sends.
 EMERGENCY_RESET = 0
@@ -248,7 +248,8 @@ def fault(drive, lane, cut):
 def update_statusword(drive, lane, mode_bits):
     """Write 6041h and the status flags from the state; `mode_bits` are bits 11 to 13.
 
-    Bit 4 tells that the supply is present, bit 9 (remote) is always set: this drive takes commands from the bus only.
+    Bit 4 tells that the supply is present, bit 9 (remote) is set here: drives that take commands from elsewhere, too,
+    clear it themselves.
     Bit 15 is set while the motor turns in the negative direction (the manual does not say which).
     """
     state = drive.fsa[lane]
@@ -257,7 +258,7 @@ def update_statusword(drive, lane, mode_bits):
         word |= 0x0010
     if state in (DISABLED, FAULTED, REACTING, NOT_READY) and drive.controlword[lane] & 0x0004:
         word |= 0x0020  # bit 5 is free in these states: it shows that no quick stop is commanded
-    word |= 0x0200
+    word |= REMOTE_BIT
     if drive.target_reached[lane]:
         word |= 0x0400
     if drive.internal_limit[lane]:
@@ -270,4 +271,4 @@ def update_statusword(drive, lane, mode_bits):
         word |= 0x4000
         if drive.omega_slow[lane] < 0.0:
             word |= 0x8000
-    drive.statusword[lane] = word
+    drive.statusword[lane] = word & ~drive.absent_status_bits[lane]

@@ -42,6 +42,13 @@ def unwrapped(target, position, scaler):
 
 
 @stage
+def nearest(target, position, scaler):
+    """Return what an absolute target [rad] means of all that differ by turns of the 32-bit counter: the nearest."""
+    turn = 4294967296.0 * 6.283185307179586 / scaler
+    return target + turn * math.floor((position - target) / turn + 0.5)
+
+
+@stage
 def stop(x, v, rate, dt):
     """Return position and velocity after dt [s] of braking to standstill with `rate` [rad/s^2]; 0 stops at once."""
     if v == 0.0 or rate <= 0.0:

@@ -39,6 +39,8 @@ class Cause(NamedTuple):
         held: Whether it is over as soon as the stage is off, so that its flag stays until the reset.
         tried_again: Whether a reset is allowed although it holds: the next enabling tries again.
         unless: Name of a cause whose fault hides this one, which then follows from it.
+        known_as: Name by which the core asks for it, where a device calls it otherwise.
+        silent: Whether it acts without an emergency, and without a bit of 1001h: of a limit that is no error.
     """
 
     name: str
@@ -51,6 +53,8 @@ class Cause(NamedTuple):
     held: bool = False
     tried_again: bool = False
     unless: str = ""
+    known_as: str = ""
+    silent: bool = False
 
 
 class Protection(NamedTuple):
@@ -74,8 +78,8 @@ def _mask(causes: Sequence[Cause], chosen: Callable[[Cause], bool]) -> int:
 
 
 def row_of(causes: Sequence[Cause], name: str) -> int:
-    """Return the first row of a cause, -1 where the table has none of that name."""
-    return next((row for row, cause in enumerate(causes) if cause.name == name), -1)
+    """Return the first row of a cause, by its name or what it is known as; -1 where the table has none."""
+    return next((row for row, cause in enumerate(causes) if name in (cause.name, cause.known_as)), -1)
 
 
 TOGETHER = 4  # conditions in one function: each function takes the compiler's time, and each nested in another more
@@ -140,6 +144,7 @@ class _Masks(NamedTuple):
     cuts: int
     stops: int
     at_limits: int
+    silent: int
     warns: int
     positive: int
     negative: int
@@ -157,7 +162,8 @@ def _masks(causes: Sequence[Cause]) -> _Masks:
     return _Masks(
         cuts=_mask(causes, lambda cause: cause.reaction == CUT),
         stops=_mask(causes, lambda cause: cause.reaction == STOP),
-        at_limits=_mask(causes, lambda cause: cause.reaction == LIMIT),
+        at_limits=_mask(causes, lambda cause: cause.reaction == LIMIT and not cause.silent),
+        silent=_mask(causes, lambda cause: cause.silent),
         warns=_mask(causes, lambda cause: cause.reaction == WARN),
         positive=_mask(causes, lambda cause: cause.blocks == BLOCKS_POSITIVE),
         negative=_mask(causes, lambda cause: cause.blocks == BLOCKS_NEGATIVE),
@@ -210,14 +216,14 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int) -> Any:
 
 def _react(masks: _Masks, register: tuple[int, ...]) -> Any:
     """Return the stage (drive, lane, causes that have appeared): emergencies and reactions."""
-    faults, cuts, rows = masks.faults, masks.cuts, len(register)
+    faults, cuts, silent, rows = masks.faults, masks.cuts, masks.silent, len(register)
 
     @stage
     def react(drive, lane, appeared):
         for cause in range(1, rows):
             if not appeared & (1 << cause):
                 continue
-            push_emergency = True
+            push_emergency = silent & (1 << cause) == 0
             if faults & (1 << cause):
                 cut = cuts & (1 << cause) != 0
                 # The stage that is cut has answered: what else it sees in the same moment follows from it.
@@ -264,7 +270,7 @@ def protection_of(causes: Sequence[Cause]) -> Protection:
     look, react = _look(masks, conditions, len(causes) - 1), _react(masks, register)
     cause_flags = _cause_flags(masks.held, tuple(cause.status_flag for cause in causes))
     faults, cuts, software, tried_again = masks.faults, masks.cuts, masks.software, masks.tried_again
-    following_fault, csp = row_of(causes, FOLLOWING_ERROR) + 1, cia402.CSP
+    following_fault, csp, ip = row_of(causes, FOLLOWING_ERROR) + 1, cia402.CSP, cia402.IP
 
     @stage
     def causes_gone(drive, lane):
@@ -280,7 +286,8 @@ def protection_of(causes: Sequence[Cause]) -> Protection:
     @inlined
     def statusword_bits(drive, lane):
         bits = 0x0800 if drive.active[lane] & software else 0
-        if drive.mode_display[lane] == csp and drive.fault[lane] == following_fault:
+        mode = drive.mode_display[lane]
+        if mode in (csp, ip) and drive.fault[lane] == following_fault:
             bits |= 0x2000
         return bits
 

@@ -9,20 +9,27 @@ from mechanics.compiled import inlined
 
 
 @inlined
-def derive(drive, dt):
-    """Compute the constants of encoder, current limit and sensor, DC link and rotor for ticks of dt [s]."""
+def derive_sensors(drive):
+    """Compute the constants of encoder and current sensor."""
     for lane in range(LANES):
         # 2080h:02 may be 0, which is no encoder that could be counted with.
         steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
         steps = steps if steps > 0.0 else 1.0
         drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
         drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
+        drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]
+        drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
+        drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]
+
+
+@inlined
+def derive(drive, dt):
+    """Compute the constants of encoder, current limit and sensor, DC link and rotor for ticks of dt [s]."""
+    derive_sensors(drive)
+    for lane in range(LANES):
         share = drive.torque_limit[lane]
         drive.current_share[lane] = share if share > 0.0 and share < 1.0 else 1.0
         i_max = drive.i_max[lane]
         drive.torque_demand_share[lane] = drive.i_q_ref[lane] / i_max if i_max > 0.0 else 0.0
-        drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]
-        drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
-        drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]
         drive.chopper_conductance[lane] = 1.0 / drive.chopper_resistance[lane]
     derive_link(drive, dt)

@@ -24,12 +24,23 @@ MODES = (
     Mode(0, "no", "No mode", None, 1),
     Mode(cia402.PP, "pp", "Profile position mode", 0, 2),
     Mode(cia402.PV, "pv", "Profile velocity mode", 2, 1),
+    Mode(cia402.TQ, "tq", "Profile torque mode", 3, 0),
     Mode(cia402.HM, "hm", "Homing mode", 5, 2),
+    Mode(cia402.IP, "ip", "Interpolated position mode", 6, 2),
     Mode(cia402.CSP, "csp", "Cyclic synchronous position mode", 7, 2),
     Mode(cia402.CSV, "csv", "Cyclic synchronous velocity mode", 8, 1),
     Mode(cia402.CST, "cst", "Cyclic synchronous torque mode", 9, 0),
 )
 PP, PV, HM, CSP, CSV, CST = cia402.PP, cia402.PV, cia402.HM, cia402.CSP, cia402.CSV, cia402.CST
+TQ, IP = cia402.TQ, cia402.IP
+
+
+@stage
+def acts_as(mode):
+    """Return the mode whose generator a mode has: ip is csp and tq is cst on drives that have them (TGZ manual)."""
+    if mode == IP:
+        return CSP
+    return CST if mode == TQ else mode
 
 
 @stage
@@ -65,7 +76,7 @@ def start_braking(drive, lane):
     the demand is.
     """
     level = drive.loop_level[lane]
-    if level != 0 and drive.mode_display[lane] != CSP and drive.fsa[lane] != fsa.REACTING:
+    if level != 0 and acts_as(drive.mode_display[lane]) != CSP and drive.fsa[lane] != fsa.REACTING:
         return
     drive.velocity_demand[lane] = drive.omega_meas[lane]
     drive.position_demand[lane] = drive.theta_meas[lane]
@@ -90,13 +101,13 @@ def brake(drive, lane, rate, dt):
 def change_mode(drive, lane):
     """Make the requested mode the present one, without a jump: demands start from the motion there is."""
     before = drive.loop_level[lane]
-    if before == 0 or drive.mode_display[lane] == CSP:
+    if before == 0 or acts_as(drive.mode_display[lane]) == CSP:
         # A set-point of csp may have jumped: its speed for a period is none that the axis has, or could be braked from.
         drive.velocity_demand[lane] = drive.omega_meas[lane]
     if before != 2:
         drive.position_demand[lane] = drive.theta_meas[lane]
     drive.mode_display[lane] = drive.mode[lane]
-    by_position = drive.mode[lane] == PP or drive.mode[lane] == HM or drive.mode[lane] == CSP
+    by_position = drive.mode[lane] == PP or drive.mode[lane] == HM or acts_as(drive.mode[lane]) == CSP
     if before != 2 and by_position and drive.position_p[lane] > 0.0:
         # The position loop asks for the present speed only with the lag that it has at that speed.
         lag = drive.velocity_demand[lane] / drive.position_p[lane]
@@ -112,9 +123,28 @@ def change_mode(drive, lane):
 
 
 @stage
+def may_change_mode(drive, lane):
+    """Return whether the mode that was written takes effect now: after its delay, and where it must be, at a halt."""
+    if drive.mode_wait[lane] > 0.0:
+        return False
+    if drive.mode_needs_halt[lane] == 0 or drive.fsa[lane] != fsa.ENABLED:
+        return True
+    return (drive.controlword[lane] & cia402.HALT) != 0 and drive.velocity_demand[lane] == 0.0
+
+
+@stage
+def request_mode(drive, lane, mode):
+    """Take a write of 6060h: the mode changes at once, where nothing makes it wait."""
+    drive.mode[lane] = mode
+    drive.mode_wait[lane] = drive.mode_delay[lane]
+    if mode != drive.mode_display[lane] and may_change_mode(drive, lane):
+        change_mode(drive, lane)
+
+
+@stage
 def asked_direction(drive, lane):
     """Return the sign of the motion that the targets of the present mode ask for."""
-    mode = drive.mode_display[lane]
+    mode = acts_as(drive.mode_display[lane])
     way = 0.0
     if mode == PP:
         way = drive.profile_target[lane] - drive.position_demand[lane] if drive.set_point_valid[lane] == 1 else 0.0
@@ -160,8 +190,14 @@ def follow(drive, lane, mode, dt):
 def generate_demand(drive, lane, dt):
     """Run the mode for one period of dt [s]: reads targets; writes position, velocity or torque demand and bit 10."""
     if drive.mode[lane] != drive.mode_display[lane]:
-        change_mode(drive, lane)
-    mode = drive.mode_display[lane]
+        drive.mode_wait[lane] -= dt
+        if drive.mode_wait[lane] < 0.5 * dt:
+            drive.mode_wait[lane] = 0.0
+        if may_change_mode(drive, lane):
+            change_mode(drive, lane)
+    if drive.set_point_waiting[lane] == 1 and drive.set_point_valid[lane] == 0:
+        pp.empty_buffer(drive, lane)
+    mode = acts_as(drive.mode_display[lane])
     # Whatever moves the demand without bows leaves no acceleration behind for a ramp that has them.
     drive.acceleration_before[lane] = drive.acceleration_demand[lane]
     drive.acceleration_demand[lane] = 0.0
@@ -204,7 +240,7 @@ def generate_demand(drive, lane, dt):
 @stage
 def mode_bits(drive, lane):
     """Return bit 12 of the statusword as the present mode documents it (tables 148, 217, 237, 263, 283)."""
-    mode = drive.mode_display[lane]
+    mode = acts_as(drive.mode_display[lane])
     bits = 0
     if mode == PP:
         if drive.set_point_acknowledged[lane] == 1:

@@ -13,7 +13,10 @@ def generate(drive, lane, dt):
     """Move the position demand to 607Ah + 60B0h within the interpolation period; 607Dh limits it and sets bit 11."""
     drive.loop_level[lane] = 2
     target = drive.target_position[lane] + drive.position_offset[lane]
-    target = profiles.unwrapped(target, drive.position_demand[lane], drive.position_scaler[lane])
+    if drive.cyclic_wraps[lane] == 1:
+        target = profiles.nearest(target, drive.position_demand[lane], drive.position_scaler[lane])
+    else:
+        target = profiles.unwrapped(target, drive.position_demand[lane], drive.position_scaler[lane])
     low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
     drive.internal_limit[lane] = 1 if target > high + ROUNDING or target < low - ROUNDING else 0
     target = min(max(target, low), high)

@@ -1,4 +1,4 @@
-"""Homing mode (manual, section 8): methods 1, 2, 3, 5, 17, 18, 19, 21, 33, 34 and 35; 0 does nothing.
+"""Homing mode (manual, section 8): methods 1, 2, 3, 5, 17, 18, 19, 21, 33, 34, 35 and 37; 0 does nothing.
 
 A switch is searched fast; once it is touched the axis brakes, and looks for the edge slowly, always in the same
 direction, until the switch changes; that edge is home. Then the axis returns to the edge and rests there. Search and
@@ -10,7 +10,7 @@ edge as the methods have them:
     21  search left until the home switch is active, edge to the right; a limit switch turns the search round
     1, 2, 3, 5  as 17, 18, 19, 21; from the edge on, the same way, to the encoder's next index, which is home
     33, 34  to the next index, left or right, slowly
-    35  here
+    35, 37  here
 
 A way of more than a turn without an index is one on which none comes: homing fails, rather than run into a stop.
 """
@@ -29,6 +29,7 @@ IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_IN
 
 BY_SWITCH = 16  # from a method with an index to the one that ends at the switch's edge
 INDEX_LEFT, INDEX_RIGHT = 33, 34
+HERE = (35, 37)  # CiA 402 has 35 as the older number of 37
 INDEX_WAY = 1.05 * TWO_PI  # rad in which an index must come
 
 
@@ -61,6 +62,12 @@ def _switch(method):
 
 
 @stage
+def _has_switch(drive, lane, method):
+    """Return whether there is the switch that a method looks for; without it the search would never end."""
+    return (drive.homing_switches[lane] >> _switch(_by_switch(method))) & 1 == 1
+
+
+@stage
 def _search_sign(method):
     """Return the direction in which a method searches its switch."""
     return -1.0 if method in (17, 21) else 1.0
@@ -83,7 +90,7 @@ def start_or_stop(drive, lane, word_before):
         drive.homing_attained[lane] = 0
         drive.target_reached[lane] = 0
         method = drive.homing_method[lane]
-        if method == 35:
+        if method in HERE:
             # Does not need operation enabled. At rest the demand is zero too, whatever is left of the position error.
             if drive.velocity_demand[lane] == 0.0:
                 drive.position_demand[lane] = drive.theta_meas[lane]
@@ -97,6 +104,7 @@ def start_or_stop(drive, lane, word_before):
                 (drive.homing_fast[lane] <= 0.0 and not alone)
                 or drive.homing_slow[lane] <= 0.0
                 or drive.homing_acceleration[lane] <= 0.0
+                or not (alone or _has_switch(drive, lane, method))
             )
             drive.homing_state[lane] = FAILED if method == 0 or unable else SEARCH
             if alone and not unable:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.firmware.common import fsa, profiles, s_ramp, six_point
+from drive_env.firmware.common import fsa, profiles, s_ramp, shaped, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
@@ -12,15 +12,47 @@ from mechanics.compiled import stage
 def new_set_point(drive, lane, word_before):
     """Take the target position over on the rising edge of controlword bit 4; bit 12 tells it until the bit falls.
 
-    There is no "change immediately" on this drive: a new edge plans anew from where the axis is.
+    Without a buffer a new edge plans anew from where the axis is, "change set immediately" (bit 5) or not. With one, an
+    edge without bit 5 during a motion puts the set-point into it, and bit 12 stays until it is taken out; one more edge
+    without bit 5 does nothing then (CiA 402-2, profile position mode).
     """
     word = drive.controlword[lane]
     if not word & cia402.NEW_SET_POINT:
-        drive.set_point_acknowledged[lane] = 0
+        drive.set_point_acknowledged[lane] = drive.set_point_waiting[lane]
         return
     if word_before & cia402.NEW_SET_POINT or drive.fsa[lane] != fsa.ENABLED or drive.stopping[lane] == 1:
         return
-    target = drive.target_position[lane]
+    if drive.set_point_buffer[lane] == 1 and not word & cia402.CHANGE_AT_ONCE and _is_under_way(drive, lane):
+        if drive.set_point_waiting[lane] == 0:
+            drive.set_point_waiting[lane] = 1
+            drive.waiting_target[lane] = drive.target_position[lane]
+            drive.waiting_word[lane] = word
+            drive.set_point_acknowledged[lane] = 1
+        return
+    drive.set_point_waiting[lane] = 0
+    _take(drive, lane, drive.target_position[lane], word)
+    drive.set_point_acknowledged[lane] = 1
+
+
+@stage
+def _is_under_way(drive, lane):
+    """Return whether the profile moves to a set-point."""
+    return drive.set_point_valid[lane] == 1 and (
+        drive.position_demand[lane] != drive.profile_target[lane] or drive.velocity_demand[lane] != 0.0
+    )
+
+
+@stage
+def empty_buffer(drive, lane):
+    """Have no set-point in the buffer; bit 12 is bit 4's again."""
+    drive.set_point_waiting[lane] = 0
+    if not drive.controlword[lane] & cia402.NEW_SET_POINT:
+        drive.set_point_acknowledged[lane] = 0
+
+
+@stage
+def _take(drive, lane, target, word):
+    """Plan the motion to a target [rad], as the controlword of its edge says."""
     if word & cia402.RELATIVE:
         option = drive.positioning_option[lane] & 3
         if option == 0:
@@ -36,7 +68,6 @@ def new_set_point(drive, lane, word_before):
     target = min(max(target, low), high)
     drive.profile_target[lane] = target
     drive.set_point_valid[lane] = 1
-    drive.set_point_acknowledged[lane] = 1
     drive.target_reached[lane] = 0
     drive.in_window_time[lane] = 0.0
 
@@ -51,6 +82,9 @@ def generate(drive, lane, ramp, dt):
         drive.position_demand[lane] = x
         drive.velocity_demand[lane] = v
         return
+    if drive.set_point_waiting[lane] == 1 and not _is_under_way(drive, lane):
+        _take(drive, lane, drive.waiting_target[lane], drive.waiting_word[lane])
+        empty_buffer(drive, lane)
     up = drive.acceleration[lane]
     v_max = profiles.limited(drive.max_velocity[lane], drive.velocity_limit[lane])
     target = drive.profile_target[lane]
@@ -59,6 +93,8 @@ def generate(drive, lane, ramp, dt):
         down = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else up
         if s_ramp.is_set(drive, lane):
             s_ramp.advance(drive, lane, target, v_max, up, down, dt)
+        elif shaped.is_set(drive, lane):
+            shaped.advance(drive, lane, target, v_max, up, down, dt)
         elif six_point.is_set(drive, lane):
             six_point.advance(drive, lane, target, v_max, up, down, dt)
         else:

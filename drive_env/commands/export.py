@@ -1,0 +1,75 @@
+"""`drive-env export`: EDS and DCF of a drive as it is commissioned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drive_env.commands.options import (
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Timeout,
+    check_free,
+    connect,
+    errors_as_exit_codes,
+    names_a_bus,
+)
+
+KBIT = 1000  # bit/s
+
+
+def export(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(help="New file, .eds or .dcf.", show_default=False)],
+    dcf: Annotated[bool, typer.Option("--dcf", help="Write the DCF beside the EDS, too.")] = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Annotated[int, typer.Option("--node", "-n", help="Node-ID.")] = 1,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    motor: Annotated[
+        str | None,
+        typer.Option("--motor", help="Of an emulated drive: what it is commissioned for.", show_default="the device's"),
+    ] = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+) -> None:
+    """Write the EDS or DCF of a drive with its commissioned values: of one on a bus, else of an emulated one.
+
+    An EDS has them as defaults, a DCF as the values of this node; other masters (python-canopen, CANopen tools) read
+    them. With --interface, --channel, --node or --bitrate they are read from that drive; nothing is written to it.
+    """
+    from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds, commissioned_values
+    from drive_env.whole_file import write_whole
+
+    with errors_as_exit_codes():
+        if file.suffix.lower() not in (".eds", ".dcf"):
+            raise ValueError(f"{file} must end with .eds or .dcf, which says what is written")
+        files = [file, file.with_suffix(".dcf")] if dcf and file.suffix.lower() == ".eds" else [file]
+        for one in files:
+            check_free(one)
+        if names_a_bus(context):
+            with connect(
+                interface, channel, [node], device, eds, bitrate=bitrate, timeout=timeout, safety=False
+            ) as drives:
+                values = commissioned_values(drives)
+                source = drives.description.dictionary.path
+        else:
+            from drive_env.devices import find_device
+            from drive_env.emulator.emulated_drives import EmulatedDrives
+
+            known = find_device(device)
+            source = known.eds
+            with EmulatedDrives(device, "inertia", motor, num_machines=known.num_axes, num_threads=1) as emulated:
+                values = commissioned_values(emulated)
+        for one in files:
+            is_dcf = one.suffix.lower() == ".dcf"
+            kbit = CAN_KBIT if bitrate is None else bitrate // KBIT
+            text = commissioned_eds(source, values, one.name, node_id=node if is_dcf else None, bit_rate=kbit)
+            write_whole(one, text)
+            print(f"{one}: {len(values)} parameters of {'node ' + str(node) if is_dcf else device}")

@@ -1,0 +1,56 @@
+"""Process data of an EDS that a node could not start with: COB-IDs that are missing, mappings of what is not there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from canopen.objectdictionary import ODVariable
+
+from drive_env.dictionary.eds_file import Section, object_section
+
+Key = tuple[int, int]
+
+RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
+TO_MAPPING = 0x200
+PREDEFINED = {0x1400 + k: 0x200 + 0x100 * k for k in range(4)} | {0x1800 + k: 0x180 + 0x100 * k for k in range(4)}
+OFF = 0x80000000  # bit 31 of a PDO's COB-ID
+LONGEST = 64  # bits
+
+
+def repair_process_data(sections: dict[str, Section], types: Mapping[Key, ODVariable]) -> Iterator[tuple[str, str]]:
+    """Give PDOs without a COB-ID that of the predefined set, or none; map nothing where a mapping cannot be.
+
+    Returns:
+        Where, and what was done.
+    """
+    for index in [*RPDOS, *TPDOS]:
+        cob_id = types.get((index, 1))
+        name = object_section(index, 1)
+        if cob_id is not None and not cob_id.default:
+            given = PREDEFINED.get(index)
+            sections[name]["DefaultValue"] = f"0x{OFF:X}" if given is None else f"$NODEID+0x{given:X}"
+            yield f"[{name}]", "has no COB-ID: " + ("off" if given is None else "that of the predefined connection set")
+        mapping = index + TO_MAPPING
+        count = types.get((mapping, 0))
+        if cob_id is None or count is None or not count.default:
+            continue
+        wrong = _wrong_mapping([types.get((mapping, sub)) for sub in range(1, int(count.default) + 1)], types)
+        if wrong:
+            sections[object_section(mapping, 0)]["DefaultValue"] = "0"
+            yield f"[{mapping:04X}]", f"{wrong}: nothing is mapped"
+
+
+def _wrong_mapping(mapped: list[ODVariable | None], types: Mapping[Key, ODVariable]) -> str:
+    """Return why objects cannot be mapped, "" if they can."""
+    length = 0
+    for sub, variable in enumerate(mapped, 1):
+        if variable is None or not isinstance(variable.default, int):
+            return f"sub-index {sub} is missing"
+        index, place, bits = variable.default >> 16, variable.default >> 8 & 0xFF, variable.default & 0xFF
+        target = types.get((index, place))
+        if target is None:
+            return f"{index:04X}h:{place:02X} does not exist"
+        if len(target) != bits:
+            return f"{index:04X}h:{place:02X} has {len(target)} bits, not {bits}"
+        length += bits
+    return f"{length} bits are more than {LONGEST}" if length > LONGEST else ""

@@ -1,0 +1,72 @@
+"""What a device is on EtherCAT: the table `ethercat` of its data. A device without it has no EtherCAT.
+
+Vendor, product and revision are those of its dictionary (1018h), and its process data those of 1C12h and 1C13h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mechanics.near_names import did_you_mean
+
+MEMORY = (0x1000, 0x3000)  # where a controller has memory for sync managers: 8 KiB
+LEAST_MAILBOX = 32  # bytes
+
+
+class Place(NamedTuple):
+    """A mailbox: address and length [bytes]."""
+
+    start: int
+    length: int
+
+
+class EtherCatBehaviour(NamedTuple):
+    """What a device is on EtherCAT.
+
+    Attributes:
+        receive: What the master writes: sync manager 0.
+        send: What it reads: sync manager 1.
+        bootstrap_receive: The same in Bootstrap.
+        bootstrap_send: The same in Bootstrap.
+        outputs: Address of sync manager 2.
+        inputs: Address of sync manager 3.
+        only_on_can: Objects whose names begin so are not there on EtherCAT; "": all are.
+        shortest_cycle: Of SYNC0 [s].
+        eeprom: Size [bytes].
+    """
+
+    receive: Place
+    send: Place
+    bootstrap_receive: Place
+    bootstrap_send: Place
+    outputs: int
+    inputs: int
+    only_on_can: str
+    shortest_cycle: float
+    eeprom: int
+
+
+def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
+    """Return the table `ethercat` of a device's data; ValueError for a key or a value that cannot be."""
+    if data is None:
+        return None
+    fields = EtherCatBehaviour._fields
+    for key in data:
+        if key not in fields:
+            raise ValueError(f"ethercat has no {key!r}{did_you_mean(key, fields)}")
+    missing = [field for field in fields if field not in data]
+    if missing:
+        raise ValueError(f"ethercat lacks {', '.join(missing)}")
+    row: dict[str, Any] = {key: Place(*value) if isinstance(value, list) else value for key, value in data.items()}
+    found = EtherCatBehaviour(**row)
+    for name in ("receive", "send", "bootstrap_receive", "bootstrap_send"):
+        start, length = getattr(found, name)
+        if length < LEAST_MAILBOX or not MEMORY[0] <= start <= MEMORY[1] - length:
+            raise ValueError(
+                f"ethercat.{name} = {start:04X}h, {length} bytes: a mailbox has {LEAST_MAILBOX} bytes or more, between "
+                f"{MEMORY[0]:04X}h and {MEMORY[1]:04X}h"
+            )
+    if found.eeprom % 128 or not found.eeprom:
+        raise ValueError(f"ethercat.eeprom = {found.eeprom} bytes must be a multiple of 128")
+    return found

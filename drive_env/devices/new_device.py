@@ -1,0 +1,484 @@
+"""A device's folder from a vendor's EDS: dictionary, bindings, roles, gains, class values, what a person must fill in.
+
+Everything that the EDS says is taken; what it does not say and the emulator needs is a class value or an object of the
+emulator's own, in the manufacturer's area where the EDS has none; each is in the list. An object of the EDS that has no
+effect here stays an entry that can be read and written, and is listed as such.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from canopen.objectdictionary import ODVariable
+
+from drive_env import cia402
+from drive_env.devices.eds_process_data import repair_process_data
+from drive_env.devices.standard_objects import (
+    BY_THEMSELVES,
+    GAINS,
+    HOMING_METHODS,
+    MOTOR,
+    MOTOR_ROLES,
+    NEEDED,
+    QUICK_STOP_OPTIONS,
+    STANDARD,
+    TORQUE,
+    WITHOUT_EFFECT,
+    OwnObject,
+)
+from drive_env.devices.variants import TYPES
+from drive_env.devices.vendor_units import vendor_units
+from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.drive_eds import axes_of, read_types
+from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds
+from drive_env.dictionary.entries import INTEGER_TYPES, eds_file
+from drive_env.dictionary.units import find_unit
+from drive_env.whole_file import files_to_be
+
+if TYPE_CHECKING:
+    from drive_env.motors import Motor
+
+Key = tuple[int, int]
+Types = Mapping[Key, ODVariable]
+
+TEMPLATE = Path(__file__).parent / "template.toml"
+CLASS_VALUES = "no EDS has them: class values of a 24 to 48 V stage"
+AS_THE_STANDARD = "no EDS has them: the standard's way; `quirks` and `canopen` of the file formats name what may differ"
+LIST_NAME, EDS_NAME = "to_fill_in.md", "drive.eds"
+# Where the emulator's own objects may lie: the first block of the manufacturer's area that the EDS leaves free.
+OWN_BLOCKS = range(0x5F00, 0x1FFF, -0x100)
+OWN_PER_AXIS = 0x10
+STORE, RESTORE = 0x1010, 0x1011
+ERROR_BEHAVIOUR = 0x1029
+STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); those above are the maker's
+TRANSMISSION_TYPES = ["0...240", 254, 255]
+
+
+# What a drive has that has a mode, where its 6502h tells none.
+MODE_NEEDS = {
+    cia402.PP: cia402.TARGET_POSITION,
+    cia402.PV: cia402.TARGET_VELOCITY,
+    cia402.HM: cia402.HOMING_METHOD,
+    cia402.CSP: cia402.TARGET_POSITION,
+    cia402.CSV: cia402.TARGET_VELOCITY,
+    cia402.CST: cia402.TARGET_TORQUE,
+}
+
+
+class Note(NamedTuple):
+    """A line of the list: what, and why."""
+
+    what: str
+    why: str
+
+
+class NewDevice(NamedTuple):
+    """A folder that was written.
+
+    Attributes:
+        folder: The folder.
+        fill_in: What a person must fill in or check.
+        modes: What became of the drive's modes of operation.
+        without_effect: Objects that are stored and have no effect here.
+        repairs: What was put right in the EDS.
+    """
+
+    folder: Path
+    fill_in: tuple[Note, ...]
+    modes: tuple[Note, ...]
+    without_effect: tuple[Note, ...]
+    repairs: tuple[Note, ...]
+
+    def text(self) -> str:
+        """Return the list as Markdown."""
+        titles = (
+            ("Fill in or check", self.fill_in), ("Modes of operation and homing", self.modes),
+            ("Stored, without an effect in the emulator", self.without_effect), ("Put right in the EDS", self.repairs),
+        )  # fmt: skip
+        lines = [f"# {self.folder.name}: what its EDS does not say", ""]
+        for title, notes in titles:
+            lines += [
+                f"## {title}",
+                "",
+                *(f"- {note.what}: {note.why}" for note in notes),
+                *([] if notes else ["nothing"]),
+                "",
+            ]
+        return "\n".join(lines)
+
+
+def new_device(
+    eds: Path, folder: Path, motor: Motor, *, velocity_unit: str = "", acceleration_unit: str = ""
+) -> NewDevice:
+    """Write the folder of a device that its EDS describes; return what a person must know of it.
+
+    Args:
+        eds: The vendor's file.
+        folder: To be made.
+        motor: Whose rated current is the base of thousandths.
+        velocity_unit: Unit of speeds, "rpm", "pps", "0.1 rpm" ..., where the EDS tells none.
+        acceleration_unit: The same of accelerations.
+
+    Raises:
+        ValueError: For a file that is the EDS of no CiA 402 drive, a folder that exists, or an unknown unit.
+    """
+    if folder.exists():
+        raise ValueError(f"{folder} exists already, and is not overwritten; choose another folder with --out")
+    for unit in (velocity_unit, acceleration_unit):
+        if unit:
+            find_unit(unit)
+    draft = _Draft(eds, motor, velocity_unit, acceleration_unit)
+    made = draft.made(folder)
+    files: dict[Path, str | bytes] = {folder / name: text for name, text in draft.files(folder).items()}
+    with files_to_be(files | {folder / LIST_NAME: made.text()}):
+        pass
+    return made
+
+
+class _Draft:
+    """What one EDS becomes."""
+
+    def __init__(self, eds: Path, motor: Motor, velocity_unit: str, acceleration_unit: str) -> None:
+        self._eds, self._motor = eds, motor
+        if not eds.is_file():
+            raise ValueError(f"there is no EDS at {eds}; give the path of the drive's .eds file")
+        self._file: EdsFile = eds_file(eds)
+        try:
+            self._types: Types = read_types(eds)
+        except Exception as error:  # the reader raises whatever the broken line leads to
+            raise ValueError(f"{eds} cannot be read as an EDS: {error}") from error
+        self._axes = axes_of(eds, self._types)
+        for index in (cia402.CONTROLWORD, cia402.MODE):
+            if (index, 0) not in self._types:
+                raise ValueError(f"{eds} describes no drive that could be enabled: it has no {index:04X}h")
+        self._sections: dict[str, Section] = {name: dict(row) for name, row in self._file.sections.items()}
+        self._units = vendor_units(self._types, velocity_unit, acceleration_unit)
+        self._fill_in: list[Note] = []
+        self._told_of_modes: list[Note] = []
+        self._changes: list[Note] = []
+        self._base = self._free_block()
+        self._modes = self._supported_modes()
+        self._bindings = self._standard_bindings()
+        self._roles: dict[str, Key] = dict(self._units.scale)
+        self._own: list[tuple[Key, OwnObject]] = []
+        self._take_current_limit()
+        self._add_own_objects()
+        self._correct_defaults()
+        self._changes += [Note(*row) for row in repair_process_data(self._sections, self._types)]
+        self._tell_of_units()
+        self._drop_twinless()
+
+    def made(self, folder: Path) -> NewDevice:
+        repairs = [Note(one.where, one.what) for one in self._file.repairs]
+        return NewDevice(
+            folder,
+            tuple(self._fill_in + self._class_values()),
+            tuple(self._told_of_modes),
+            tuple(self._without_effect()),
+            tuple(repairs + self._changes),
+        )
+
+    def files(self, folder: Path) -> dict[str, str]:
+        """Return the folder's files."""
+        return {
+            "device.toml": self._device_toml(folder),
+            EDS_NAME: parse_eds(EdsFile(self._sections, ()).text()).text(),
+            "bindings.toml": self._bindings_toml(),
+            "roles.toml": "# Which object plays which part.\n\n"
+            + "".join(f'{name} = "{_text(key)}"\n' for name, key in self._roles.items()),
+            "gains.toml": self._gains_toml(),
+        }
+
+    # --- what the drive has ---------------------------------------------------------------------------------------
+    def _default(self, index: int, sub: int = 0) -> int:
+        found = self._types.get((index, sub))
+        return found.default if found is not None and isinstance(found.default, int) else 0
+
+    def _supported_modes(self) -> list[int]:
+        """Return the numbers of the modes that drive and emulator both have."""
+        from drive_env.firmware.common.modes import MODES  # the compiler comes with it
+
+        bits = self._default(cia402.SUPPORTED_MODES)
+        here = [mode for mode in MODES if mode.supported_bit is not None]
+        if bits == 0:
+            found = [mode for mode in here if (MODE_NEEDS.get(mode.number, -1), 0) in self._types]
+            listed = ", ".join(mode.abbreviation for mode in found)
+            self._fill_in.append(
+                Note(
+                    f'[values] "{cia402.MODE:04X}:0" of device.toml',
+                    f"6502h tells no modes: {listed} by the objects that it has",
+                )
+            )
+        else:
+            found = [mode for mode in here if mode.supported_bit is not None and bits >> mode.supported_bit & 1]
+            known = {mode.supported_bit for mode in here}
+            others = [bit for bit in range(16) if bits >> bit & 1 and bit not in known]
+            self._told_of_modes += [
+                Note(f"mode {bit + 1}", "6502h has it, and the emulator does not: 6060h refuses it") for bit in others
+            ]
+        methods = self._homing_methods()
+        numbers = [mode.number for mode in found if mode.number != cia402.HM or methods]
+        names = [mode.abbreviation for mode in found if mode.number in numbers]
+        self._told_of_modes.insert(0, Note("taken", ", ".join(names) or "none"))
+        if cia402.HM in numbers:
+            self._told_of_modes.append(
+                Note("homing methods", ", ".join(map(str, methods)) + " of 6098h; others are refused")
+            )
+        return numbers
+
+    def _homing_methods(self) -> list[int]:
+        """Return the methods of homing that both have: within 6098h's limits, and in 60E3h where that lists any."""
+        variable = self._types.get((cia402.HOMING_METHOD, 0))
+        low = -128 if variable is None or variable.min is None else variable.min
+        high = 127 if variable is None or variable.max is None else variable.max
+        listed = {self._default(cia402.HOMING_METHODS, sub) for sub in range(1, 255)} - {0}
+        return [one for one in HOMING_METHODS if low <= one <= high and (not listed or one in listed)]
+
+    def _standard_bindings(self) -> dict[Key, Binding]:
+        found = {}
+        for row in STANDARD:
+            variable = self._types.get((row.index, row.sub))
+            if variable is not None and variable.data_type in INTEGER_TYPES:
+                found[row.index, row.sub] = row.__class__(
+                    row.index, row.sub, row.field, self._unit(row.unit), row.part, row.event
+                )
+        return found
+
+    def _unit(self, name: str) -> str:
+        return {
+            "velocity": self._units.velocity,
+            "acceleration": self._units.acceleration,
+            "torque": self._units.torque,
+        }.get(name, name)
+
+    def _take_current_limit(self) -> None:
+        """Let 6072h limit the current of a drive without 6073h: by its rated torque it is the same."""
+        limit, torque = (cia402.MAX_CURRENT, 0), (cia402.MAX_TORQUE, 0)
+        if limit not in self._bindings and torque in self._types:
+            self._bindings[torque] = Binding(*torque, "i_max", self._unit(TORQUE))
+        for key in (limit, torque):
+            if key in self._bindings:
+                self._roles["current_limit"] = key
+                return
+
+    # --- what it has not ------------------------------------------------------------------------------------------
+    def _free_block(self) -> int:
+        used = {index for index, _ in self._types}
+        for base in OWN_BLOCKS:
+            if not used & set(range(base, base + OWN_PER_AXIS * self._axes)):
+                return base
+        raise ValueError(f"{self._eds} leaves no room in 2000h to 5FFFh for the emulator's own objects")
+
+    def _add_own_objects(self) -> None:
+        fields = {row.field for row in self._bindings.values()}
+        if self._units.scale:
+            fields.add("position_scaler")
+        others = [
+            row
+            for row, modes in NEEDED
+            if row.field not in fields and (modes is None or any(mode in self._modes for mode in modes))
+        ]
+        groups: tuple[tuple[str, Sequence[OwnObject]], ...] = (
+            ("Emulator: gains", GAINS), ("Emulator: motor", MOTOR), ("Emulator: what the EDS lacks", others)
+        )  # fmt: skip
+        for offset, (title, rows) in enumerate(groups):
+            for sub, row in enumerate(rows, 1):
+                key = (self._base + offset, sub)
+                self._own.append((key, row))
+                self._bindings[key] = Binding(*key, row.field, self._unit(row.unit))
+            for axis in range(self._axes if rows else 0):
+                self._write_own(self._base + offset + axis * OWN_PER_AXIS, title, rows)
+        for key, row in self._own:
+            role = {"position_scaler": "position_scale", "i_max": "current_limit"} | MOTOR_ROLES
+            if row.field in role:
+                self._roles[role[row.field]] = key
+            if row.why:
+                self._fill_in.append(
+                    Note(f"{_text(key)} {row.name}", f"the EDS has {row.why}: an object of the emulator's own")
+                )
+        own = f"{self._base:04X}h and {self._base + 1:04X}h"
+        why = (
+            "gains and motor: the emulator's own, which the real drive has elsewhere; their values follow from --motor"
+        )
+        self._fill_in.append(Note(own, why))
+
+    def _write_own(self, index: int, title: str, rows: Sequence[OwnObject]) -> None:
+        self._sections[object_section(index)] = {"ParameterName": title, "ObjectType": "0x9"}
+        self._sections[object_section(index, 0)] = {
+            "ParameterName": "Highest sub-index", "DataType": f"0x{TYPES['u8']:04X}", "AccessType": "const",
+            "DefaultValue": str(len(rows)),
+        }  # fmt: skip
+        for sub, row in enumerate(rows, 1):
+            unit = self._unit(row.unit)
+            section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw"}
+            shown = {} if unit == "raw" else {"Unit": _shown(unit)}
+            self._sections[object_section(index, sub)] = section | {"DefaultValue": "0"} | shown
+
+    def _correct_defaults(self) -> None:
+        """Give objects whose factory value the emulator cannot have another, and units to what is bound."""
+        for key, binding in self._bindings.items():
+            row = self._section(key)
+            if binding.unit != "raw" and not row.get("Unit"):
+                row["Unit"] = _shown(binding.unit)
+        for index, allowed, instead in (
+            (cia402.QUICK_STOP_OPTION, QUICK_STOP_OPTIONS, 2), (cia402.MODE, (0, *self._modes), 0),
+        ):  # fmt: skip
+            if (index, 0) in self._types and self._default(index) not in allowed:
+                self._changes.append(
+                    Note(f"[{index:04X}]", f"DefaultValue={self._default(index)} is not possible here: it is {instead}")
+                )
+                self._section((index, 0))["DefaultValue"] = str(instead)
+        exponent = (cia402.INTERPOLATION_PERIOD, 2)
+        if exponent in self._types and self._types[exponent].default is None:
+            self._section(exponent)["DefaultValue"] = "-3"
+            self._changes.append(Note(f"[{_text(exponent)}]", "has no default: -3, milliseconds"))
+        for key in self._units.scale.values():
+            self._section(key).setdefault("LowLimit", "1")
+        for key, variable in self._types.items():
+            if isinstance(variable.default, int) and variable.default >= 1 << 63:
+                self._section(key)["DefaultValue"] = "0"
+                self._changes.append(Note(f"[{_text(key)}]", "the emulator keeps 63 bits: its default is 0"))
+
+    def _section(self, key: Key) -> Section:
+        name = object_section(*key)
+        return self._sections[name] if name in self._sections else self._sections[object_section(key[0])]
+
+    def _drop_twinless(self) -> None:
+        """Leave out what a further axis has and the first has not: what it is cannot be known from the first."""
+        for index, sub in list(self._types):
+            first = cia402.of_first_axis(index)
+            if self._axes > 1 and first != index and (first, sub) not in self._types and index in cia402.PROFILE_AREAS:
+                self._sections.pop(object_section(index, sub), None)
+                self._sections.pop(object_section(index), None)
+                self._changes.append(
+                    Note(f"[{_text((index, sub))}]", "was left out: the first axis has no such object")
+                )
+
+    def _tell_of_units(self) -> None:
+        units = self._units
+        for quantity, unit in (
+            ("velocity", units.velocity),
+            ("acceleration", units.acceleration),
+            ("torque", units.torque),
+        ):
+            where = units.sources[quantity]
+            if not where:
+                why = "the EDS tells no unit: the standard's, or what fits the others; read the manual"
+                self._fill_in.append(Note(f"unit of {quantity} in bindings.toml, {_shown(unit)}", why))
+        if units.scale and min(self._default(*key) for key in units.scale.values()) <= 0:
+            self._fill_in.append(
+                Note(units.sources["position"], "has no factory value: the counts of the motor's encoder")
+            )
+
+    def _class_values(self) -> list[Note]:
+        base = f"base of thousandths: {self._motor.rated_current:g} A peak of {self._motor.name}"
+        return [
+            Note("[current] rated of device.toml", base),
+            Note("[rates], [current], [supply], [temperature], [stage] of device.toml", CLASS_VALUES),
+            Note("[quirks] and [canopen] of device.toml", AS_THE_STANDARD),
+            Note("[emergencies] of device.toml", "codes of CiA 402; the maker's table may have others"),
+        ]
+
+    def _without_effect(self) -> Iterable[Note]:
+        own = {index for (index, _), _ in self._own}
+        scale = {index for index, _ in self._units.scale.values()}
+        bound = {index for index, _ in self._bindings}
+        for index in sorted({index for index, _ in self._types}):
+            first = cia402.of_first_axis(index)
+            if first in bound | own | scale or first in BY_THEMSELVES or index < 0x2000:
+                continue
+            yield Note(f"{index:04X}h", WITHOUT_EFFECT.get(first, "nothing here reads it"))
+
+    # --- files ----------------------------------------------------------------------------------------------------
+    def _device_toml(self, folder: Path) -> str:
+        text = TEMPLATE.read_text(encoding="utf-8")
+        info, current = self._sections.get("DeviceInfo", {}), self._motor.rated_current
+        title = " ".join(filter(None, (info.get("VendorName"), info.get("ProductName")))) or self._eds.stem
+        head = (
+            f"# Made from {self._eds.name} by drive-env new; {LIST_NAME} lists what a person must fill in.\n"
+            f"name = {_quoted(folder.name)}\ntitle = {_quoted(title)}\neds = {_quoted(EDS_NAME)}\n"
+            f'firmware = "servo"\naxes = {self._axes}\n'
+        )
+        if self._axes > 1:
+            text = text.replace("axis_offsets = []", self._axis_offsets())
+        text = text.replace(
+            "[current]  # A of peak i_q\n",
+            f"[current]  # A of peak i_q\nrated = {current:.6g}  # base of thousandths: {self._motor.name}\n",
+        )
+        if info.get("LSS_Supported", "0") not in ("", "0"):
+            text = text.replace("lss = false", "lss = true")
+        return f"{head}{text}\n{self._tables()}"
+
+    def _axis_offsets(self) -> str:
+        rows = [
+            (cia402.PROFILE_AREAS.start, cia402.SINGLE_DEVICE_TYPE, cia402.AXIS_OFFSET),
+            (self._base, self._base + OWN_PER_AXIS - 1, OWN_PER_AXIS),
+        ]
+        listed = "".join(f"    {{ first = 0x{a:04X}, last = 0x{b:04X}, step = 0x{c:X} }},\n" for a, b, c in rows)
+        return f"axis_offsets = [\n{listed}]"
+
+    def _tables(self) -> str:
+        values: dict[str, list[Any]] = {f"{cia402.MODE:04X}:0": [0, *self._modes]}
+        if (cia402.QUICK_STOP_OPTION, 0) in self._types:
+            values[f"{cia402.QUICK_STOP_OPTION:04X}:0"] = [*QUICK_STOP_OPTIONS]
+        method = next((key for key, row in self._bindings.items() if row.field == "homing_method"), None)
+        if method is not None:
+            values[_text(method)] = [0, *self._homing_methods()]
+        for index, sub in self._types:
+            if sub == 2 and (0x1400 <= index < 0x1600 or 0x1800 <= index < 0x1A00):
+                values[_text((index, sub))] = [*TRANSMISSION_TYPES]
+            if index == ERROR_BEHAVIOUR and sub > 0:
+                values[_text((index, sub))] = [0, 1, 2]
+        stored = sorted(sub for index, sub in self._types if index == STORE and sub > 0)
+        services = [
+            _text((index, sub)) for index in (STORE, RESTORE) for i, sub in self._types if i == index and sub > 0
+        ]
+        lines = ["[states]", "", "[values]  # objects that know a few values only"]
+        lines += [f'"{key}" = [{", ".join(map(_toml, row))}]' for key, row in values.items()]
+        lines += ["", "[strict_transmission_types]", "", "[unsupported]  # without a node on a bus"]
+        lines += [f"objects = [{', '.join(map(_quoted, services))}]", "", "[canopen.store_groups]  # CiA 301, 1010h"]
+        motors = [f"motor {axis}" for axis in range(self._axes)] + ["module"]
+        groups = {
+            STORE_ALL: ["bus", "communication", "profile", *motors],
+            STORE_COMMUNICATION: ["bus", "communication"],
+            STORE_PROFILE: ["profile"],
+        }
+        lines += [f"{sub} = [{', '.join(map(_quoted, groups.get(sub, motors)))}]" for sub in stored]
+        return "\n".join(lines) + "\n"
+
+    def _bindings_toml(self) -> str:
+        lines = ["# Objects and the fields of the drive record that they are, in their units.", ""]
+        for key, row in self._bindings.items():
+            parts = [f'field = "{row.field}"']
+            parts += [f'unit = "{row.unit}"'] if row.unit != "raw" else []
+            parts += [f'event = "{row.event}"'] if row.event else []
+            lines.append(f'"{_text(key)}" = {{ {", ".join(parts)} }}')
+        return "\n".join(lines) + "\n"
+
+    def _gains_toml(self) -> str:
+        lines = ["# Gains of the emulator's own cascade; the real drive has its own.", "", 'cascade = "pi"', ""]
+        for key, row in self._own[: len(GAINS)]:
+            loop, part = row.name.lower().split()
+            lines += ["[[gain]]", f'name = "{"torque" if loop == "current" else loop}_{part}"', f'title = "{row.name}"',
+                      f'object = "{_text(key)}"', "highest = 1_000_000", f'loop = "{loop}"', f'part = "{part.upper()}"',
+                      ""]  # fmt: skip
+        return "\n".join(lines)
+
+
+def _text(key: Key) -> str:
+    return f"{key[0]:04X}:{key[1]}"
+
+
+def _shown(unit: str) -> str:
+    """Return a unit as the EDS has it: what a position is counted in is an increment, whatever its limits mean."""
+    return "inc" if unit in ("counter", "position window", "position limit") else unit
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _toml(value: int | str) -> str:
+    return str(value) if isinstance(value, int) else _quoted(value)

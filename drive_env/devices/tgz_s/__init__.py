@@ -1,0 +1,1 @@
+"""The TGZ-S: a TGZ-D whose second axis is not there."""

@@ -1,0 +1,50 @@
+"""Objects that show a part of another object, of the same axis or of a certain axis of the node.
+
+A device's table `parts` has them: `of`, the object, or one for each axis of the node; `axis`, whose; `shift` and
+`bits`, which part of it: bits from `shift` on, or, where that is negative, the whole so many bits further up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+Key = tuple[int, int]
+
+
+class Part(NamedTuple):
+    """A row.
+
+    Attributes:
+        of: The object, or one for each axis of the node.
+        axis: Number in the node of the axis whose object it is; None: of the same axis.
+        shift: Lowest of its bits; negative: so many bits further up.
+        bits: How many of them.
+    """
+
+    of: tuple[Key, ...]
+    axis: int | None = None
+    shift: int = 0
+    bits: int = 32
+
+    def source(self, axis: int) -> Key:
+        """Return the object that an axis of the node shows a part of."""
+        return self.of[axis % len(self.of)]
+
+    def shown(self, raw: Any) -> Any:
+        """Return the part of integers of the object."""
+        moved = raw >> self.shift if self.shift >= 0 else raw << -self.shift
+        return moved & ((1 << self.bits) - 1)
+
+    def put(self, raw: Any, part: Any) -> Any:
+        """Return integers of the object with another part."""
+        mask = ((1 << self.bits) - 1) << self.shift
+        return (raw & ~mask) | ((part << self.shift) & mask)
+
+
+def parts_of(rows: Mapping[Key, Mapping[str, Any]], parse: Any) -> dict[Key, Part]:
+    """Return a device's table; `parse` makes a key of its text."""
+    return {
+        key: Part(tuple(parse(text) for text in row["of"]), row.get("axis"), row.get("shift", 0), row.get("bits", 32))
+        for key, row in rows.items()
+    }

@@ -1,0 +1,91 @@
+"""Machines with servo amplifiers on mains: a servo machine's parameters, and those of rectifier, link and resistor.
+
+The axes of a machine with an even number of them are the pairs of two-axis modules, and share links. Machines have
+nothing in common with each other, so an axis that is alone in its machine has a link of its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drive_env.devices import Device
+from drive_env.emulator import servo_machine
+from drive_env.emulator.parameters import Floats, MachineKind, MachineParameter, Mask, Records
+from drive_env.emulator.servo_machine import SERVO
+from drive_env.firmware.record import LANES, set_lanes
+from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
+from drive_env.motors import Motor
+
+OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off
+CHOPPER, CHOPPER_HYSTERESIS = 0.92, 0.025  # of the over-voltage: where the chopper begins, and how far it draws down
+OVERSPEED = 1.5  # of the rated speed
+# degC; class values. A thermostat of class F insulation, its sensor's limit just below, and a cabinet.
+THERMOSTAT, MOTOR_TEMPERATURE, AMBIENT = 155.0, 145.0, 60.0
+
+# Parameters that are a field of the record as they stand.
+_FIELDS = {
+    "stage.mains_frequency": "mains_frequency",
+    "stage.charging_resistance": "charging_resistance",
+    "stage.idle_power": "idle_power",
+    "stage.brake_power": "brake_power",
+    "stage.brake_thermal_time": "brake_thermal_time",
+    "stage.mains_phase_lost": "mains_phase_lost",
+    "stage.emergency_stop": "emergency_stop",
+}
+_NOT_HERE = {"stage.idle_current", "stage.supply_sinks"}  # the rectifier feeds only
+
+
+def motor_parameters(motor: Motor) -> list[MachineParameter]:
+    """Return the parameters of a motor, in the order in which they are drawn, and what is never drawn of the mains."""
+    rows = servo_machine.motor_parameters(motor)
+    for name in ("mains_phase_lost", "emergency_stop"):
+        rows.append(MachineParameter(f"stage.{name}", "1", 0.0, 0.0, 0.0, 0.0))
+    return rows
+
+
+def apply(records: Records, device: Device, motor: Motor, name: str, values: Floats, axes: Mask) -> None:
+    """Write a motor or stage parameter into the records of the axes where the mask is true."""
+    if name in _FIELDS:
+        set_lanes(records, _FIELDS[name], values, axes)
+    else:
+        servo_machine.apply(records, device, motor, name, values, axes)
+
+
+def set_constants(records: Records, device: Device, motor: Motor) -> None:
+    """Write what stage and motor are besides their parameters, and what the drive has been told of its motor."""
+    servo_machine.set_constants(records, device, motor)
+    records["cyclic_wraps"] = 1  # positions of 64 bits inside: the 32 bits outside are their end
+    records["chopper_enable"] = 1.0
+    records["chopper_voltage"] = CHOPPER * device.overvoltage
+    records["chopper_hysteresis"] = CHOPPER_HYSTERESIS * device.overvoltage
+    records["offset_limit"] = OFFSET_SHARE * device.current_full_scale
+    records["current_range"] = device.current_full_scale
+    records["overspeed"] = OVERSPEED * motor.rated_speed
+    records["thermostat_temperature"] = THERMOSTAT
+    records["motor_temperature"] = MOTOR_TEMPERATURE
+    records["ambient_limit"] = AMBIENT
+    for mode, needed in device.mode_gate.items():
+        records["d_mode_needed"][:, mode, :] = needed
+    for lane in range(LANES):  # three inputs for the switches of each axis of a module
+        records["switch_input"][:, :, lane] = 3 * (lane % device.num_axes) + np.arange(3)
+    # Of an absolute encoder, which knows the rotor's angle.
+    records["motor_type"], records["commutation_mode"], records["encoder_init_mode"] = BLDC, ENCODER, USE_OFFSET
+    records["pole_pairs"], records["encoder_steps"] = motor.n_p, motor.encoder_counts
+    records["encoder_direction"] = motor.encoder_direction
+
+
+def connect(records: Records, axes_per_machine: int) -> None:
+    """Let the axes of a machine share links in pairs."""
+    shared = axes_per_machine % 2 == 0
+    records["link_shared"] = 1.0 if shared else 0.0
+
+
+SERVO_MAINS = MachineKind(
+    motor_parameters,
+    SERVO.wiring_parameters,
+    frozenset((SERVO.known | _FIELDS.keys()) - _NOT_HERE),
+    set_constants,
+    apply,
+    noise=SERVO.noise,
+    connect=connect,
+)

@@ -1,0 +1,71 @@
+"""CANopen over EtherCAT: services of a mailbox message, and emergencies (ETG.1000.6, 5.6).
+
+A message has two bytes of header: a number, of which nobody makes use, and the service in the upper four bits.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from enum import IntEnum
+
+from drive_env.devices import EmergencyCode
+
+HEADER = 2
+MAILBOX_HEADER = 6
+QUEUE = 8  # emergencies for each axis of the node
+
+
+class Service(IntEnum):
+    """Services of CoE (ETG.1000.6, table 28)."""
+
+    EMERGENCY = 1
+    SDO_REQUEST = 2
+    SDO_RESPONSE = 3
+    INFORMATION = 8
+
+
+def message(service: Service, content: bytes) -> bytes:
+    """Return a message with its header."""
+    return struct.pack("<H", service << 12) + content
+
+
+def split(data: bytes) -> tuple[int, bytes]:
+    """Return service and content of a message; ValueError for one without a header."""
+    if len(data) < HEADER:
+        raise ValueError(f"a CoE message has {HEADER} bytes of header or more, not {len(data)}")
+    return data[1] >> 4, data[HEADER:]
+
+
+class MailboxEmergencies:
+    """Emergencies that wait for the mailbox.
+
+    Args:
+        num_axes: Axes of the node.
+
+    Attributes:
+        told: Error register of the last one that was queued; 0 before the first.
+    """
+
+    def __init__(self, num_axes: int) -> None:
+        self.told = 0
+        self._waiting: deque[bytes] = deque()
+        self._room = QUEUE * num_axes
+
+    def push(self, emergency: EmergencyCode, error_register: int) -> None:
+        """Queue one; a full queue loses the newest."""
+        if len(self._waiting) < self._room:
+            content = emergency.code.to_bytes(2, "little") + bytes((error_register,)) + bytes(emergency.extra)
+            self._waiting.append(message(Service.EMERGENCY, content))
+            self.told = error_register
+
+    def take(self) -> list[bytes]:
+        """Return and forget the messages that wait."""
+        taken = list(self._waiting)
+        self._waiting.clear()
+        return taken
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._waiting.clear()
+        self.told = 0

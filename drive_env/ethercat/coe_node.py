@@ -1,0 +1,255 @@
+"""A drive on EtherCAT: what is behind the slave controller (`application.py` has the calls and their order).
+
+Dictionary, axes, errors, stored parameters and the process image are those of any node (`node/`). Here stands what
+EtherCAT makes of them: which AL state lets what act, and when outputs take effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from drive_env.cia402 import State
+from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.ethercat.application import (
+    AlState,
+    AlStatusCode,
+    ClockSetting,
+    Layout,
+    MailboxPlace,
+    SyncManagerSetting,
+)
+from drive_env.ethercat.coe import MailboxEmergencies, Service, split
+from drive_env.ethercat.coe_information import SdoInformation
+from drive_env.ethercat.coe_sdo import CoeSdoServer
+from drive_env.ethercat.object_descriptions import describe
+from drive_env.ethercat.sii_content import sii_content
+from drive_env.node.axis import ObjectPort
+from drive_env.node.node_axes import NodeAxes
+from drive_env.node.node_dictionary import NodeDictionary
+from drive_env.node.node_errors import NodeErrors
+from drive_env.node.node_objects import ERROR_HISTORY, NodeObjects
+from drive_env.node.parameters import Parameters
+from drive_env.node.process_image import ImageObjects
+from drive_env.node.store import PowerLostError, Store
+
+ENABLE_OPERATION = 0x0F  # bits of the controlword that command operation enabled
+OUTPUTS_CONDITION = "outputs"
+NODE_ID = 1  # of the factory's values; EtherCAT has no COB-IDs that follow it
+
+
+class CoeObjects(NodeObjects):
+    """The node's own objects, those of the process image among them."""
+
+    image: ImageObjects
+
+    def port(self, entry: Entry) -> ObjectPort:
+        """Return the way to one of these objects."""
+        return self.image.port(entry) if self.image.owns(entry) else super().port(entry)
+
+
+class CoeNode:
+    """The device of a slave, in front of the axes of an emulated one.
+
+    Args:
+        drives: The emulated drives.
+        first_axis: Number of the device's first axis among the drives'.
+        spare: Drives of the node's last axes, those that `drives` have none for.
+        store: The file that is its non-volatile memory; without one it lasts as long as the node.
+        serial: Serial number in its EEPROM.
+
+    Raises:
+        ValueError: For a device that has no EtherCAT, or axes that the drives do not have.
+
+    Attributes:
+        layout: Where its sync managers lie.
+        drives: The emulated drives.
+        dictionary: All objects by index and sub-index.
+        state: AL state.
+    """
+
+    def __init__(
+        self,
+        drives: EmulatedDrives,
+        first_axis: int = 0,
+        *,
+        spare: EmulatedDrives | None = None,
+        store: Path | None = None,
+        serial: int = 0,
+    ) -> None:
+        device = drives.device
+        behaviour = device.ethercat
+        if behaviour is None:
+            raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
+        self.drives = drives
+        self.state = AlState.INIT
+        self.layout = Layout(
+            MailboxPlace(*behaviour.receive), MailboxPlace(*behaviour.send), behaviour.outputs, behaviour.inputs,
+            MailboxPlace(*behaviour.bootstrap_receive), MailboxPlace(*behaviour.bootstrap_send),
+        )  # fmt: skip
+        self._device = device
+        self._shortest_cycle = behaviour.shortest_cycle
+        self._axes = NodeAxes(drives, first_axis, spare)
+        entries = drives.inside.objects.entries.without(behaviour.only_on_can)
+        self._objects = CoeObjects(device, entries, lambda index: None)
+        self._image = ImageObjects(device, entries, lambda: self.state is AlState.PRE_OP)
+        self._objects.image = self._image
+        self.dictionary = NodeDictionary(device, entries, self._objects, self._axes)
+        self._image.connect(self.dictionary.port)
+        self._emergencies = MailboxEmergencies(device.num_axes)
+        depth = len(self._objects.subs(ERROR_HISTORY))
+        self._errors = NodeErrors(device, self._axes, depth, self._emergencies, lambda now: None, lambda: None)
+        self._errors.add_objects(self._objects)
+        self._store = Store(store, device.name)
+        self._parameters = Parameters(
+            device, self._objects, self._axes, self.dictionary, self._store, lambda: NODE_ID, lambda: None
+        )
+        self._parameters.add_commands()
+        self._parameters.check(store)
+        self._parameters.prepare_restart()
+        self._by_index = _by_index(entries)
+        self._sdo = CoeSdoServer(self._port, self._entries_of, self._image, behaviour.send.length)
+        self._information = SdoInformation(describe(device), behaviour.send.length)
+        self._sii = sii_content(device, serial)
+        self._has_sync0 = False
+        self._waiting: bytes | None = None  # outputs that take effect with SYNC0
+
+    # --- process data -------------------------------------------------------------------------------------------------
+    @property
+    def output_size(self) -> int:
+        """Bytes of sync manager 2, as they are mapped now."""
+        return self._image.output_size
+
+    @property
+    def input_size(self) -> int:
+        """Bytes of sync manager 3, as they are mapped now."""
+        return self._image.input_size
+
+    def outputs(self, data: bytes, now: float) -> None:
+        """Let outputs take effect at once or, with SYNC0, at its next pulse."""
+        if self._has_sync0:
+            self._waiting = data
+        else:
+            self._apply(data, now)
+
+    def inputs(self, now: float) -> bytes:
+        """Return the input image as it is now."""
+        return self._image.read_inputs()
+
+    def sync0(self, now: float) -> None:
+        """Let the outputs that came since the last pulse take effect."""
+        data, self._waiting = self._waiting, None
+        if data is not None and self.state is AlState.OP:
+            self._apply(data, now)
+
+    def _apply(self, data: bytes, now: float) -> None:
+        if self._image.write_outputs(data):
+            self._errors.conditions.pop(OUTPUTS_CONDITION, None)
+        else:
+            self._errors.condition("pdo_not_accepted", now, OUTPUTS_CONDITION)
+
+    # --- states -------------------------------------------------------------------------------------------------------
+    def power_on(self, now: float) -> None:
+        """Boot: stored values, the factory's image, no error to be told."""
+        self.state = AlState.INIT
+        self._waiting = None
+        self._has_sync0 = False
+        self._axes.restart()
+        self._objects.restore(NODE_ID, self._store.sections.get("communication", {}))
+        self._image.restart()
+        self._errors.restart()
+        self._sdo.close()
+
+    def request_state(
+        self, old: AlState, new: AlState, sync_managers: Sequence[SyncManagerSetting], clock: ClockSetting, now: float
+    ) -> AlStatusCode:
+        """Refuse a cycle of SYNC0 that the device cannot keep up with; 0, a single pulse, is none."""
+        if new is AlState.SAFE_OP and old is AlState.PRE_OP:
+            if clock.has_sync0 and clock.sync0_cycle < self._shortest_cycle:
+                return AlStatusCode.DC_CYCLE_TIME
+            self._has_sync0 = clock.has_sync0
+        return AlStatusCode.NO_ERROR
+
+    def state_changed(self, new: AlState, code: AlStatusCode, now: float) -> None:
+        """Learn the new state; who leaves Op, for whatever reason, has its motors stopped by their fault reaction."""
+        old, self.state = self.state, new
+        if old is AlState.OP and new is not AlState.OP:
+            self._waiting = None
+            self._stop_axes(now)
+        if new in (AlState.INIT, AlState.BOOTSTRAP):
+            self._sdo.close()
+            self._emergencies.clear()
+
+    def watchdog_expired(self, now: float) -> None:
+        """Learn that no outputs came in time: the axes stop by their fault reaction."""
+        self._waiting = None
+        self._stop_axes(now)
+
+    def _stop_axes(self, now: float) -> None:
+        """Take enabled axes into their fault reaction, and tell of it."""
+        if self._axes.trip():
+            self._errors.condition("communication_error", now)
+
+    def before_cycle(self, now: float) -> None:
+        """Keep motors off outside Op (manual of the TMCM-3313, section 2.2): whatever enabled one, it goes no cycle."""
+        if self.state is not AlState.OP and any(axis.state == State.OPERATION_ENABLED for axis in self._axes):
+            self._stop_axes(now)
+
+    def after_cycle(self, now: float) -> None:
+        """Tell of what the axes had."""
+        self._errors.collect(now)
+
+    # --- mailbox ------------------------------------------------------------------------------------------------------
+    def coe(self, message: bytes, now: float) -> list[bytes]:
+        """Return the CoE messages that answer one; ValueError for none that is answered."""
+        service, content = split(message)
+        if service == Service.SDO_REQUEST:
+            try:
+                return self._sdo.request(content)
+            except PowerLostError:
+                self.power_on(now)
+                return []
+        if service == Service.INFORMATION:
+            return self._information.request(content)
+        raise ValueError(f"service {service} of CoE is none that this device has")
+
+    def pending_coe(self, now: float) -> list[bytes]:
+        """Return and forget the emergencies that wait."""
+        return self._emergencies.take()
+
+    def _entries_of(self, index: int) -> Sequence[Entry]:
+        entries = self._by_index.get(index)
+        return entries if entries is not None else [self.dictionary.entries.find((index, 0))]
+
+    def _port(self, index: int, sub: int) -> ObjectPort:
+        """Return the way by which an SDO comes to an object."""
+        port = self.dictionary.port(index, sub)
+        if port.event != "controlword":
+            return port
+        return port._replace(check=lambda raw: self._check_controlword(port, raw))
+
+    def _check_controlword(self, port: ObjectPort, raw: int) -> None:
+        port.check(raw)
+        if self.state is not AlState.OP and raw & ENABLE_OPERATION == ENABLE_OPERATION:
+            raise ObjectAccessError(
+                WRONG_STATE,
+                f"{port.entry.label} cannot enable operation in {self.state.name}; motors run in Op alone",
+            )
+
+    # --- EEPROM -------------------------------------------------------------------------------------------------------
+    def read_sii(self) -> bytes:
+        """Return the EEPROM's content."""
+        return self._sii
+
+    def write_sii(self, content: bytes) -> None:
+        """Keep what the master has written."""
+        self._sii = content
+
+
+def _by_index(entries: ObjectDictionary) -> dict[int, list[Entry]]:
+    found: dict[int, list[Entry]] = {}
+    for entry in entries:
+        found.setdefault(entry.index, []).append(entry)
+    return {index: sorted(rows, key=lambda one: one.sub) for index, rows in found.items()}

@@ -1,0 +1,136 @@
+"""The clock of a slave controller: local time, system time, what it has to be put right by, SYNC0 (ETG.1000.4, 6.8).
+
+Every slave has an oscillator of its own. A master measures by port receive times how long frames take, writes each
+slave's offset and delay, and then lets the first slave's system time pass all others (ARMW, FRMW): each compares, and
+corrects its rate. World time is in nanoseconds here; the world has one, the slaves have none that is right.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from drive_env.ethercat import registers
+
+SLOWEST_CORRECTION = 0.1  # of a clock tick: the ET1100 makes ticks of 9, 10 or 11 ns of 10
+PHASE_SHARE, RATE_SHARE = 0.25, 0.03  # of a difference, by which time and rate are corrected at each comparison; ours
+ACTIVE, SYNC0 = 0x01, 0x02
+NOT_IN_NEAR_FUTURE = 0x04  # of the activation status: the start time has passed
+WORD = 1 << 32
+
+
+class DistributedClock:
+    """A slave's clock, and its registers from 0900h on.
+
+    Args:
+        memory: The controller's.
+        drift: By how much its oscillator is too fast, as a share: 50e-6 is 50 ppm.
+        epoch: Its local time [ns] at world time 0; clocks count from power-on.
+    """
+
+    def __init__(self, memory: bytearray, drift: float = 0.0, epoch: int = 0) -> None:
+        self._memory = memory
+        self._drift = drift
+        self._epoch = epoch
+        self.reset(0)
+
+    def reset(self, now: int) -> None:
+        """Forget all corrections and pulses, as a reset does."""
+        self._anchor = now
+        self._anchor_local = self._epoch + now * (1.0 + self._drift)
+        self._correction = 0.0
+        self._compared: int | None = None
+        self._mean = 0.0
+        self._next_pulse: int | None = None  # system time [ns]
+        self.is_measuring = False  # receive times are latched as the frame comes back
+
+    # --- times ------------------------------------------------------------------------------------------------------
+    def local(self, now: int) -> int:
+        """Return local time [ns] at world time `now` [ns]."""
+        return int(self._anchor_local + (now - self._anchor) * (1.0 + self._drift + self._correction))
+
+    def system(self, now: int) -> int:
+        """Return system time [ns], the local one with the master's offset."""
+        (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
+        return (self.local(now) + int(offset)) % (1 << 64)
+
+    def refresh(self, now: int) -> None:
+        """Let the registers show the time `now` [ns]."""
+        struct.pack_into("<Q", self._memory, registers.SYSTEM_TIME, self.system(now))
+
+    def latch(self, port: int, now: int) -> None:
+        """Keep the local time at which a frame came to a port, 0 or 1 [ns]."""
+        local = self.local(now)
+        struct.pack_into("<I", self._memory, registers.RECEIVE_TIMES + 4 * port, local % WORD)
+        if port == 0:
+            struct.pack_into("<Q", self._memory, registers.RECEIVE_TIME_UNIT, local % (1 << 64))
+        self.is_measuring = port == 0
+
+    def compare(self, received: int, now: int) -> None:
+        """Correct the clock by a reference's system time, its low 32 bits, that came at `now` [ns]."""
+        memory = self._memory
+        (delay,) = struct.unpack_from("<I", memory, registers.TIME_DELAY)
+        behind = (received + delay - self.system(now)) % WORD
+        difference = -(behind - WORD if behind >= WORD // 2 else behind)  # above 0: this clock is ahead
+        local, elapsed = self.local(now), 0 if self._compared is None else now - self._compared
+        self._compared = now
+        most = SLOWEST_CORRECTION * elapsed
+        step = min(max(-PHASE_SHARE * difference, -most), most)
+        if elapsed > 0:
+            rate = self._correction - RATE_SHARE * difference / elapsed
+            self._correction = min(max(rate, -SLOWEST_CORRECTION), SLOWEST_CORRECTION)
+        self._anchor, self._anchor_local = now, local + step
+        depth = memory[registers.FILTER_DEPTHS]
+        self._mean += (difference - self._mean) / (1 << depth)
+        told = min(round(abs(self._mean)), WORD // 2 - 1)
+        struct.pack_into("<I", memory, registers.TIME_DIFFERENCE, told | (1 << 31 if self._mean < 0.0 else 0))
+        speed = min(max(round(self._correction * 0x1000), -0x8000), 0x7FFF)
+        struct.pack_into("<h", memory, registers.SPEED_DIFFERENCE, speed)
+
+    def restart_comparison(self, now: int) -> None:
+        """Forget what comparisons have brought, as a write of the speed counter's start does."""
+        self._anchor, self._anchor_local = now, float(self.local(now))
+        self._correction = self._mean = 0.0
+        self._compared = None
+        struct.pack_into("<I", self._memory, registers.TIME_DIFFERENCE, 0)
+        struct.pack_into("<h", self._memory, registers.SPEED_DIFFERENCE, 0)
+
+    # --- SYNC0 ------------------------------------------------------------------------------------------------------
+    @property
+    def has_sync0(self) -> bool:
+        """Whether SYNC0 is switched on."""
+        return self._memory[registers.SYNC_ACTIVATION] & (ACTIVE | SYNC0) == ACTIVE | SYNC0
+
+    @property
+    def cycle(self) -> int:
+        """Cycle of SYNC0 [ns]; 0: one shot."""
+        (cycle,) = struct.unpack_from("<I", self._memory, registers.SYNC0_CYCLE)
+        return int(cycle)
+
+    def activate(self, now: int) -> None:
+        """Take what 0981h says: SYNC0 from its start time on. A start that has passed makes no pulse."""
+        self._memory[registers.SYNC_STATUS] = 0
+        self._next_pulse = None
+        if self.has_sync0:
+            (start,) = struct.unpack_from("<Q", self._memory, registers.SYNC0_START)
+            if start > self.system(now):
+                self._next_pulse = start
+                self._memory[registers.SYNC_STATUS] = 1
+            else:
+                self._memory[registers.SYNC_STATUS] = NOT_IN_NEAR_FUTURE
+
+    def next_pulse(self) -> int | None:
+        """Return the world time [ns] of the next pulse, None where there is none."""
+        if self._next_pulse is None:
+            return None
+        (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
+        ahead = (self._next_pulse - int(offset)) % (1 << 64) - self._anchor_local
+        return self._anchor + int(ahead / (1.0 + self._drift + self._correction)) + 1
+
+    def take_pulse(self, now: int) -> bool:
+        """Return whether a pulse is due at `now` [ns], and go on to the next."""
+        pulse = self._next_pulse
+        if pulse is None or self.system(now) < pulse:
+            return False
+        self._next_pulse = pulse + self.cycle if self.cycle else None
+        struct.pack_into("<Q", self._memory, registers.SYNC0_START, self._next_pulse or pulse)
+        return True

@@ -1,0 +1,43 @@
+"""A log of all frames, as Wireshark reads them: a pcap file of Ethernet frames with nanoseconds."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from types import TracebackType
+
+MAGIC, ETHERNET_LINK, LARGEST = 0xA1B23C4D, 1, 65_535
+
+
+class PcapLog:
+    """Writes frames to a file; its `add` is a listener of a segment.
+
+    Args:
+        path: The file, which must not exist.
+        epoch: Time of the file at world time 0 [s since 1970].
+
+    Raises:
+        OSError: If it cannot be made.
+    """
+
+    def __init__(self, path: Path, epoch: float = 0.0) -> None:
+        self._epoch = epoch
+        self._file = path.open("xb")
+        self._file.write(struct.pack("<IHHiIII", MAGIC, 2, 4, 0, 0, LARGEST, ETHERNET_LINK))
+
+    def add(self, now: float, frame: bytes, _came_back: bool = False) -> None:
+        """Write a frame at world time `now` [s]."""
+        seconds, nanoseconds = divmod(round((self._epoch + now) * 1e9), 1_000_000_000)
+        self._file.write(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()
+
+    def __enter__(self) -> PcapLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,94 @@
+"""A segment: slaves in a line. A frame passes each of them on its way out and comes back through all.
+
+A frame that is not whole changes nothing: its datagrams must fill its length, and, where the way it came tells the FCS,
+that must fit. Then the first slave counts it (0300h or 030Ch), those behind count that somebody did (0308h).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drive_env.ethercat import datagrams, registers
+from drive_env.ethercat.slave import EtherCatSlave
+
+HOP = 450  # ns from one slave's port to the next one's: a metre of cable, receiver, processing unit; ours
+INVALID_FRAME = 0  # byte of a port's two RX error counters
+SOURCE, LOCAL = 6, 0x02  # a controller sets this bit of the source address: the frame has been here
+
+
+class Segment:
+    """Slaves one behind the other.
+
+    Attributes:
+        slaves: In the order of the line.
+        listeners: Called with time [s], frame as it was sent or came back, and whether it came back.
+    """
+
+    def __init__(self) -> None:
+        self.slaves: list[EtherCatSlave] = []
+        self.listeners: list[Callable[[float, bytes, bool], None]] = []
+
+    def add(self, slave: EtherCatSlave) -> None:
+        """Put a slave at the end of the line."""
+        if self.slaves:
+            self.slaves[-1].controller.connect(ends_line=False)
+        self.slaves.append(slave)
+
+    def power_on(self, now: float) -> None:
+        """Switch all slaves on."""
+        for slave in self.slaves:
+            slave.power_on(now)
+
+    def transfer(self, frame: bytes, now: float) -> bytes | None:
+        """Return an Ethernet frame without FCS as it comes back at `now` [s]; None: it does not."""
+        start = datagrams.begin(frame)
+        if start is None:
+            return None
+        body = bytearray(frame)
+        if not self._pass(body, start, now):
+            return None
+        body[SOURCE] |= LOCAL
+        done = bytes(body)
+        for listener in self.listeners:
+            listener(now, frame, False)
+            listener(now, done, True)
+        return done
+
+    def transfer_wire(self, frame: bytes, now: float) -> bytes | None:
+        """Return an Ethernet frame with its FCS as it comes back; None: it was damaged, or does not come back."""
+        plain = datagrams.without_check_sequence(frame)
+        if plain is None:
+            self._count(registers.RX_ERRORS + INVALID_FRAME)
+            return None
+        done = self.transfer(plain, now)
+        return None if done is None else datagrams.with_check_sequence(done)
+
+    def transfer_payload(self, payload: bytes, now: float) -> bytes | None:
+        """Return the payload of a UDP datagram as it comes back; None: it does not."""
+        frame = datagrams.BROADCAST + datagrams.MASTER + datagrams.ETHERTYPE + payload
+        done = self.transfer(frame, now)
+        return None if done is None else done[datagrams.ETHERNET :]
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _pass(self, body: bytearray, start: int, now: float) -> bool:
+        """Let a frame pass all slaves; returns whether it was whole."""
+        places = datagrams.find(body, start)
+        if places is None:
+            self._count(registers.UNIT_ERRORS)
+            return False
+        time = round(now * 1e9)
+        last = len(self.slaves) - 1
+        for k, slave in enumerate(self.slaves):
+            slave.controller.process(body, places, time + k * HOP)
+        for k, slave in enumerate(self.slaves):
+            clock = slave.controller.clock
+            if clock.is_measuring:
+                clock.is_measuring = False
+                if k < last:
+                    clock.latch(1, time + (2 * last - k) * HOP)
+            slave.after_frame(now)
+        return True
+
+    def _count(self, address: int) -> None:
+        for k, slave in enumerate(self.slaves):
+            slave.controller.count(address if k == 0 else registers.FORWARDED_ERRORS)

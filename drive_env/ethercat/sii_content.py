@@ -1,0 +1,160 @@
+"""The content of a slave's EEPROM, made from its device's data (ETG.1000.6, 5.4; ETG.2010)."""
+
+from __future__ import annotations
+
+import struct
+
+from drive_env.devices import Device
+from drive_env.devices.ethercat import EtherCatBehaviour
+from drive_env.ethercat.object_descriptions import ObjectDescription, describe
+from drive_env.ethercat.sii_interface import CONFIGURATION, checksum
+from drive_env.node import mapping
+from drive_env.node.process_image import INPUTS, OUTPUTS
+
+STRINGS, GENERAL, FMMU, SYNC_MANAGERS, INPUT_PDO, OUTPUT_PDO, CLOCK = 10, 30, 40, 41, 50, 51, 60  # categories
+PDI_CONTROL, PDI_CONFIGURATION, SYNC_PULSE = 0x0C05, 0x0000, 0x0064  # SPI slave; pulses of 1 us
+COE, FOE = 0x04, 0x08  # mailbox protocols
+# CoE details: SDO, SDO information, PDO assignment and configuration, complete access.
+COE_DETAILS = 0x01 | 0x02 | 0x04 | 0x08 | 0x20
+CONTROLS = (0x26, 0x22, 0x64, 0x20)  # of sync managers 0 to 3
+KINDS = (1, 2, 3, 4)
+FMMU_KINDS = (1, 2, 3)  # outputs, inputs, state of the mailbox
+BEFORE_CATEGORIES = 0x80  # bytes
+# Operation modes: name, activation of the clocks (0: none; 0300h: SYNC0).
+MODES = (("Free run or synchronous with sync manager", 0x0000), ("Distributed clocks, SYNC0", 0x0300))
+
+
+def identity(device: Device) -> tuple[int, int, int]:
+    """Return vendor, product code and revision number, those of 1018h."""
+    dictionary = device.new_dictionary()
+    values = [dictionary.find((0x1018, sub)).default for sub in (1, 2, 3)]
+    vendor, product, revision = (value if isinstance(value, int) else 0 for value in values)
+    return vendor, product, revision
+
+
+def title(device: Device) -> str:
+    """Return maker and name of a device."""
+    return device.title.partition(",")[0]
+
+
+def mapped(objects: dict[int, ObjectDescription], direction: int) -> list[tuple[int, list[int]]]:
+    """Return the mapping objects that the factory assigns to a direction, and the factory's entries of each."""
+
+    def numbers(index: int) -> list[int]:
+        values = [entry.default for entry in objects[index].entries]
+        found = [value if isinstance(value, int) else 0 for value in values]
+        return found[1 : found[0] + 1]
+
+    return [(index, numbers(index)) for index in numbers(direction)]
+
+
+def image_size(objects: dict[int, ObjectDescription], direction: int) -> int:
+    """Return the length of the factory's image of a direction [bytes]."""
+    return sum(mapping.parse(raw)[2] for _, raws in mapped(objects, direction) for raw in raws) // 8
+
+
+class _Strings:
+    """Strings of the EEPROM, counted from 1."""
+
+    def __init__(self) -> None:
+        self.all: list[bytes] = []
+
+    def number(self, text: str) -> int:
+        encoded = text.encode("latin-1", "replace")[:255]
+        if encoded not in self.all:
+            if len(self.all) == 255:
+                return 0
+            self.all.append(encoded)
+        return self.all.index(encoded) + 1
+
+    def content(self) -> bytes:
+        return bytes((len(self.all),)) + b"".join(bytes((len(one),)) + one for one in self.all)
+
+
+def sii_content(device: Device, serial: int = 0, alias: int = 0) -> bytes:
+    """Return the whole EEPROM, filled up with FFh.
+
+    Raises:
+        ValueError: For a device without EtherCAT, or whose content is longer than its EEPROM.
+    """
+    behaviour = device.ethercat
+    if behaviour is None:
+        raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
+    objects = describe(device)
+    strings = _Strings()
+    rest = _general(device, strings) + _category(FMMU, bytes(FMMU_KINDS).ljust(4, b"\0"))
+    rest += _sync_managers(behaviour, image_size(objects, OUTPUTS), image_size(objects, INPUTS))
+    for category, direction, manager in ((INPUT_PDO, INPUTS, 3), (OUTPUT_PDO, OUTPUTS, 2)):
+        rest += _category(category, _pdos(objects, direction, manager, strings))
+    rest += _category(CLOCK, b"".join(_mode(strings.number(name), activation) for name, activation in MODES))
+    content = _head(device, behaviour, serial, alias) + _category(STRINGS, strings.content()) + rest + b"\xff\xff"
+    if len(content) > behaviour.eeprom:
+        raise ValueError(f"the EEPROM of {device.name} has {behaviour.eeprom} bytes; its content takes {len(content)}")
+    return content.ljust(behaviour.eeprom, b"\xff")
+
+
+def configuration(alias: int = 0) -> bytes:
+    """Return the first words, which the controller reads, with their CRC."""
+    words = struct.pack("<7H", PDI_CONTROL, PDI_CONFIGURATION, SYNC_PULSE, 0, alias, 0, 0)
+    return words + struct.pack("<H", checksum(words.ljust(CONFIGURATION, b"\0")))
+
+
+def bootstrap(behaviour: EtherCatBehaviour) -> bytes:
+    """Return words 0014h to 0017h: the mailboxes in Bootstrap."""
+    return struct.pack("<4H", *behaviour.bootstrap_receive, *behaviour.bootstrap_send)
+
+
+def _head(device: Device, behaviour: EtherCatBehaviour, serial: int, alias: int) -> bytes:
+    mailboxes = struct.pack("<4H", *behaviour.receive, *behaviour.send)
+    head = configuration(alias) + struct.pack("<4I", *identity(device), serial) + bytes(8)
+    head += bootstrap(behaviour) + mailboxes + struct.pack("<H", COE | FOE)
+    return head.ljust(BEFORE_CATEGORIES - 4, b"\0") + struct.pack("<2H", behaviour.eeprom // 128 - 1, 1)
+
+
+def _category(number: int, content: bytes) -> bytes:
+    words = (len(content) + 1) // 2
+    return struct.pack("<2H", number, words) + content.ljust(2 * words, b"\0")
+
+
+def _general(device: Device, strings: _Strings) -> bytes:
+    name = strings.number(title(device))
+    order = strings.number(device.name.upper())
+    group = strings.number("Drives")
+    # Group, image, order and name; reserved; CoE, FoE, EoE; SoE, DS402, SysMan; flags; current; group; ports.
+    content = struct.pack("<4B", group, 0, order, name) + bytes((0, COE_DETAILS, 1, 0, 0, device.num_axes, 0, 0))
+    content += struct.pack("<hBBH", 0, 0, 0, 0x0011)  # two ports, MII both
+    return _category(GENERAL, content.ljust(32, b"\0"))
+
+
+def _sync_managers(behaviour: EtherCatBehaviour, outputs: int, inputs: int) -> bytes:
+    places = (behaviour.receive, behaviour.send, (behaviour.outputs, outputs), (behaviour.inputs, inputs))
+    rows = [
+        struct.pack("<HHBBBB", start, length, control, 0, 1 if length else 0, kind)
+        for (start, length), control, kind in zip(places, CONTROLS, KINDS, strict=True)
+    ]
+    return _category(SYNC_MANAGERS, b"".join(rows))
+
+
+def _pdos(objects: dict[int, ObjectDescription], direction: int, manager: int, strings: _Strings) -> bytes:
+    content = b""
+    for index, raws in mapped(objects, direction):
+        name = strings.number(objects[index].name)
+        content += struct.pack("<HBBBBH", index, len(raws), manager, 0, name, 0)
+        for raw in raws:
+            mapped_index, sub, bits = mapping.parse(raw)
+            entry = entry_of(objects, (mapped_index, sub))
+            content += struct.pack("<HBBBBH", mapped_index, sub, strings.number(entry[0]), entry[1], bits, 0)
+    return content
+
+
+def entry_of(objects: dict[int, ObjectDescription], key: tuple[int, int]) -> tuple[str, int]:
+    """Return name and data type of an entry."""
+    found = objects[key[0]]
+    entry = next(one for one in found.entries if one.sub == key[1])
+    name = found.name if len(found.entries) == 1 else f"{found.name} {entry.name}"
+    return name, entry.data_type
+
+
+def _mode(name: int, activation: int) -> bytes:
+    """Return an operation mode of the clocks: no cycle times, which the master chooses."""
+    return struct.pack("<IiihHhBB4s", 0, 0, 0, 0, activation, 0, name, 0, bytes(4))

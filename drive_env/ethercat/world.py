@@ -1,0 +1,110 @@
+"""A world on EtherCAT: emulated machines, their slaves in a line, and one time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.ethercat import datagrams
+from drive_env.ethercat.controller import LOGICAL
+from drive_env.ethercat.segment import Segment
+from drive_env.ethercat.slave import EtherCatSlave
+
+CYCLE = 0.001  # s: the communication cycle
+
+
+class EtherCatWorld:
+    """Slaves in a line and the drives behind them.
+
+    In lockstep each frame with process data (LRD, LWR, LRW) lets one communication cycle pass after it, and nothing
+    else does: frames take no time, and what a frame brings back was there before its cycle. Otherwise time is what
+    `run_until` says.
+
+    Attributes:
+        segment: The line.
+        drives: All emulated drives.
+        time: Time since the world began [s].
+        cycles: Communication cycles that have passed.
+        cycle_time: Length of one [s].
+
+    Args:
+        lockstep: Time advances by process data.
+        cycle_time: Length of a communication cycle [s], a whole multiple of the drives' supervision.
+    """
+
+    def __init__(self, *, lockstep: bool = True, cycle_time: float = CYCLE) -> None:
+        self.lockstep = lockstep
+        self.cycle_time = cycle_time
+        self.segment = Segment()
+        self.drives: list[EmulatedDrives] = []
+        self.time = 0.0
+        self.cycles = 0
+
+    def add(self, slave: EtherCatSlave, drives: EmulatedDrives | None = None) -> None:
+        """Put a slave at the end of the line; `drives` are new ones that advance with the world."""
+        self.segment.add(slave)
+        if drives is not None:
+            self.drives.append(drives)
+
+    def power_on(self) -> None:
+        """Switch all slaves on."""
+        self.segment.power_on(self.time)
+
+    def receive(self, frame: bytes) -> bytes | None:
+        """Return an Ethernet frame without FCS as it comes back; None: it does not."""
+        return self._after(self.segment.transfer(frame, self.time), datagrams.ETHERNET)
+
+    def receive_payload(self, payload: bytes) -> bytes | None:
+        """Return the payload of a UDP datagram as it comes back; None: it does not."""
+        return self._after(self.segment.transfer_payload(payload, self.time), 0)
+
+    def run_until(self, now: float, begins: Callable[[float], None] | None = None, early: float = 0.0) -> None:
+        """Let everything happen in its order that is due until `now` [s]; not in lockstep.
+
+        Args:
+            now: New time of the world [s].
+            begins: Called as a communication cycle begins, with the time when it was due [s].
+            early: A cycle that is due within this time [s] after `now` happens already.
+        """
+        while self.next_cycle <= now + early:
+            if begins is not None:
+                begins(self.next_cycle)
+            self.cycle()
+        self.time = max(self.time, now)
+        for slave in self.segment.slaves:
+            slave.run_until(self.time)
+
+    @property
+    def next_cycle(self) -> float:
+        """When the next communication cycle ends [s]."""
+        return (self.cycles + 1) * self.cycle_time
+
+    def next_event(self) -> float:
+        """Return when `run_until` has something to do next [s]."""
+        return min(self.next_cycle, *(slave.next_event() for slave in self.segment.slaves))
+
+    def cycle(self) -> None:
+        """Let one communication cycle pass."""
+        for slave in self.segment.slaves:
+            slave.before_cycle(self.time)
+        for drives in self.drives:
+            drives.advance(self.cycle_time)
+        self.cycles += 1
+        self.time = max(self.time, self.cycles * self.cycle_time)
+        for slave in self.segment.slaves:
+            slave.run_until(self.time)
+            slave.after_cycle(self.time)
+
+    def close(self) -> None:
+        """End the drives."""
+        for drives in self.drives:
+            drives.close()
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _after(self, done: bytes | None, start: int) -> bytes | None:
+        """Let a cycle pass, in lockstep, after a frame with process data."""
+        if done is not None and self.lockstep:
+            start = datagrams.begin(done) or start if start else start
+            if any(place.command in LOGICAL for place in datagrams.find(done, start) or ()):
+                self.cycle()
+        return done

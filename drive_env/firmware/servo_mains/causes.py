@@ -1,0 +1,235 @@
+"""What two-axis servo amplifiers on mains watch: the errors of the TGZ manual's table, by their physical cause.
+
+A cause's status flag is its bit of the error register. Errors without a cause in this model (an internal error, the
+brake's switch, the ramp of another axis, the supplies of IGBT drivers and brake) are those that a machine sets:
+error_bits does it for every error of the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from drive_env.firmware.common import causes, fsa, start_up
+from drive_env.firmware.common.brake import CLOSED
+from drive_env.firmware.common.modes import CSP, acts_as
+from drive_env.firmware.common.protection import (
+    BLOCKS_NEGATIVE,
+    BLOCKS_POSITIVE,
+    COMMUNICATION,
+    CUT,
+    FAULT_RESET,
+    FOLLOWING_ERROR,
+    LIMIT,
+    STOP,
+    WARN,
+    Cause,
+)
+from drive_env.firmware.servo.causes import open_load_a, open_load_b, overcurrent_a, overcurrent_b
+from drive_env.firmware.servo.causes import overcurrent_high_side as overcurrent_link
+from drive_env.firmware.servo_mains.mains_link import owner
+from mechanics.compiled import inlined, stage
+
+REVERSE_TIME = 0.01  # s of speeding up against the current, after which the commutation is wrong
+REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for
+STUCK_TIME = 0.1  # s of standing still under a brake that should be open
+# Bits of 1001h (TGZ manual): current, voltage, temperature, communication.
+CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
+
+
+@stage
+def watch_motion(drive, lane, dt):
+    """Measure for how long an axis is outside its window, runs away against its current, or stands under its brake."""
+    window = drive.following_error_window[lane]
+    error = abs(drive.position_demand[lane] - drive.theta_meas[lane])
+    follows = drive.drive_function[lane] > 0.0 and window > 0.0 and drive.loop_level[lane] > 0.0
+    drive.following_time[lane] = drive.following_time[lane] + dt if follows and error > window else 0.0
+    asked = drive.i_q_ref[lane]
+    most = REVERSE_SHARE * drive.i_max[lane] * drive.current_share[lane]
+    omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
+    runs_away = (
+        drive.stage_on[lane] > 0.0
+        and abs(asked) > most
+        and asked * omega < 0.0
+        and abs(omega) > abs(slow)
+        and abs(omega) > drive.standstill[lane]
+    )
+    drive.reverse_time[lane] = drive.reverse_time[lane] + dt if runs_away else 0.0
+    held = (
+        drive.brake_mode[lane] == CLOSED
+        and drive.stage_on[lane] > 0.0
+        and abs(drive.velocity_demand[lane]) > drive.standstill[lane]
+        and abs(slow) <= drive.standstill[lane]
+    )
+    drive.stuck_time[lane] = drive.stuck_time[lane] + dt if held else 0.0
+
+
+@stage
+def mains_phase(drive, lane, told):
+    """Return whether a phase of the mains is missing."""
+    return drive.mains_phase_lost[owner(drive, lane)] > 0.5
+
+
+@stage
+def mains_supply(drive, lane, told):
+    """Return whether the mains are too low to charge the link."""
+    return drive.supply_voltage[owner(drive, lane)] < drive.undervoltage[lane]
+
+
+@stage
+def holding_brake(drive, lane, told):
+    """Return whether the brake holds a motor that it should have let go."""
+    return drive.stuck_time[lane] > STUCK_TIME
+
+
+@stage
+def current_measurement(drive, lane, told):
+    """Return whether a current is measured although the stage is off."""
+    peak = max(drive.peak_a[lane], drive.peak_b[lane])
+    return drive.stage_on[lane] == 0.0 and peak > drive.offset_limit[lane]
+
+
+@stage
+def motor_thermostat(drive, lane, told):
+    """Return whether the winding's thermostat has opened."""
+    return drive.T_winding[lane] > drive.thermostat_temperature[lane]
+
+
+@stage
+def ambient_temperature(drive, lane, told):
+    """Return whether it is too hot around the drive."""
+    return drive.ambient[lane] > drive.ambient_limit[lane]
+
+
+@stage
+def feedback(drive, lane, told):
+    """Return whether the encoder does not answer."""
+    return drive.encoder_broken[lane] > 0.5
+
+
+@stage
+def commutation(drive, lane, told):
+    """Return whether the motor speeds up against its current, or its angle could not be found."""
+    failed = drive.init_state[lane] == start_up.FAILED and drive.fsa[lane] >= fsa.SWITCHED
+    return failed or drive.reverse_time[lane] > REVERSE_TIME
+
+
+@stage
+def over_speed(drive, lane, told):
+    """Return whether the motor turns too fast."""
+    return abs(drive.omega_meas[lane]) > drive.overspeed[lane]
+
+
+@stage
+def contouring(drive, lane, told):
+    """Return whether the axis has been farther from its demand than 6065h for longer than 6066h."""
+    # Whole milliseconds; half a period keeps the sum's rounding out.
+    return drive.following_time[lane] > drive.following_error_time[lane] + 5e-4
+
+
+@stage
+def trajectory(drive, lane, told):
+    """Return whether a cyclic set-point asks for more speed than the motor may have."""
+    cyclic = acts_as(drive.mode_display[lane]) == CSP and drive.drive_function[lane] > 0.0
+    return cyclic and drive.stopping[lane] == 0 and abs(drive.velocity_demand[lane]) > drive.overspeed[lane]
+
+
+@stage
+def current_regulation(drive, lane, told):
+    """Return whether a phase has too much current, or none although there should be, or the link is shorted."""
+    too_much = overcurrent_a(drive, lane, told) or overcurrent_b(drive, lane, told)
+    none = open_load_a(drive, lane, told) or open_load_b(drive, lane, told)
+    return too_much or none or overcurrent_link(drive, lane, told)
+
+
+@stage
+def emergency_stop(drive, lane, told):
+    """Return whether the emergency stop button is pressed."""
+    return drive.emergency_stop[lane] > 0.5
+
+
+@stage
+def brake_resistance(drive, lane, told):
+    """Return whether the brake resistor is too hot."""
+    return drive.brake_hot[lane] > 0.5
+
+
+@stage
+def i2t(drive, lane, told):
+    """Return whether the stage's I2t budget is used up."""
+    return drive.overload[lane] > 1.0
+
+
+@stage
+def motor_temperature(drive, lane, told):
+    """Return whether the winding is too hot."""
+    return drive.T_winding[lane] > drive.motor_temperature[lane]
+
+
+@stage
+def motor_parameter(drive, lane, told):
+    """Return whether the motor's parameters are none that it could be turned with."""
+    i_peak = drive.peak_current[lane]
+    return i_peak <= 0.0 or i_peak > drive.current_range[lane] or drive.pole_pairs[lane] < 1.0
+
+
+@stage
+def _never(drive, lane, told):
+    return False
+
+
+def _error(
+    bit: int,
+    name: str,
+    reaction: int,
+    condition: Callable[..., Any] = _never,
+    *,
+    register: int = 0,
+    held: bool = False,
+    known_as: str = "",
+) -> Cause:
+    """Return the row of an error: it is there by its condition, or because the machine sets it."""
+
+    @inlined
+    def is_there(drive, lane, told):
+        return (drive.error_bits[lane] >> bit) & 1 == 1 or condition(drive, lane, told)
+
+    return Cause(name, reaction, register, 1 << bit, is_there, held=held, known_as=known_as)
+
+
+CAUSES = (
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+    _error(0, "mains_phase", STOP, mains_phase),
+    _error(1, "mains_supply", STOP, mains_supply),
+    _error(2, "internal_error", CUT),
+    _error(3, "over_voltage", CUT, causes.overvoltage, register=VOLTAGE),
+    _error(4, "under_voltage", CUT, causes.undervoltage, register=VOLTAGE),
+    _error(5, "sto", CUT, causes.shutdown_switch),
+    _error(6, "holding_brake", CUT, holding_brake, held=True),
+    _error(7, "holding_brake_switch", STOP),
+    _error(8, "current_measurement", CUT, current_measurement, register=CURRENT),
+    _error(9, "motor_thermostat", STOP, motor_thermostat, register=TEMPERATURE),
+    _error(10, "ambient_temperature", STOP, ambient_temperature),
+    _error(11, "heat_sink_temperature", CUT, causes.overtemperature, register=TEMPERATURE),
+    _error(12, "feedback", CUT, feedback, register=NETWORK),
+    _error(13, "commutation", CUT, commutation, held=True),
+    _error(14, "over_speed", CUT, over_speed, held=True),
+    _error(15, "contouring", STOP, contouring, held=True, known_as=FOLLOWING_ERROR),
+    _error(16, "trajectory", STOP, trajectory, held=True),
+    # From outside the axis, too: its network was stopped or lost.
+    _error(17, "host_communication", STOP, register=NETWORK, held=True, known_as=COMMUNICATION),
+    _error(18, "drive_ramp_e2", STOP),
+    _error(19, "current_regulation", CUT, current_regulation, register=CURRENT, held=True),
+    _error(20, "emergency_stop", STOP, emergency_stop),
+    _error(21, "igbt_driver_voltage", CUT, register=CURRENT),
+    _error(22, "brake_resistance", STOP, brake_resistance),
+    _error(23, "brake_supply", STOP),
+    _error(25, "i2t", STOP, i2t, held=True),
+    _error(26, "motor_temperature", STOP, motor_temperature),
+    _error(27, "motor_parameter", CUT, motor_parameter),
+    # The manual has no code for them: they stop the axis, and statusword bit 11 tells it.
+    Cause("positive_software_limit", LIMIT, 0, 0, causes.above_limit, BLOCKS_POSITIVE, software=True, silent=True),
+    Cause("negative_software_limit", LIMIT, 0, 0, causes.below_limit, BLOCKS_NEGATIVE, software=True, silent=True),
+    # The axis has left its limits: no command, and nothing else ends with it.
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+)

@@ -1,0 +1,54 @@
+"""The gate of a drive whose own mode must fit the mode of operation: else it takes nothing from its master.
+
+Which D-Mode each mode of operation needs is data of the device. A mismatch "disconnects" the drive from the master
+(TGZ manual, section on 6060h): controlword and set-points are ignored, statusword bit 9 (remote) is 0. What an axis
+does that was enabled then, the manual does not say. Here it makes a quick stop, and its power goes off at standstill,
+since nobody is left who could stop it; after the mismatch has ended it must be enabled anew, step by step.
+
+The gate is looked at once per supervision period: both numbers may be changed within one, in either order.
+"""
+
+from __future__ import annotations
+
+from drive_env import cia402
+from drive_env.firmware.common import fsa
+from mechanics.compiled import stage
+
+MOST_MODES = 11  # modes of operation 0 to 10
+QUICK_STOP = int(cia402.COMMANDS["quick stop"].value)
+DISABLE_VOLTAGE = int(cia402.COMMANDS["disable voltage"].value)
+
+
+@stage
+def fits(drive, lane):
+    """Return whether the D-Mode is the one that the mode of operation needs."""
+    mode = drive.mode[lane]
+    if mode < 0 or mode >= MOST_MODES:
+        return False
+    needed = drive.d_mode_needed[mode, lane]
+    return needed == 0 or needed == drive.d_mode[lane]
+
+
+@stage
+def is_remote(drive, lane):
+    """Return whether the axis takes commands from its master."""
+    return drive.disconnected[lane] == 0
+
+
+@stage
+def look_at_gate(drive, lane, dt):
+    """Connect or disconnect the axis, once per period; one that is disconnected while it moves is stopped."""
+    if fits(drive, lane):
+        drive.disconnected[lane] = 0
+        return
+    if drive.disconnected[lane] == 0:
+        drive.disconnected[lane] = 1
+        drive.controlword[lane] = QUICK_STOP
+        fsa.command(drive, lane)
+    if drive.fsa[lane] != fsa.STOPPING:
+        return
+    # By 605Ah a quick stop may end in a state that holds the motor: here its power goes off all the same.
+    stands = drive.velocity_demand[lane] == 0.0 and abs(drive.omega_slow[lane]) <= drive.standstill[lane]
+    if drive.quick_stop_option[lane] >= fsa.STOP_AND_STAY and (stands or drive.stop_time[lane] > fsa.LONGEST_STOP):
+        drive.controlword[lane] = DISABLE_VOLTAGE
+        fsa.command(drive, lane)

@@ -1,0 +1,68 @@
+"""What two-axis servo amplifiers on mains have in the record beside what every servo drive has.
+
+Names that a device binds, or a test reads:
+
+- peak_current: M-Ipeak [A]: what 32767 of every torque object is, which are currents in the record
+- i_max: limit of the current of its own [A], beside M-Ipeak
+- target_torque: 6071h [A]: set-point of cst and pt, feed-forward in csp and ip, with torque_offset (loops.py)
+- image_limit: current limit of the process images, raw: 0 none, 32767 no current at all
+- velocity_ratio: 6094h: rpm of a velocity unit; only units read it
+- d_mode: 2303h, 2403h;  d_mode_needed: by mode of operation, 0 any (d_mode.py)
+- profile_shape: 6086h as it is, -3 to 1 (common/shaped.py)
+- following_error_time: 6066h [s]
+- overspeed: [rad/s]: over-speed, and what a cyclic set-point may ask for at most
+- inputs_set: inputs that the machine sets, bits 0 to 7; switch_input: which input each switch is wired to
+- digital_inputs: 4000h, bits 0 to 7;  input_word 60FDh, the same in bits 16 to 23
+- negative_, positive_, home_switch_mask: Homing_NegLimSwitchMask, ...: masks over bits 0 to 7
+- error_bits: errors that the machine sets, by their number in the device's error register
+- status_flags: the device's error register now: bit k is error k
+- u_dc, chopper, mains_energy, mains_loss, brake_energy, idle_energy, brake_heat: of the link, both axes alike
+"""
+
+from __future__ import annotations
+
+from drive_env.firmware.record import Field
+from drive_env.firmware.servo import fields as servo
+from drive_env.firmware.servo_mains import d_mode, mains_link
+
+# Of a servo drive on a supply without mains.
+_NOT_HERE = ("idle_current", "supply_sinks")
+
+PARAMETERS = (
+    *(field for field in servo.PARAMETERS if field.name not in _NOT_HERE),
+    *mains_link.PARAMETERS,
+    # --- parameters and commands that the dictionary writes -------------------------------------------------------
+    Field("peak_current", "f8", "A", "M-Ipeak of the motor"),
+    Field("image_limit", "f8", "1/32767", "share of M-Ipeak that is taken away: 0 none, 32767 all"),
+    Field("velocity_ratio", "f8", "rpm", "6094h: of a velocity unit", 1.0),
+    Field("d_mode", "i4", "", "2303h, 2403h"),
+    Field("following_error_time", "f8", "s", "6066h: for which the error may be outside of 6065h"),
+    Field("negative_switch_mask", "i4", "", "inputs that are the negative limit switch; 0: there is none"),
+    Field("positive_switch_mask", "i4", "", "the same of the positive one"),
+    Field("home_switch_mask", "i4", "", "the same of the home switch"),
+    # --- data of the device and of its motor ----------------------------------------------------------------------
+    Field("d_mode_needed", "i4", "", "D-Mode that each mode of operation needs; 0: any", depth=d_mode.MOST_MODES),
+    Field("overspeed", "f8", "rad/s", "speed that is an error", 1e9),
+    Field("offset_limit", "f8", "A", "current that may be measured while the stage is off", 1e9),
+    Field("current_range", "f8", "A", "of the current measurement", 1e9),
+    Field("thermostat_temperature", "f8", "K", "of the winding above 0 degC, at which its thermostat opens", 1e9),
+    Field("motor_temperature", "f8", "K", "of the winding above 0 degC, as its sensor tells it, that is an error", 1e9),
+    Field("ambient_limit", "f8", "K", "ambient temperature above 0 degC that is an error", 1e9),
+    # --- the machine as it is -------------------------------------------------------------------------------------
+    Field("inputs_set", "i4", "", "digital inputs that are set from outside, bits 0 to 7"),
+    Field("switch_input", "f8", "", "input that the left, right and home switch are wired to", depth=3),
+    Field("error_bits", "i4", "", "errors that are there, whatever the machine does: bit k is error k"),
+    Field("emergency_stop", "f8", "", "1: the emergency stop button is pressed"),
+)
+
+STATE = (
+    *servo.STATE,
+    *mains_link.STATE,
+    Field("torque_feed_forward", "f8", "A", "what csp and ip add to the set-point of the current"),
+    Field("disconnected", "i4", "", "1: the D-Mode does not fit, the master is ignored"),
+    Field("following_time", "f8", "s", "for which the following error has been outside of its window"),
+    Field("reverse_time", "f8", "s", "for which the motor has run away against its current"),
+    Field("stuck_time", "f8", "s", "for which the brake has held the motor although it was to move"),
+    Field("digital_inputs", "i4", "", "4000h: levels of the module's inputs, bits 0 to 7"),
+    Field("input_word", "i4", "", "60FDh: the same in bits 16 to 23"),
+)

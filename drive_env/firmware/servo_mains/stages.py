@@ -1,0 +1,111 @@
+"""The firmware of two-axis servo amplifiers on mains: which stages run when."""
+
+from __future__ import annotations
+
+from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.servo import alignment
+from drive_env.firmware.servo import causes as servo_causes
+from drive_env.firmware.servo.derived import derive_sensors
+from drive_env.firmware.servo.loops import current_loop
+from drive_env.firmware.servo.power_stage import open_phases, power_stage
+from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_halls, tell_counts
+from drive_env.firmware.servo.stages import (
+    collect_torque,
+    find_what_is_needed,
+    halt,
+    power_on,
+    prepare_winding,
+    read_motion,
+    tell_sensor,
+    warm,
+)
+from drive_env.firmware.servo_mains import causes, d_mode, fields
+from drive_env.firmware.servo_mains.inputs import find_switches, read_module_inputs
+from drive_env.firmware.servo_mains.loops import feed_forward, motion_loops, share_current
+from drive_env.firmware.servo_mains.mains_link import (
+    derive_link,
+    find_rectifier_voltage,
+    forget_link,
+    share_rectifier,
+    watch_link,
+)
+from drive_env.firmware.servo_mains.power import convert_energy
+from mechanics.compiled import stage
+
+
+@stage
+def run_tick(drive, rates, k):
+    """Run the current loop once: sensors, regulation, bridges and link, torque for the load's next steps.
+
+    One stage, since a call between two of them takes some nanoseconds, thousands of times a second.
+    """
+    if drive.block_uses_halls[0]:
+        measure_halls(drive, rates.tick)
+    measure_angle(drive, rates.tick)
+    measure_currents(drive)
+    current_loop(drive)
+    power_stage(drive)
+    if drive.block_has_open_phase[0]:
+        open_phases(drive)
+    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+    for s in range(1, rates.substeps):
+        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+
+@stage
+def regulate_motion(drive, rates):
+    """Run position and velocity loop."""
+    motion_loops(drive)
+
+
+@stage
+def read_mains(drive, rates):
+    """Find the voltage of the rectifier for this window."""
+    find_rectifier_voltage(drive, rates.window)
+    share_rectifier(drive)
+
+
+@stage
+def prepare_link(drive, rates):
+    """Compute what the ticks need as quotients, and look after the link."""
+    derive_sensors(drive)
+    share_current(drive)
+    watch_link(drive, rates.period)
+    derive_link(drive, rates.tick)
+
+
+@stage
+def tell_errors(drive, lane):
+    """Write the error register: a bit for each error that holds, or is shown until the reset."""
+    drive.status_flags[lane] = drive.cause_flags[lane]
+
+
+@stage
+def connect(drive, lane):
+    """Begin anew: connected to the master if the D-Mode fits, without anything measured for a time."""
+    drive.disconnected[lane] = 0 if d_mode.fits(drive, lane) else 1
+    drive.following_time[lane] = 0.0
+    drive.reverse_time[lane] = 0.0
+    drive.stuck_time[lane] = 0.0
+    drive.torque_feed_forward[lane] = 0.0
+
+
+STAGES = FirmwareStages(
+    name="servo_mains",
+    parameters=fields.PARAMETERS,
+    state=fields.STATE,
+    causes=causes.CAUSES,
+    begin_period=(warm, prepare_link, read_module_inputs),
+    measure=(find_switches, servo_causes.watch_phases, causes.watch_motion),
+    switch=(servo_causes.forget_peaks, d_mode.look_at_gate, alignment.commutate, tell_sensor),
+    tell=(feed_forward, tell_errors),
+    end_period=(find_what_is_needed,),
+    window=(read_motion, regulate_motion, read_mains, prepare_winding),
+    tick=(run_tick,),
+    power_on=(power_on, tell_counts, connect, forget_link),
+    halt=(halt, forget_link),
+    remote=d_mode.is_remote,
+)
+
+FIRMWARE = compose(STAGES, __name__)

@@ -1,0 +1,82 @@
+"""EDS and DCF of a drive as it is commissioned (CiA 306): its own EDS, with the values that its parameters have now.
+
+An EDS has them as defaults, a DCF as values of one node (ParameterValue, DeviceComissioning). What is no parameter, a
+command, a service or a set-point, stays as its EDS has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from drive_env.dictionary.eds_file import EdsFile, object_section
+from drive_env.dictionary.eds_values import number_of
+from drive_env.dictionary.entries import EdsText, ObjectDictionary, eds_file
+from drive_env.drives.interface import Drives, device_of
+from drive_env.master.parameters import command, read_parameters
+
+Key = tuple[int, int]
+CAN_KBIT = 1000  # kbit/s, where nobody says another bit rate
+
+
+def commissioned_values(drives: Drives, node: int = 0) -> dict[Key, int]:
+    """Return the parameters that a node has now, by the index of each of its axes.
+
+    Args:
+        drives: Emulated, or on a bus.
+        node: Which of a bus's nodes, from 0; emulated drives are one node from their first axis on.
+    """
+    bus = drives.bus
+    if bus is not None:
+        known, found = bus.description, dict[Key, int]()
+        for axis in range(known.num_axes):
+            values = read_parameters(bus, node * known.num_axes + axis)
+            found |= {known.key(known.dictionary.find(key), axis): value for key, value in values.items()}
+        return found
+    device = device_of(drives)
+    found = {}
+    for entry in device.new_dictionary():
+        axis, base = device.locate(entry.index)
+        is_parameter = entry.access in ("rw", "rwr", "rww") and entry.bits is not None
+        if is_parameter and axis < drives.num_axes and not command(base, device.master):
+            found[entry.index, entry.sub] = int(np.asarray(drives.read((base, entry.sub)))[axis])
+    return found
+
+
+def commissioned_eds(
+    eds: Path | EdsText, values: Mapping[Key, int], name: str, *, node_id: int | None = None, bit_rate: int = CAN_KBIT
+) -> str:
+    """Return the text of an EDS with values, or of a DCF.
+
+    Args:
+        eds: The drive's own.
+        values: Index and sub-index -> integer.
+        name: Of the file.
+        node_id: Of the node; a DCF has one, an EDS none.
+        bit_rate: Of its bus [kbit/s], in a DCF.
+    """
+    file = eds_file(eds, node_id or 1)
+    sections = {title: dict(row) for title, row in file.sections.items()}
+    defaults = {(entry.index, entry.sub): entry.default for entry in ObjectDictionary(eds, node_id or 1)}
+    for key, value in values.items():
+        row = sections.get(object_section(*key)) or sections.get(object_section(key[0]))
+        if row is None or key not in defaults:
+            continue
+        if node_id is not None:
+            row["ParameterValue"] = str(value)
+        elif defaults[key] != value:  # what follows the node-ID goes on following it
+            row["DefaultValue"] = str(value)
+    info = sections.setdefault("FileInfo", {})
+    if node_id is not None:
+        info["LastEDS"] = info.get("FileName", "")
+        before = sections.get("DeviceComissioning", {})
+        sections["DeviceComissioning"] = {
+            "NodeID": str(node_id), "NodeName": before.get("NodeName", f"node {node_id}"), "Baudrate": str(bit_rate),
+            "NetNumber": before.get("NetNumber", "0"), "NetworkName": before.get("NetworkName", ""),
+            "CANopenManager": before.get("CANopenManager", "0"),
+        }  # fmt: skip
+    info["FileName"] = name
+    info["FileRevision"] = str((number_of(info.get("FileRevision", "0")) or 0) + 1)
+    return EdsFile(sections, ()).text()

@@ -1,0 +1,75 @@
+"""The axes of one node: which of the emulated drives' they are, and what is done to all of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import overload
+
+import numpy as np
+
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.node.axis import Axis
+
+
+class NodeAxes(Sequence[Axis]):
+    """The axes of a node, in their order.
+
+    Args:
+        drives: The emulated drives.
+        first_axis: Number of the device's first axis among the drives'.
+        spare: Drives of the node's last axes, those that `drives` have none for.
+
+    Raises:
+        ValueError: For axes that the drives do not have.
+    """
+
+    def __init__(self, drives: EmulatedDrives, first_axis: int = 0, spare: EmulatedDrives | None = None) -> None:
+        device, objects = drives.device, drives.inside.objects
+        number = device.num_axes - (0 if spare is None else spare.num_axes)
+        if not 0 <= first_axis <= drives.num_axes - number:
+            raise ValueError(
+                f"first_axis={first_axis}: {device.name} has {number} of the {drives.num_axes} axes there are; "
+                f"use 0 to {drives.num_axes - number}"
+            )
+        mask = np.zeros(drives.num_axes, bool)
+        mask[first_axis : first_axis + number] = True
+        self._axes = [Axis(objects, int(k)) for k in np.flatnonzero(mask)]
+        self._sets = [(objects, mask)]
+        if spare is not None:
+            self._axes += [Axis(spare.inside.objects, k) for k in range(spare.num_axes)]
+            self._sets.append((spare.inside.objects, np.ones(spare.num_axes, bool)))
+
+    def __len__(self) -> int:
+        return len(self._axes)
+
+    @overload
+    def __getitem__(self, number: int) -> Axis: ...
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[Axis]: ...
+    def __getitem__(self, number: int | slice) -> Axis | Sequence[Axis]:
+        return self._axes[number]
+
+    def __iter__(self) -> Iterator[Axis]:
+        return iter(self._axes)
+
+    def restart(self) -> None:
+        """Restore the stored values of the axes and start their firmware anew; the motors are off."""
+        for objects, mask in self._sets:
+            objects.restart(mask)
+        for axis in self._axes:
+            axis.forget_texts()
+
+    def trip(self) -> bool:
+        """Take each axis from operation enabled into fault, as its network is lost; return whether one was there."""
+        tripped = [axis.trip() for axis in self._axes]  # all of them, not those up to the first that was
+        return any(tripped)
+
+    def engrave(self, key: tuple[int, int], raw: int) -> None:
+        """Set what the factory wrote into an object of all axes: a serial number."""
+        for objects, mask in self._sets:
+            objects.engrave(key, raw, mask)
+
+    def store(self, values: Sequence[Mapping[tuple[int, int], int]]) -> None:
+        """Set what a restart restores, axis by axis; the values are those of objects that exist, within their range."""
+        for axis, stored in zip(self._axes, values, strict=True):
+            axis.store(stored)

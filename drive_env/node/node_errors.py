@@ -1,0 +1,160 @@
+"""What a node does of errors, whatever its fieldbus: error register (1001h), history (1003h), emergencies, reactions.
+
+An emergency is an event here: code, error register and additional bytes. How it travels, and when it may, is the
+fieldbus' own, and so is what becomes of the node's state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from typing import Protocol
+
+from drive_env.devices import Device, EmergencyCode
+from drive_env.firmware.common.protection import CUT, STOP
+from drive_env.node.axis import Axis, QueuedEmergency
+from drive_env.node.error_history import CONDITIONS, OPTIONAL_CONDITIONS, ErrorCondition, ErrorHistory
+from drive_env.node.node_objects import ERROR_HISTORY, ERROR_REGISTER, NodeObjects
+
+FAULT_RESET = 0  # row of the firmware's causes
+
+
+class EmergencySink(Protocol):
+    """What takes a node's emergencies.
+
+    Attributes:
+        told: Error register of the last message that was queued; 0 before the first.
+    """
+
+    told: int
+
+    def push(self, emergency: EmergencyCode, error_register: int) -> None:
+        """Queue a message."""
+
+    def clear(self) -> None:
+        """Forget what waits."""
+
+
+class NodeErrors:
+    """Errors of a node and its axes.
+
+    Args:
+        device: Whose node it is.
+        axes: Its axes.
+        depth: Errors that the history keeps.
+        sink: Takes the emergencies.
+        flush: Sends what may be sent at a time [s].
+        react: Does what the fieldbus' state does of a fault of an axis.
+
+    Attributes:
+        conditions: Conditions of communication that last, by whose they are.
+        history: 1003h.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        axes: Sequence[Axis],
+        depth: int,
+        sink: EmergencySink,
+        flush: Callable[[float], None],
+        react: Callable[[], None],
+    ) -> None:
+        self._device = device
+        self._axes = list(axes)
+        self._queues = [(axis, axis.take_emergencies) for axis in axes]
+        self._sink = sink
+        self._flush = flush
+        self._react = react
+        self._told_last = 0  # axis of the last emergency
+        self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
+        self.conditions: dict[Hashable, ErrorCondition] = {}
+        self.history = ErrorHistory(depth)
+
+    def add_objects(self, objects: NodeObjects) -> None:
+        """Let 1001h and, where the device has it, 1003h show them."""
+        objects.readers[ERROR_REGISTER, 0] = self.register
+        subs = objects.subs(ERROR_HISTORY)
+        if subs:
+            for sub in (0, *subs):
+                objects.readers[ERROR_HISTORY, sub] = partial(self.history.read, sub)
+            objects.commands[ERROR_HISTORY, 0] = self.history.write
+
+    def restart(self) -> None:
+        """Forget what was to be told, and all conditions; the history stays."""
+        self._sink.clear()
+        self.conditions.clear()
+
+    def register(self, without: Axis | None = None) -> int:
+        """Return 1001h: what the axes and the node's communication have."""
+        register = 0
+        for number, axis in enumerate(self._axes):
+            if axis is not without:
+                register |= self._of_axis(number, axis.error_register)
+        for condition in self.conditions.values():
+            register |= condition.error_register
+        return register
+
+    def _of_axis(self, number: int, register: int) -> int:
+        """Return an axis' share of 1001h; some devices show that it is not the first one's."""
+        bit = self._device.canopen.quirks.further_axis_bit
+        return register | bit if number and register else register
+
+    def condition(self, name: str, now: float, key: Hashable = None) -> None:
+        """Tell of a condition of the bus at `now` [s], unless it is known already; `key` says whose it is."""
+        condition = CONDITIONS.get(name) or OPTIONAL_CONDITIONS[name]
+        key = name if key is None else key
+        if self.conditions.get(key) is condition:
+            return
+        if condition.lasts:
+            self.conditions[key] = condition
+        emergency = self._device.emergencies[name].of_axis(0)
+        self._told_last = 0
+        self._sink.push(emergency, self.register() | condition.error_register)
+        self.history.add(emergency.code, 0, self._number_of(emergency))
+        self._flush(now)
+
+    def condition_if_known(self, name: str, now: float) -> None:
+        """Tell of a condition that a device's table of emergencies may lack, since the standard leaves it open."""
+        if name in self._device.emergencies:
+            self.condition(name, now)
+
+    def collect(self, now: float) -> None:
+        """Tell of what the axes had since the last call; call it after each cycle of the drives."""
+        for axis, take in self._queues:
+            for emergency in take():
+                self._tell_of(axis, emergency, now)
+        if self._sink.told and not self.register():
+            # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
+            reset = self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name]
+            self._sink.push(reset.of_axis(self._told_last), 0)
+
+    def _tell_of(self, axis: Axis, queued: QueuedEmergency, now: float) -> None:
+        """Pass an axis' emergency on, with the error register of its moment, and react to a fault."""
+        cause = self._device.firmware.causes[queued.row]
+        if queued.row == FAULT_RESET:
+            self.conditions.clear()
+        self._told_last = self._axes.index(axis)
+        register = self._of_axis(self._told_last, queued.error_register) | self.register(without=axis)
+        emergency = self._device.emergencies[cause.name].of_axis(self._told_last)
+        if not self._is_told_of_module(queued.row, now):
+            self._sink.push(emergency, register)
+            self.history.add(emergency.code, self._told_last, self._number_of(emergency))
+        if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
+            self._flush(now)
+            self._react()
+
+    def _number_of(self, emergency: EmergencyCode) -> int:
+        """Return the device's own number of an error, as 1003h has it."""
+        return emergency.extra[0] if self._device.canopen.quirks.history_tells_number else 0
+
+    def _is_told_of_module(self, row: int, now: float) -> bool:
+        """Return whether another axis has told of the same thing of the module in this cycle, and note it if not.
+
+        A switch of the whole module is one event for all of its axes, and CiA 301 wants one message for an event.
+        """
+        if not self._device.is_of_module(self._device.firmware.causes[row].name):
+            return False
+        told = self._module_told.get(row) == now
+        self._module_told[row] = now
+        return told

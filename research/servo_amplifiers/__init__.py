@@ -1,0 +1,1 @@
+"""The servo amplifiers TGZ-D and TGZ-S, read from their manual."""

@@ -1,0 +1,289 @@
+"""Quirks of drives as switches of a device's data: what each does on the wire, and that our own motion copes with it.
+
+Each quirk is a variant of the TMCM-1636 with one row; motion is run on the emulated drives, and over a bus by a master
+that knows the EDS alone, as it knows a drive of another maker.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env.bus.world import World
+from drive_env.devices import find_device
+from drive_env.devices.drive_quirks import DriveQuirks
+
+TURN = 65536
+PP, PV, CSP, CSV = 1, 3, 8, 9
+QUIRKS = {
+    "no quirk": {},
+    "same mode refused": {"refuses_same_mode": True},
+    "mode delayed": {"mode_display_delay": 0.03},
+    "mode at a halt": {"mode_change_needs_halt": True},
+    "mode delayed, at a halt": {"mode_display_delay": 0.02, "mode_change_needs_halt": True},
+    "no bit 10": {"absent_status_bits": [10]},
+    "bits absent": {"absent_status_bits": [4, 7, 9, 11, 13, 14, 15]},
+    "buffer": {"set_point_buffer": 1},
+    "all": {
+        "mode_display_delay": 0.01,
+        "mode_change_needs_halt": True,
+        "absent_status_bits": [4, 9, 10],
+        "set_point_buffer": 1,
+    },
+}
+
+
+def variant(tmp_path, quirks):
+    path = tmp_path / "quirky.toml"
+    rows = "".join(f"{key} = {json.dumps(value)}\n" for key, value in quirks.items())
+    path.write_text(f'title = "Quirky"\nvariant_of = "tmcm1636"\n[quirks]\n{rows}', encoding="utf-8")
+    return str(path)
+
+
+def build(tmp_path, **quirks):
+    return EmulatedDrives(variant(tmp_path, {"refuses_same_mode": False} | quirks), "inertia", num_threads=1, seed=1)
+
+
+def one(drives, name):
+    return int(drives.read(name)[0])
+
+
+# --- what each does ---------------------------------------------------------------------------------------------------
+def test_a_mode_that_is_delayed_is_shown_and_acts_late(tmp_path):
+    with build(tmp_path, mode_display_delay=0.005) as drives:
+        drives.write(0x6060, PP)
+        seen = drives.record([0x6060, 0x6061], 0.01)
+        assert seen[0x6060][:, 0].tolist() == [PP] * 10
+        assert seen[0x6061][:, 0].tolist() == [0] * 5 + [PP] * 5
+        drives.write(0x6060, PV)
+        drives.advance(0.003)
+        drives.write(0x6060, CSP)  # the clock begins anew
+        assert drives.record([0x6061], 0.01)[0x6061][:, 0].tolist() == [PP] * 5 + [CSP] * 5
+
+
+def test_a_mode_that_needs_a_halt_waits_for_rest_and_bit_8(tmp_path):
+    with build(tmp_path, mode_change_needs_halt=True) as drives:
+        drives.write(0x6060, PV)
+        assert one(drives, 0x6061) == PV  # not enabled: at once
+        motion.enable(drives)
+        drives.write(0x60FF, 20 * TURN)
+        drives.advance(0.3)
+        drives.write(0x6060, CSV)
+        drives.advance(0.1)
+        assert one(drives, 0x6061) == PV and one(drives, 0x606C) > 15 * TURN  # it turns on
+        drives.write(0x6040, 0x10F)
+        drives.advance(0.002)
+        assert one(drives, 0x6061) == PV  # it is braking
+        drives.advance(0.5)
+        assert one(drives, 0x6061) == CSV
+        motion.disable(drives)
+        drives.write(0x6060, PP)
+        assert one(drives, 0x6061) == PP
+
+
+@pytest.mark.parametrize("bit", [4, 9, 10, 14])
+def test_a_bit_that_is_absent_never_comes(tmp_path, bit):
+    """Bits of a move of pp that others show: supply, remote, target reached, motor turns."""
+    seen = {}
+    for absent in ([], [bit]):
+        with build(tmp_path, absent_status_bits=absent) as drives:
+            motion.enable(drives, mode="pp")
+            motion.start_move(drives, TURN)
+            seen[bool(absent)] = drives.record([0x6041], 0.6)[0x6041]
+        (tmp_path / "quirky.toml").unlink()
+        find_device.cache_clear()
+    np.testing.assert_array_equal(seen[True], seen[False] & ~(1 << bit))
+    assert np.any(seen[False] & 1 << bit)
+
+
+def set_point(drives, target, word=0x1F):
+    """Give a set-point; return bit 12 as bit 4 is set, and as it is back."""
+    drives.write(0x607A, target)
+    drives.write(0x6040, word)
+    with_bit = one(drives, 0x6041) >> 12 & 1
+    drives.write(0x6040, word & ~0x10)
+    return with_bit, one(drives, 0x6041) >> 12 & 1
+
+
+def ends(drives, seconds=3.0):
+    """Return where the demand has rested, in turns, until it rests for good."""
+    demand = drives.record([0x6062], seconds)[0x6062][:, 0] / TURN
+    resting = demand[1:][np.diff(demand) == 0.0]
+    return sorted(set(np.round(resting, 6).tolist()), key=resting.round(6).tolist().index)
+
+
+def test_a_second_set_point_waits_in_the_buffer_and_bit_12_tells_it(tmp_path):
+    with build(tmp_path, set_point_buffer=1) as drives:
+        motion.enable(drives, mode="pp")
+        assert set_point(drives, 2 * TURN) == (1, 0)  # under way, the buffer is empty
+        drives.advance(0.05)
+        assert set_point(drives, TURN) == (1, 1)  # in the buffer: it is full
+        assert set_point(drives, 9 * TURN) == (1, 1)  # one more is not taken
+        assert one(drives, 0x6062) < 2 * TURN
+        trace = drives.record([0x6041, 0x6062], 1.5)
+        peak = int(np.argmax(trace[0x6062][:, 0]))
+        assert trace[0x6062][peak, 0] == pytest.approx(2 * TURN, abs=1)
+        full = trace[0x6041][:, 0] >> 12 & 1
+        assert full[: peak - 1].all() and not full[peak + 2 :].any()  # taken out where the first one ends
+        assert not np.any(trace[0x6041][:peak, 0] & 0x0400)  # and bit 10 comes at the last one alone
+        assert trace[0x6062][-1, 0] == TURN and trace[0x6041][-1, 0] & 0x0400
+
+
+def test_a_relative_set_point_in_the_buffer_goes_on_from_the_target_before(tmp_path):
+    with build(tmp_path, set_point_buffer=1) as drives:
+        motion.enable(drives, mode="pp")
+        set_point(drives, 2 * TURN)
+        drives.advance(0.02)
+        set_point(drives, TURN, 0x5F)
+        drives.advance(1.5)
+        assert one(drives, 0x6062) == 3 * TURN
+
+
+@pytest.mark.parametrize("buffer", [0, 1])
+def test_change_set_immediately_replaces_what_is_under_way(tmp_path, buffer):
+    with build(tmp_path, **({"set_point_buffer": 1} if buffer else {})) as drives:
+        motion.enable(drives, mode="pp")
+        set_point(drives, 20 * TURN)
+        drives.advance(0.05)
+        if buffer:
+            assert set_point(drives, 15 * TURN) == (1, 1)
+        assert set_point(drives, TURN, 0x3F) == (1, 0)  # the buffer is emptied, too
+        drives.advance(2.0)
+        assert one(drives, 0x6062) == TURN
+
+
+def test_without_a_buffer_each_set_point_replaces_the_one_before(tmp_path):
+    with build(tmp_path) as drives:
+        motion.enable(drives, mode="pp")
+        set_point(drives, 20 * TURN)
+        drives.advance(0.05)
+        assert set_point(drives, TURN) == (1, 0)
+        drives.advance(2.0)
+        assert one(drives, 0x6062) == TURN
+
+
+@pytest.mark.parametrize("how", ["disable", "quick stop", "mode", "reset"])
+def test_a_set_point_that_waits_is_forgotten_with_the_move(tmp_path, how):
+    with build(tmp_path, set_point_buffer=1) as drives:
+        motion.enable(drives, mode="pp")
+        set_point(drives, 20 * TURN)
+        drives.advance(0.05)
+        assert set_point(drives, TURN) == (1, 1)
+        if how == "disable":
+            motion.disable(drives)
+        elif how == "quick stop":
+            motion.quick_stop(drives)
+        elif how == "reset":
+            drives.reset_node()
+        else:
+            drives.write(0x6060, PV)
+        drives.advance(0.5)
+        motion.enable(drives, mode="pp")
+        here = one(drives, 0x6062)
+        drives.advance(0.3)
+        assert one(drives, 0x6062) == here
+        assert one(drives, 0x6041) & 0x1000 == 0
+        motion.move_to(drives, here + TURN)
+
+
+# --- that our motion copes --------------------------------------------------------------------------------------------
+def life(drives):
+    """Move, be moved elsewhere during a move, turn, be led, home."""
+    motion.enable(drives, mode="pp")
+    motion.move_to(drives, TURN)
+    assert abs(one(drives, 0x6064) - TURN) < 1000
+    motion.start_move(drives, 30 * TURN)
+    drives.advance(0.05)
+    motion.move_to(drives, -TURN)  # at once, whatever a buffer holds
+    assert abs(one(drives, 0x6064) + TURN) < 1000
+    motion.move_to(drives, 2 * TURN, relative=True)
+    assert abs(one(drives, 0x6064) - TURN) < 2000
+    motion.enable(drives, mode="pv")
+    assert one(drives, 0x6061) == PV
+    drives.write(0x60FF, 5 * TURN)
+    drives.advance(0.3)
+    assert abs(one(drives, 0x606C) - 5 * TURN) < TURN
+    motion.select_mode(drives, "csv")  # turning
+    assert one(drives, 0x6061) == CSV
+    drives.record([0x606C], 0.05, play={0x60FF: np.zeros(50, int)})
+    motion.enable(drives, mode="csp")
+    here = one(drives, 0x6064)
+    drives.record([0x6064], 0.1, play={0x607A: here + np.arange(100) * 100})
+    drives.advance(0.2)
+    assert abs(one(drives, 0x6064) - here - 9900) < 2000
+    drives.write(0x6098, 35)
+    motion.home(drives)
+    assert abs(one(drives, 0x6064)) < 2000
+    motion.disable(drives)
+    assert drives.emergencies() == []
+
+
+@pytest.mark.parametrize("quirks", QUIRKS.values(), ids=QUIRKS)
+def test_motion_copes_with_each_quirk(tmp_path, quirks):
+    with build(tmp_path, **quirks) as drives:
+        life(drives)
+
+
+BY_DEFAULT = ("same mode refused", "all")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in BY_DEFAULT else pytest.param(name, marks=pytest.mark.slow) for name in QUIRKS]
+)
+def test_a_master_that_knows_the_eds_alone_copes_with_each(tmp_path, name):
+    world = World(lockstep=True)
+    drives = build(tmp_path, **QUIRKS[name])
+    world.add(drives, [1])
+    bus = WorldBus(world)
+    path = tmp_path / "vendor.eds"
+    path.write_text(find_device("tmcm1636").eds.read_text(encoding="utf-8"), encoding="utf-8")
+    try:
+        with CanDrives(eds=path, bus=bus, pace="lockstep") as known_by_eds:
+            life(known_by_eds)
+    finally:
+        bus.shutdown()
+        world.close()
+
+
+def test_a_mode_that_never_comes_is_told_and_the_axis_is_not_left_running(tmp_path):
+    with build(tmp_path, mode_display_delay=1.0) as drives:
+        with pytest.raises(TimeoutError, match=r"did not change to csv in 0.5 s, at a halt neither"):
+            motion.enable(drives, mode="pv")
+            motion._await_mode(drives, "csv", np.ones(1, bool), timeout=0.5)
+        assert one(drives, 0x6040) == 0x10F  # halted
+
+
+def test_a_move_that_does_not_arrive_is_no_move_that_has(tmp_path):
+    """Without bit 10 the position decides: an axis that stands elsewhere has not got there."""
+    with build(tmp_path, absent_status_bits=[10]) as drives:
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, TURN)
+        drives.write((0x607D, 2), 2 * TURN)
+        with pytest.raises(TimeoutError, match=r"axis 0 did not reach target reached after 1"):
+            motion.move_to(drives, 5 * TURN, timeout=1.0)
+
+
+# --- the data ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("quirks", "message"),
+    [
+        ({"mode_display_delay": 2.0}, "mode_display_delay = 2.0 must be 0 to 1 s"),
+        ({"absent_status_bits": [3]}, r"absent_status_bits = \[3\] must be some of 4, 7, 9, 10, 11, 13, 14, 15"),
+        ({"absent_status_bits": [12]}, "what a master waits for"),
+        ({"set_point_buffer": 2}, "set_point_buffer = 2 must be 0, or 1"),
+        ({"mode_delay": 0.1}, "quirks.mode_delay is nothing that a device has"),
+        ({"mode_change_needs_halt": 1}, "must be true or false"),
+    ],
+)
+def test_a_quirk_that_cannot_be_is_told(tmp_path, quirks, message):
+    with pytest.raises(ValueError, match=message):
+        find_device(variant(tmp_path, quirks))
+
+
+def test_the_devices_that_ship_have_none():
+    for name in ("tmcm1636", "tmcm6212", "tmcm3313", "tmcm1636_fw109"):
+        assert find_device(name).quirks == DriveQuirks()

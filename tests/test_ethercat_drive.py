@@ -1,0 +1,80 @@
+"""`drive-env serve tmcm3313 --interface ethercat`, and a stock master in another network namespace that moves it."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_ethercat_ways import needs_namespaces
+
+from drive_env.ethercat.namespaces import Namespaces
+
+HERE = Path(__file__).parent
+PATIENCE = 240.0  # s; kernels may have to be compiled
+CYCLES = 400
+
+
+@pytest.fixture
+def spaces():
+    number = os.getpid() % 100_000
+    spaces = Namespaces(f"drive-{number}", f"master-{number}", "veth1", "veth0")
+    spaces.make()
+    yield spaces
+    spaces.remove()
+
+
+def inside(space, *arguments):
+    return ["ip", "netns", "exec", space, sys.executable, *map(str, arguments)]
+
+
+def first_line(process):
+    """Return what a process prints first; it may compile before."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end and process.poll() is None:
+        if select.select((process.stdout,), (), (), 1.0)[0]:
+            return process.stdout.readline()
+    raise AssertionError(f"it did not begin: {process.poll()}")
+
+
+@pytest.fixture
+def seen(spaces):
+    """What the master saw."""
+    pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
+    program = "from drive_env.programs import drive_env; drive_env()"
+    serve = ("-c", program, "serve", "tmcm3313", "--load", "portal", "--lockstep")
+    served = subprocess.Popen(
+        inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface),
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert "1 slave (tmcm3313" in first_line(served)
+        master = inside(spaces.master, HERE / "ethercat_drive_master.py", spaces.master_interface, CYCLES)
+        done = subprocess.run(master, capture_output=True, text=True, timeout=PATIENCE)
+    finally:
+        served.terminate()
+        served.wait(PATIENCE)
+        served.stdout.close()
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@needs_namespaces
+def test_soem_moves_all_three_axes_in_csp(seen):
+    assert seen["slaves"] == 1 and seen["identity"] == [0x286, 3313, 0x10009] and seen["name"] == "TMCM-3313"
+    mapping = struct.unpack("<H9I", bytes.fromhex(seen["mapping"]))
+    assert mapping[:3] == (9, 0x60400010, 0x607A0020), "complete access"
+    assert seen["refused"] == 0x06010002, "1018h is read only"
+    assert seen["objects"] == 329 and seen["described"] == ["Statusword", 6, 16] and seen["entries"] == 4
+    assert seen["sizes"] == [30, 30] and seen["safe_op"] and seen["op"]
+    assert seen["words"] == [0x27] * 3, "operation enabled"
+    assert seen["wrong"] <= 50  # of 700, on a machine that others use, too
+    assert seen["moved"] == pytest.approx([CYCLES * 4, CYCLES * 8, CYCLES * 12], abs=200)
+    assert seen["stopped"] == [0x08] * 3, "who leaves Op has its motors stopped, by a fault"
+    assert seen["error"] == 0x8100, "and is told"

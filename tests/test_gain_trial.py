@@ -1,0 +1,328 @@
+"""A trial without a machine: its cost, the momentum balance, and what is done when an axis must be stopped."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drive_env import cia402
+from drive_env.devices import find_device
+from drive_env.motors import find_motor
+from drive_env.trials import gain_trial
+from drive_env.trials.gain_trial import (
+    PHASES,
+    PROBE,
+    RECOVERY,
+    Trial,
+    Trials,
+    clear,
+    measured_cost,
+    momentum_balance,
+    softness,
+)
+from drive_env.trials.oscillation import OSCILLATION, shakes
+from drive_env.trials.positioning import CYCLE, PROFILE, TRIAL, WATCH, plan_move, power_up, start, swing, write_profile
+from drive_env.trials.score import Terms, cost
+
+DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
+ENABLED, FAULT = 0x0637, 0x0238
+NAMES = DEVICE.gains.names
+POSITION, DEMAND, CURRENT, STATUS = (
+    cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD
+)  # fmt: skip
+GAINS = np.array([[1000, 200, 800, 100, 50]] * 4)
+SAFE = np.array([[900, 200, 300, 40, 20]] * 4)
+
+
+# --- cost -------------------------------------------------------------------------------------------------------------
+def test_softness_is_one_over_the_product_of_the_gains_that_give_way_to_a_load():
+    """i T_i / (P k_v): P, 1 / T_i and k_v are raw integers, and the current loop has no part in it."""
+    assert NAMES == ("torque_p", "torque_i", "velocity_p", "velocity_i", "position_p")
+    np.testing.assert_allclose(softness(DEVICE.gains, GAINS[:1]), 1.0 / (800 * 100 * 50))
+    large = np.array([[1, 1, 32767, 32767, 32767]])  # beyond 32 bits
+    np.testing.assert_allclose(softness(DEVICE.gains, large), 32767.0**-3)
+
+
+def test_a_trial_costs_half_the_mean_of_its_moves_and_half_the_worst_of_all():
+    assert measured_cost(np.array([[2.0, 6.0], [4.0, 2.0], [9.0, 3.0]])).tolist() == [1.5 + 4.5, 2.0 + 3.0]
+
+
+def test_the_disturbance_of_a_trial_is_its_softness_less_in_the_probe():
+    one = np.ones((3, 2))
+    terms = Terms(2.0 * one, one, 0.0 * one, 0.0 * one, one > 2.0)
+    aborted = np.array([[False, False], [False, True], [False, True]])
+    found = Trial(terms, one, aborted, one, aborted[0]).costs(np.array([4.0, 1.0]))
+    np.testing.assert_allclose(found[:, 0], 2.0**0.4 * np.array([4.0, 4.0, 4.0 / PROBE]) ** 0.4)
+    np.testing.assert_allclose(found[:, 1], [2.0**0.4, 30.0, 30.0])
+
+
+@pytest.mark.parametrize(("settling", "noise", "overshoot", "tripped", "J"), [
+    (1.0, 0.0, 0.0, False, 1.0), (1.0, 0.0, 0.02, False, 1.0), (1.0, 0.0, 0.12, False, 2.0),
+    (1.0, 0.03, 0.0, False, 2.0**0.2), (32.0, 0.0, 0.0, False, 4.0), (1e9, 0.0, 0.0, False, 30.0),
+    (np.nan, 0.0, 0.0, False, 30.0), (np.inf, 0.0, 0.0, False, 30.0), (1.0, 0.0, 0.0, True, 30.0),
+])  # fmt: skip
+def test_cost_of_one_term_at_a_time(settling, noise, overshoot, tripped, J):
+    values = [np.array([x]) for x in (settling, 1.0, noise, overshoot, tripped)]
+    np.testing.assert_allclose(cost(Terms(*values)), J)
+
+
+@pytest.mark.parametrize(("change", "oscillates"), [(0.99, False), (1.01, True)])
+def test_an_axis_oscillates_above_two_fifths_of_the_rated_current_from_millisecond_to_millisecond(change, oscillates):
+    current = np.zeros((25, 2))
+    current[1::2, 1] = change * OSCILLATION * MOTOR.rated_current
+    assert shakes(current, MOTOR.rated_current).tolist() == [False, oscillates]
+
+
+def test_a_swing_is_the_largest_of_any_window_of_25_ms_and_each_axis_has_its_own():
+    current = np.zeros((4 * WATCH, 2))
+    current[1:WATCH:2, 0] = 0.5  # every change is 0.5 A
+    current[WATCH + 5, 0] = 2.0  # two changes of 2 A among 24
+    current[3 * WATCH :, 1] = 7.0  # a jump between two windows is in neither
+    np.testing.assert_allclose(swing(current, 2.0), [max(0.25, np.sqrt(2 * 4.0 / 24) / 2.0), 0.0])
+
+
+# --- identification -------------------------------------------------------------------------------------------------
+def there_and_back(share=1.0):
+    """Angle and speed of a triangular move and back, of a speed that has its peak at 40 rad/s."""
+    t = np.arange(TRIAL)
+    speed = np.interp(t, [0, 30, 60, TRIAL], [0.0, 40.0, 0.0, 0.0]) * share
+    speed = np.concatenate([speed, -speed])[:, None]
+    return np.cumsum(speed, axis=0) * CYCLE, speed
+
+
+@pytest.mark.parametrize("offset", [0.3, -0.3, 0.0])
+def test_what_a_machine_takes_is_found_from_its_own_signals(offset):
+    """i = J alpha / K_t + coulomb sign(omega) + viscous omega + offset: the fit gets back what made the current."""
+    angle, speed = there_and_back()
+    J, coulomb, viscous = 4.0 * MOTOR.inertia, 0.5, 0.01
+    acceleration = np.diff(speed, axis=0, prepend=0.0) / CYCLE
+    current = J / MOTOR.torque_constant * acceleration + coulomb * np.clip(speed, -1, 1) + viscous * speed + offset
+    found = momentum_balance(angle, speed, current, MOTOR)
+    np.testing.assert_allclose(found.inertia, J, rtol=0.01)
+    np.testing.assert_allclose([found.coulomb[0], found.viscous[0]], [coulomb, viscous], rtol=0.02)
+    np.testing.assert_allclose(found.offset, offset, atol=0.01)
+
+
+def test_an_axis_that_did_not_move_has_its_rotors_inertia_and_no_friction_below_zero():
+    still = np.zeros((2 * TRIAL, 1))
+    found = momentum_balance(still, still, still, MOTOR)
+    assert (found.inertia, found.coulomb, found.viscous, found.offset) == (0.8 * MOTOR.inertia, 0.0, 0.0, 0.0)
+    angle, speed = there_and_back()
+    found = momentum_balance(angle, speed, -0.5 * np.clip(speed, -1, 1) - 0.01 * speed, MOTOR)
+    assert (found.coulomb, found.viscous) == (0.0, 0.0)
+    huge = np.diff(speed, axis=0, prepend=0.0) / CYCLE * 1e3 * MOTOR.inertia / MOTOR.torque_constant
+    assert momentum_balance(angle, speed, huge, MOTOR).inertia == 300.0 * MOTOR.inertia
+
+
+# --- trials -----------------------------------------------------------------------------------------------------------
+class Played:
+    """Drives in pp that play what a test has for them: `faults` and `shaking` are (phase, window) -> axes."""
+
+    time_waits = True
+
+    def __init__(self, axes=4, faults=None, shaking=None, stays_down=False):
+        self.num_axes, self.device = axes, DEVICE
+        self.faults, self.shaking, self.stays_down = faults or {}, shaking or {}, stays_down
+        self.status = np.full(axes, ENABLED)
+        self.target = np.zeros(axes, np.int64)
+        self.gains = np.zeros((axes, len(NAMES)), np.int64)
+        self.words, self.recorded, self.advanced = [], [], 0.0
+        self.phase, self.window = -1, 0
+
+    def read(self, name):
+        return self.status.copy() if name == STATUS else np.zeros(self.num_axes, np.int64)
+
+    def write(self, name, value, *, where=None):
+        mask = np.ones(self.num_axes, bool) if where is None else where
+        values = np.broadcast_to(np.asarray(value, np.int64), (self.num_axes,))
+        keys = [key if isinstance(key, tuple) else (key, 0) for key in DEVICE.gains.keys]
+        if name in keys:
+            self.gains[mask, keys.index(name)] = values[mask]
+        elif name == cia402.TARGET_POSITION:
+            self.target = np.where(mask, values, self.target)
+        elif name == cia402.CONTROLWORD:
+            self.words.append((int(values[0]), np.flatnonzero(mask).tolist()))
+            if (
+                values[0] == cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT and mask.sum() > 1
+            ):  # not an axis alone that goes on
+                self.phase, self.window = self.phase + 1, 0
+            if values[0] == cia402.ENABLE_OPERATION and not self.stays_down:
+                self.status = np.where(mask, ENABLED, self.status)
+
+    def record(self, objects, seconds):
+        cycles = round(seconds / CYCLE)
+        self.recorded.append((self.phase, self.gains.copy()))
+        down = self.faults.get((self.phase, self.window), [])
+        self.status[down] = FAULT
+        current = np.zeros((cycles, self.num_axes), np.int64)
+        for axis in self.shaking.get((self.phase, self.window), []):
+            current[::2, axis] = 10_000
+        self.window += 1
+        rows = np.tile(self.target, (cycles, 1))
+        status = np.tile(self.status, (cycles, 1))
+        return {POSITION: rows, DEMAND: rows, CURRENT: current, STATUS: status}
+
+    def advance(self, seconds):
+        self.advanced += seconds
+
+
+@pytest.fixture
+def trials(monkeypatch):
+    monkeypatch.setattr(gain_trial, "device_of", lambda drives: DEVICE)
+    monkeypatch.setattr(gain_trial, "ampere_per_count", lambda drives: 1e-3)
+    monkeypatch.setattr("drive_env.gains.device_of", lambda drives: DEVICE)
+    monkeypatch.setattr("drive_env.trials.positioning.per_increment", lambda drives, name: 1.0)
+    return lambda drives, axes=2: Trials(drives, MOTOR, axes, 0.004)
+
+
+MOVE = plan_move(MOTOR, np.full(4, 3.0 * MOTOR.inertia), np.full(4, 65536), np.full(4, 100.0))
+
+
+def run(trials, drives, where=None, direction=1):
+    return trials(drives).run(
+        GAINS, SAFE, MOVE, np.full(4, 500), np.full(4, direction), np.ones(4, bool) if where is None else where
+    )
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_trial_moves_there_back_and_there_again_with_more_velocity_p(trials, direction):
+    drives = Played()
+    targets = []
+    record = drives.record
+    drives.record = lambda *arguments: targets.append(drives.target.copy()) or record(*arguments)
+    found = run(trials, drives, direction=direction)
+    away = 500 + direction * MOVE.distance
+    assert [t.tolist() for t in targets[:: TRIAL // WATCH]] == [away.tolist(), [500] * 4, away.tolist()]
+    used = [gains[0].tolist() for _, gains in drives.recorded[:: TRIAL // WATCH]]
+    assert used == [GAINS[0].tolist(), GAINS[0].tolist(), [1000, 200, 1200, 100, 50]]
+    assert not found.aborted.any() and not found.culprit.any()
+    assert found.error.shape == (TRIAL, 4) and not found.error.any()
+    np.testing.assert_allclose(found.following, 0.5 * CYCLE)  # half a count for one cycle is the least there is to see
+    np.testing.assert_allclose(found.terms.settling, 1.0)
+    np.testing.assert_allclose(found.terms.disturbance, 1.0)
+    assert len(PHASES) == 3
+
+
+def test_a_machine_with_an_axis_that_oscillates_gets_its_gains_back_at_once_and_for_the_rest(trials):
+    drives = Played(shaking={(1, 3): [2]})
+    found = run(trials, drives)
+    assert found.aborted.tolist() == [[False] * 4, [False, False, True, True], [False, False, True, True]]
+    assert found.culprit.tolist() == [False, False, True, False]  # its neighbour was stopped with it
+    windows = TRIAL // WATCH
+    gains_of_2 = [gains[2].tolist() for _, gains in drives.recorded]
+    assert gains_of_2[: windows + 4] == [GAINS[2].tolist()] * (windows + 4)
+    assert gains_of_2[windows + 4 :] == [SAFE[2].tolist()] * (2 * windows - 4)
+    assert drives.recorded[-1][1][0, NAMES.index("velocity_p")] == 1200  # the other machine has its probe
+
+
+def test_an_axis_in_fault_is_cleared_and_goes_on_and_who_takes_no_part_is_left_alone(trials):
+    drives = Played(faults={(0, 2): [1], (2, 0): [3]})
+    found = run(trials, drives, np.array([True, True, False, False]))
+    assert found.aborted.tolist() == [[True, True, False, False]] * 3
+    assert found.culprit.tolist() == [False, True, False, False]
+    cleared = [axes for word, axes in drives.words if word == cia402.FAULT_RESET]
+    assert cleared == [[1]]
+    assert drives.status[3] == FAULT
+    again = [axes for word, axes in drives.words if word == cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT]
+    assert again == [[0, 1], [1], [0, 1], [0, 1]]
+
+
+def test_the_error_of_the_first_phase_and_what_it_adds_up_to(trials):
+    drives = Played()
+    record = drives.record
+
+    def behind(objects, seconds):
+        rows = record(objects, seconds)
+        rows[DEMAND] = rows[DEMAND] + 2 * MOVE.distance if drives.phase == 0 else rows[DEMAND]
+        return rows
+
+    drives.record = behind
+    found = run(trials, drives)
+    np.testing.assert_allclose(found.error, 2.0)
+    np.testing.assert_allclose(found.following[0], 2.0 * TRIAL * CYCLE)
+    np.testing.assert_allclose(found.following[1:], 0.5 * CYCLE)
+
+
+def test_whoever_looks_is_called_after_every_cycle(trials):
+    drives, looks = Played(), []
+    made = trials(drives)
+    made.look = lambda: looks.append(1)
+    made.run(GAINS, SAFE, MOVE, np.zeros(4, np.int64), np.ones(4, np.int64), np.ones(4, bool))
+    assert len(looks) == 3 * TRIAL
+
+
+def test_recovery_tries_five_times_and_ends_when_all_are_enabled(trials, monkeypatch):
+    modes = []
+    monkeypatch.setattr(gain_trial.motion, "select_mode", lambda drives, mode, where: modes.append(mode))
+    drives = Played(stays_down=True)
+    drives.status[1] = FAULT
+    where = np.array([True, True, False, False])
+    trials(drives).recover(where)
+    resets = [axes for word, axes in drives.words if word == cia402.FAULT_RESET]
+    assert resets == [[1]] * RECOVERY and drives.advanced == pytest.approx(0.05)
+    drives = Played()
+    drives.status[1] = drives.status[3] = FAULT
+    trials(drives).recover(where)
+    assert [axes for word, axes in drives.words if word == cia402.FAULT_RESET] == [[1]]
+    assert modes == ["pp", "pp"] and drives.status[3] == FAULT
+
+
+def test_on_a_bus_the_samples_are_mapped_before_the_move_begins(trials):
+    drives = Played()
+    drives.time_waits = False
+    run(trials, drives)
+    assert sum(len(gains) > 0 for _, gains in drives.recorded) == 3 * (TRIAL // WATCH + 1)
+
+
+# --- what is written --------------------------------------------------------------------------------------------------
+def test_a_fault_is_reset_by_an_edge_and_the_axis_enabled_step_by_step():
+    drives = Played()
+    clear(drives, np.array([False, True, False, False]))
+    assert drives.words == [(word, [1]) for word in (0x00, 0x80, 0x06, 0x07, 0x0F)]
+
+
+def test_bit_4_of_the_controlword_rises():
+    drives = Played()
+    start(drives, np.array([1, 2, 3, 4]), np.array([True, True, False, True]))
+    assert drives.words == [(0x0F, [0, 1, 3]), (0x1F, [0, 1, 3])]
+    assert drives.target.tolist() == [1, 2, 0, 4]
+
+
+def test_drives_are_enabled_in_five_milliseconds_whatever_becomes_of_them(monkeypatch):
+    monkeypatch.setattr("drive_env.trials.positioning.motion.select_mode", lambda drives, mode, where: None)
+    drives = Played()
+    power_up(drives)
+    assert [word for word, _ in drives.words] == [0x06, 0x07, 0x0F]
+    assert drives.advanced == pytest.approx(0.005)
+
+
+def test_a_profile_is_written_rounded_up_in_the_drives_units(monkeypatch):
+    monkeypatch.setattr("drive_env.trials.positioning.per_increment", lambda drives, name: 0.3)
+    written = {}
+    drives = SimpleNamespace(write=lambda name, value, where: written.update({name: value.tolist()}))
+    write_profile(drives, MOVE._replace(velocity=np.array([10, 11]), acceleration=np.array([20, 21])))
+    assert written == {0x6081: [3, 4], 0x6083: [6, 7], 0x6084: [6, 7]}
+
+
+@pytest.mark.parametrize(("inertia", "reach", "angle"), [
+    # 0.4 of the rated torque: a t^2 / 4
+    (40.0 * MOTOR.inertia, 1e9, 0.4 * MOTOR.rated_torque / (40.0 * MOTOR.inertia) * 0.06**2 / 4.0),
+    (1e-9, 1e9, 0.5 * MOTOR.rated_speed * 0.06 / 2.0),  # half the rated speed at the peak
+    (1e-9, -0.5, -0.2),  # 0.4 of what there is to go
+])  # fmt: skip
+def test_a_move_is_as_long_as_torque_speed_and_travel_allow(inertia, reach, angle):
+    move = plan_move(MOTOR, np.array([inertia]), 65536, np.array([reach]))
+    scale = 65536 / (2.0 * np.pi)
+    assert move.distance == round(angle * scale)
+    # A triangle of 60 ms: the speed's peak is twice the mean.
+    assert move.acceleration == np.ceil(4.0 * abs(int(move.distance[0])) / 0.06**2)
+    assert move.velocity == np.ceil(2.0 * abs(int(move.distance[0])) / 0.06) + 1
+    assert move.increments == scale and move.counts == MOTOR.encoder_counts / (2.0 * np.pi)
+    assert PROFILE * CYCLE == 0.06
+
+
+def test_a_move_of_nothing_has_a_ramp_and_a_speed_all_the_same():
+    move = plan_move(MOTOR, np.array([1.0]), 65536, np.array([0.0]))
+    assert (move.distance, move.acceleration, move.velocity) == (0, 1, np.ceil(2 / 0.06) + 1)

@@ -1,0 +1,403 @@
+"""A device from any EDS: twelve files in the manner of six makers, six of them dirty, become drives that live.
+
+Each is enabled, moved in pp, pv and csp, and homed, as emulated drives; and over a bus by our own master, which knows
+the vendor's EDS alone, and by python-canopen, which knows the EDS of the folder. Over the bus three by default.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import uuid
+
+import canopen
+import numpy as np
+import pytest
+from test_canopen_master import NODE, PATIENCE, BootUps, Pump, until
+from test_eds_reader import FOLDER, entry
+from test_parity import WorldBus
+from typer.testing import CliRunner
+
+from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env.bus.world import World
+from drive_env.commands.cli import app
+from drive_env.devices import find_device
+from drive_env.devices.new_device import new_device
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.roles import Role
+from drive_env.drives.speeds import per_increment
+from drive_env.gains import check_linear_model
+from drive_env.motors import find_motor
+
+FILES = sorted(path.stem for path in FOLDER.glob("*.eds"))
+ON_THE_BUS = ("alpina_ax40", "cascade_cm3_dirty", "fjord_ft3_dirty")  # rpm; scaled counts, 6060h write-only; two axes
+SOME = [name if name in ON_THE_BUS else pytest.param(name, marks=pytest.mark.slow) for name in FILES]
+MOTOR = "qbl4208"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """The twelve devices, and what was told of each."""
+    home = tmp_path_factory.mktemp("devices")
+    return {name: new_device(FOLDER / f"{name}.eds", home / name, find_motor(MOTOR)) for name in FILES}
+
+
+def emulated(device, **options):
+    return EmulatedDrives(
+        device, "inertia", MOTOR, num_machines=find_device(device).num_axes, num_threads=1, seed=2, **options
+    )
+
+
+def live(drives, turn, counts):
+    """Enable, pp, pv, csp, homing; what a revolution is [inc], and the counts of 60FFh that are one inc/s.
+
+    Returns:
+        Where the axes came to rest after pp, how fast they turned in pv [inc/s], where csp led them.
+    """
+    far = round(1.5 * turn)
+    motion.enable(drives, mode="pp")
+    here = drives.read(0x6064)
+    motion.move_to(drives, here + far)
+    went = drives.read(0x6064) - here
+    assert np.all(np.abs(went - far) < turn / 50), went
+    motion.enable(drives, mode="pv")
+    drives.write(0x60FF, np.rint(2.0 * turn * counts).astype(int))
+    drives.advance(0.4)
+    before = drives.read(0x6064)
+    drives.advance(0.2)
+    speed = (drives.read(0x6064) - before) / 0.2
+    np.testing.assert_allclose(speed, 2.0 * turn, rtol=0.05)
+    np.testing.assert_allclose(drives.read(0x606C) / counts, 2.0 * turn, rtol=0.25)
+    drives.write(0x60FF, 0)
+    drives.advance(0.3)
+    motion.enable(drives, mode="csp")
+    start = drives.read(0x6064)
+    way = (0.5 * turn * np.linspace(0.0, 1.0, 250) ** 2).astype(int)
+    drives.record([0x6064], 0.25, play={0x607A: start + way[:, None]})
+    drives.advance(0.3)
+    np.testing.assert_allclose(drives.read(0x6064) - start, 0.5 * turn, atol=turn / 20)
+    drives.write(0x6098, 35)
+    motion.home(drives)
+    assert np.all(np.abs(drives.read(0x6064)) < turn / 50)
+    motion.disable(drives)
+    assert drives.emergencies() == []
+
+
+def scale_of(device):
+    """Return the increments of a revolution and the counts of a speed of one inc/s, as the emulated drive has them."""
+    with emulated(device) as drives:
+        return int(drives.read(Role.POSITION_SCALE)[0]), float(np.min(per_increment(drives, 0x60FF)))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_each_becomes_a_drive_that_lives(folders, name):
+    folder = str(folders[name].folder)
+    with emulated(folder) as drives:
+        turn = int(drives.read(Role.POSITION_SCALE)[0])
+        live(drives, turn, float(np.min(per_increment(drives, 0x60FF))))
+        for entry_ in drives.device.new_dictionary():
+            if entry_.access != "wo" and entry_.bits is not None:
+                value = drives.read((entry_.index, entry_.sub))
+                assert np.all((entry_.low <= value) & (value <= entry_.high)) or entry_.access == "const", entry_.label
+    assert find_device(folder).num_axes == (2 if "fjord" in name else 1)
+    check_linear_model(find_device(folder))  # identification, rules and agents know its loops
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_our_master_moves_it_by_the_vendors_eds(folders, name):
+    folder = str(folders[name].folder)
+    turn, counts = scale_of(folder)
+    world = World(lockstep=True)
+    world.add(emulated(folder), [NODE])
+    bus = WorldBus(world)
+    try:
+        with CanDrives(eds=FOLDER / f"{name}.eds", bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
+            live(drives, turn, counts)
+        with CanDrives(folder, bus=bus, nodes=(NODE,), pace="lockstep") as drives:  # by the folder, and with limits
+            motion.enable(drives, mode="pp")
+            motion.move_to(drives, turn // 2)
+            assert np.all(np.abs(drives.read(0x6064) - turn // 2) < turn / 50)
+    finally:
+        bus.shutdown()
+        world.close()
+
+
+def command(node, word, mask, value):
+    """Write a controlword and wait for a statusword."""
+    node.sdo[0x6040].raw = word
+    until(lambda: node.sdo[0x6041].raw & mask == value)
+
+
+def select(node, mode):
+    node.sdo[0x6060].raw = mode
+    until(lambda: node.sdo[0x6061].raw == mode)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_python_canopen_moves_it(folders, name):
+    folder = folders[name].folder
+    turn, counts = scale_of(str(folder))
+    where = {"interface": "virtual", "channel": str(uuid.uuid4())}
+    with emulated(str(folder)) as drives:
+        pump = Pump(drives, **where)
+        network = canopen.Network()
+        network.connect(**where)
+        try:
+            node = canopen.RemoteNode(NODE, str(folder / "drive.eds"))
+            network.add_node(node)
+            node.sdo.RESPONSE_TIMEOUT = PATIENCE
+            heard = BootUps(network)
+            pump.power_on()
+            heard.wait()
+            drive_by_sdo(node, turn, counts)
+        finally:
+            network.disconnect()
+            pump.close()
+
+
+def drive_by_sdo(node, turn, counts):
+    """The same life as `live`, by an independent master and in real time, of the node's first axis."""
+    sdo = node.sdo
+    select(node, 1)
+    command(node, 0x06, 0x6F, 0x21)
+    command(node, 0x07, 0x6F, 0x23)
+    command(node, 0x0F, 0x6F, 0x27)
+    sdo[0x607A].raw = turn
+    command(node, 0x1F, 0x1000, 0x1000)
+    command(node, 0x0F, 0x1400, 0x0400)
+    assert abs(sdo[0x6064].raw - turn) < turn / 50
+    select(node, 3)
+    sdo[0x60FF].raw = round(2.0 * turn * counts)
+    until(lambda: abs(sdo[0x606C].raw / counts / turn - 2.0) < 0.3)
+    sdo[0x60FF].raw = 0
+    until(lambda: sdo[0x6041].raw & 0x0400)
+    select(node, 8)
+    start = sdo[0x6064].raw
+    for step in range(1, 11):
+        sdo[0x607A].raw = start + step * turn // 100
+    until(lambda: abs(sdo[0x6064].raw - start - turn // 10) < turn / 50)
+    select(node, 6)
+    sdo[0x6098].raw = 35
+    command(node, 0x1F, 0x1400, 0x1400)
+    assert abs(sdo[0x6064].raw) < turn / 50
+    command(node, 0x00, 0x4F, 0x40)
+
+
+# --- what is taken from the file --------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("name", "units", "scale"),
+    [
+        ("alpina_ax40", ("rpm", "rpm/s", "1/1000 rated"), 4096),  # 60A9h, 60AAh; the scale is the encoder's
+        ("brandt_bs7", ("pps", "pps^2", "1/1000 rated"), 3600),  # 6092h over 6091h
+        ("brandt_bs8_dirty", ("pps", "pps^2", "1/1000 rated"), 4096),  # 6092h has lost a part: 608Fh
+        ("cascade_cm2", ("0.1 pps", "10 pps^2", "1/1000 rated"), 4096),
+        ("deltron_dl751_dirty", ("rpm", "rpm/s", "1/1000 rated"), 10000),
+        ("fjord_ft3_dirty", ("pps", "pps^2", "1/1000 rated"), 8192),
+    ],
+)
+def test_its_units_are_the_files(folders, name, units, scale):
+    folder = str(folders[name].folder)
+    bindings = find_device(folder).bindings
+    assert tuple(bindings[index, 0].unit for index in (0x606C, 0x6083, 0x6077)) == units
+    assert scale_of(folder)[0] == scale
+
+
+def test_a_gear_that_is_written_changes_what_a_position_is(folders):
+    with emulated(str(folders["brandt_bs7"].folder)) as drives:
+        drives.write((0x6091, 1), 4)
+        assert drives.read(Role.POSITION_SCALE)[0] == 1800
+        with pytest.raises(ObjectAccessError, match="its lowest is 1"):
+            drives.write((0x6091, 2), 0)
+
+
+def test_thousandths_are_of_the_motors_rated_current(folders):
+    """3.5 A peak are 1000: a set-point of 300 in cst is 1.05 A."""
+    with emulated(str(folders["alpina_ax40"].folder), ideal=True) as drives:
+        drives.machine.brake = "closed"
+        motion.enable(drives, mode="cst")
+        drives.record([0x6077], 0.05, play={0x6071: np.full(50, 300)})
+        assert drives.inside.records["i_q"][0][0] == pytest.approx(1.05, abs=0.05)
+        assert drives.read(0x6077)[0] == pytest.approx(300, abs=15)
+        assert drives.read(0x6073)[0] == 2000  # twice the rated current, as every preset
+
+
+@pytest.mark.parametrize(
+    ("name", "modes", "methods"),
+    [
+        ("alpina_ax40", (0, 1, 3, 6, 8, 9, 10), (0, 17, 18, 33, 35)),  # 60E3h
+        ("everest_ed1", (0, 1, 3, 6, 8, 9), None),
+    ],
+)
+def test_modes_and_homing_are_what_both_have(folders, name, modes, methods):
+    device = find_device(str(folders[name].folder))
+    assert device.allowed_values[0x6060, 0] == modes
+    with emulated(device.name) as drives:
+        assert drives.read(0x6502)[0] == sum(1 << mode - 1 for mode in modes if mode)
+        with pytest.raises(ObjectAccessError, match="cannot be 2; allowed are"):
+            drives.write(0x6060, 2)
+        if methods is not None:
+            assert device.allowed_values[0x6098, 0] == methods
+            with pytest.raises(ObjectAccessError, match="cannot be -4"):
+                drives.write(0x6098, -4)
+
+
+def test_an_object_that_is_lacking_is_no_role_and_is_not_made(folders):
+    device = find_device(str(folders["cascade_cm2"].folder))
+    assert Role.OUTPUTS not in device.roles and Role.BRAKE_CHOPPER not in device.roles
+    known = device.new_dictionary()
+    assert not known.has(0x6065) and not known.has(0x6073)
+    assert device.roles[Role.CURRENT_LIMIT] == (0x5F02, 2)  # the emulator's own, and the list says so
+    told = {note.what: note.why for note in folders["cascade_cm2"].fill_in}
+    assert "no 6073h" in told["5F02:2 Current limit"]
+
+
+def test_what_has_no_effect_is_stored_and_listed(folders):
+    made = folders["alpina_ax40"]
+    told = {note.what: note.why for note in made.without_effect}
+    assert told["6080h"] == "no speed is limited by it"
+    assert {"2200h", "3000h", "3010h", "6402h"} <= told.keys()
+    assert not {"6040h", "607Ah", "6502h", "5F00h", "1017h"} & told.keys()
+    with emulated(str(made.folder)) as drives:
+        drives.write(0x6080, 1234)
+        assert drives.read(0x6080)[0] == 1234
+        drives.write((0x3010, 1), 2048)
+        assert drives.read((0x3010, 1))[0] == 2048
+        with pytest.raises(ObjectAccessError, match="can only be read"):
+            drives.write(0x2200, 1)
+    text = (made.folder / "to_fill_in.md").read_text(encoding="utf-8")
+    assert text == made.text() and "- 6080h: no speed is limited by it" in text
+
+
+def test_process_data_that_a_node_could_not_start_with_are_put_right(folders):
+    told = {note.what: note.why for note in folders["deltron_dl751_dirty"].repairs}
+    assert told["[1602]"] == "607Bh:00 does not exist: nothing is mapped"
+    assert told["[1401sub1]"] == told["[1801sub1]"] == "has no COB-ID: that of the predefined connection set"
+    known = find_device(str(folders["deltron_dl751_dirty"].folder)).new_dictionary(5)
+    assert known.find((0x1602, 0)).default == 0
+    assert known.find((0x1601, 0)).default == 2
+    assert (known.find((0x1401, 1)).default, known.find((0x1801, 1)).default) == (0x305, 0x285)
+
+
+def test_texts_and_floats_are_served_as_they_are(folders):
+    folder = folders["everest_ed1"].folder
+    where = {"interface": "virtual", "channel": str(uuid.uuid4())}
+    with emulated(str(folder)) as drives:
+        pump, network = Pump(drives, **where), canopen.Network()
+        network.connect(**where)
+        try:
+            node = canopen.RemoteNode(NODE, str(folder / "drive.eds"))
+            network.add_node(node)
+            node.sdo.RESPONSE_TIMEOUT = PATIENCE
+            heard = BootUps(network)
+            pump.power_on()
+            heard.wait()
+            assert node.sdo[0x2000].raw == 25.5
+            assert node.sdo[0x2001].raw == "E-0001"
+            assert node.sdo[0x2002].raw == 0
+            assert node.sdo[0x2100][6].raw == 0
+            assert node.sdo[0x2003].raw == 7
+        finally:
+            network.disconnect()
+            pump.close()
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+def run(*line):
+    return CliRunner().invoke(app, [str(word) for word in line])
+
+
+def test_the_command_makes_the_folder_and_prints_the_list(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = run("new", "--eds", FOLDER / "deltron_dl750.eds", "--motor", MOTOR)
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("# deltron_dl750: what its EDS does not say")
+    assert "serve it: drive-env serve deltron_dl750" in done.stdout
+    with EmulatedDrives("./deltron_dl750", "inertia", num_threads=1) as drives:
+        assert drives.read(0x1000)[0] == 0x00020192
+    again = run("new", "--eds", FOLDER / "deltron_dl750.eds")
+    assert again.exit_code == 2 and "exists already, and is not overwritten" in again.stderr
+
+
+def test_a_unit_that_the_eds_does_not_tell_may_be_given(tmp_path):
+    out = tmp_path / "d"
+    line = ["new", "--eds", FOLDER / "brandt_bs7.eds", "--out", out, "--velocity-unit", "0.1 rpm"]
+    assert run(*line).exit_code == 0
+    device = find_device(str(out))
+    assert device.bindings[0x60FF, 0].unit == "0.1 rpm"
+    assert device.bindings[0x6083, 0].unit == "rpm/s"
+    with EmulatedDrives(str(out), "inertia", num_threads=1) as drives:
+        motion.enable(drives, mode="pv")
+        drives.write(0x60FF, "120 rpm")
+        assert drives.read(0x60FF)[0] == 1200
+        drives.advance(0.5)
+        assert drives.machine.rotor_speed[0] == pytest.approx(4.0 * math.pi, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "says"),
+    [
+        (None, (), "there is no EDS at"),
+        ("no EDS at all\n", (), "describes no CiA 402 drive: it has no statusword 6041h"),
+        (entry("6041", "Statusword", data_type="0x0006"), (), "no drive that could be enabled: it has no 6040h"),
+        (entry("6041", "Statusword", data_type="0x0007"), (), "CiA 402 has it with 16 bits; correct its DataType"),
+        ("", ("--velocity-unit", "furlong"), "there is no unit 'furlong'"),
+        ("", ("--motor", "none"), "no motor is named 'none'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_told_and_leaves_nothing(tmp_path, text, options, says):
+    path, out = tmp_path / "a.eds", tmp_path / "out"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    done = run("new", "--eds", path, "--out", out, *options)
+    assert done.exit_code == 2, done.output
+    assert says in done.stderr and not out.exists()
+
+
+# --- export -----------------------------------------------------------------------------------------------------------
+def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(folders, tmp_path):
+    folder = folders["alpina_ax40"].folder
+    done = run("export", tmp_path / "a.eds", "--dcf", "--device", folder, "--motor", MOTOR, "--node", 9)
+    assert done.exit_code == 2 or done.exit_code == 1  # --node means a bus, and there is none
+    done = run("export", tmp_path / "a.eds", "--dcf", "--device", folder, "--motor", MOTOR)
+    assert done.exit_code == 0, done.output
+    preset = find_device(str(folder)).preset(find_motor(MOTOR))
+    eds, dcf = (canopen.import_od(str(tmp_path / name), node) for name, node in (("a.eds", 7), ("a.dcf", None)))
+    for name, value in preset.items():
+        index, sub = int(name[:4], 16), int(name[5:])
+        both = [od[index] if sub == 0 else od[index][sub] for od in (eds, dcf)]
+        assert both[0].default == both[1].value == value, name
+    assert eds[0x1400][1].default == 0x207  # what follows the node-ID goes on following it
+    assert (dcf.node_id, dcf.bitrate, dcf[0x1400][1].value) == (1, 1_000_000, 0x201)
+    assert "a.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")
+    again = run("export", tmp_path / "a.eds", "--device", folder)
+    assert again.exit_code == 2 and "files are not overwritten" in again.stderr
+    assert run("export", tmp_path / "a.txt", "--device", folder).exit_code == 2
+
+
+def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path):
+    from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
+
+    folder, source = str(folders["fjord_ft2"].folder), FOLDER / "fjord_ft2.eds"
+    world = World(lockstep=True)
+    world.add(emulated(folder), [NODE])
+    bus = WorldBus(world)
+    try:
+        with CanDrives(eds=source, bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
+            drives.write(0x6081, [1111, 2222])
+            values = commissioned_values(drives)
+    finally:
+        bus.shutdown()
+        world.close()
+    assert (values[0x6081, 0], values[0x6881, 0]) == (1111, 2222)
+    assert (0x607A, 0) not in values and (0x6040, 0) not in values  # a set-point, a command
+    path = tmp_path / "two.dcf"
+    path.write_text(commissioned_eds(source, values, path.name, node_id=NODE, bit_rate=500), encoding="utf-8")
+    dcf = canopen.import_od(str(path))
+    assert (dcf[0x6081].value, dcf[0x6881].value, dcf.node_id, dcf.bitrate) == (1111, 2222, NODE, 500_000)
+    assert dcf[0x607A].value is None
+
+
+def test_making_a_device_is_quick(tmp_path):
+    begun = time.process_time()
+    new_device(FOLDER / "fjord_ft2.eds", tmp_path / "d", find_motor(MOTOR))
+    assert time.process_time() - begun < 20.0  # a few tenths of a second; a busy computer counts its neighbours

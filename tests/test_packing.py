@@ -1,0 +1,185 @@
+"""Integers of axes in the bytes of process data, which PDO an object goes into, and what comes with each SYNC."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, UNSUPPORTED_ACCESS, ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.can.mapping import Slots, pack
+from drive_env.master.can.pdo import RemotePdo
+from drive_env.master.can.samples import PdoSamples
+from drive_env.master.errors import BusError
+from drive_env.master.packing import Member, integers, pack_rows, unpack_rows
+from drive_env.node import mapping
+
+
+def entry(index=0x6064, bits=32, signed=True, access="rw", mappable=True, sub=0):
+    return Entry(index, sub, "an object", bits, access, None, None, 0, "", mappable, signed)
+
+
+# --- bytes --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("size", range(1, 9))
+@pytest.mark.parametrize("signed", [True, False])
+def test_integers_of_any_whole_number_of_bytes(size, signed):
+    top = 2 ** (8 * size - 1)
+    values = [0, 1, top - 1, *([-1, -top] if signed else [top, 2 * top - 1] if size < 8 else [])]
+    data = np.array([list(value.to_bytes(size, "little", signed=signed)) for value in values], np.uint8)
+    assert integers(data, signed).tolist() == values
+
+
+def test_members_lie_one_behind_the_other_and_axes_of_a_node_at_its_columns():
+    long, short = entry(), entry(0x6040, 16, signed=False)
+    played = {long: np.array([[1, 2, -2], [3, 4, 5]]), short: np.array([[7, 8, 0xABCD], [0, 0, 1]])}
+    members = [Member(short, 1, 0, 2), Member(long, 1, 2, 4), Member(short, 0, 6, 2)]
+    packed = pack_rows(members, played, first_axis=1)
+    assert [bytes(row).hex(" ") for row in packed] == ["cd ab fe ff ff ff 08 00", "01 00 05 00 00 00 00 00"]
+    values = {}
+    unpack_rows(values, packed, members, first_axis=1, num_axes=3)
+    assert values[0x6064, 0][:, 2].tolist() == [-2, 5]
+    assert values[0x6040, 0][:, 1:].tolist() == [[8, 0xABCD], [0, 1]]
+    first = values[0x6040, 0]
+    unpack_rows(values, packed[:, :2], [Member(short, 0, 0, 2)], first_axis=0, num_axes=3)
+    assert values[0x6040, 0] is first and first[:, 0].tolist() == [0xABCD, 1]
+
+
+# --- which PDO ----------------------------------------------------------------------------------------------------
+def widths(found):
+    return found if found is None else [[one.bits for one in pdo] for pdo in found]
+
+
+@pytest.mark.parametrize(
+    ("bits", "slots", "keep_order", "expected"),
+    [
+        ([], Slots((0,), 3), False, []),
+        ([64], Slots((0,), 3), False, [[64]]),
+        ([32, 32, 8], Slots((0,), 3), False, None),  # one bit more than 64 does not fit
+        ([32, 32, 8], Slots((0, 1), 3), False, [[32, 32], [8]]),
+        ([8, 8, 8, 8], Slots((0,), 3), False, None),  # nor one entry more than it takes
+        ([8, 8, 8, 8], Slots((0,), 4), False, [[8, 8, 8, 8]]),
+        ([16, 32, 16, 32, 32], Slots((0, 1), 3), False, [[32, 32], [32, 16, 16]]),
+        ([16, 32, 16, 32, 32], Slots((0, 1), 3), True, [[16, 32, 16], [32, 32]]),
+        ([32, 16, 32, 32, 16], Slots((0, 1), 3), True, [[32, 32], [32, 16, 16]]),  # in order it takes three
+        ([40, 40, 24, 24], Slots((0, 1), 3), False, [[40, 24], [40, 24]]),
+        ([40, 40], Slots((0,), 3), True, None),
+        ([8], Slots((), 3), False, None),
+        ([8], Slots((), 3), True, None),
+        ([24, 24, 24, 16, 16, 16], Slots((0, 1), 3), False, [[24, 24, 16], [24, 16, 16]]),
+        ([48, 16, 48, 16], Slots((0, 1), 1), False, None),
+    ],
+)
+def test_what_goes_into_which_pdo(bits, slots, keep_order, expected):
+    assert widths(pack([entry(bits=one) for one in bits], slots, keep_order=keep_order)) == expected
+
+
+# --- the device's side --------------------------------------------------------------------------------------------
+def test_a_mapping_entry_is_index_sub_index_and_bits():
+    assert mapping.parse(0x20430710) == (0x2043, 0x07, 0x10)
+    assert mapping.parse(0x6041FF08) == (0x6041, 0xFF, 0x08)
+
+
+@pytest.mark.parametrize(("sub", "is_on", "count", "refused"), [
+    (0, False, 0, False), (0, False, 3, False), (1, False, 0, False), (1, False, 1, True), (0, True, 0, True),
+    (2, True, 0, True),
+])  # fmt: skip
+def test_a_mapping_is_changed_while_its_pdo_is_off_and_no_entry_is_in_use(sub, is_on, count, refused):
+    if not refused:
+        mapping.check_may_change(entry(0x1600, sub=sub), is_on, count)
+        return
+    with pytest.raises(ObjectAccessError) as caught:
+        mapping.check_may_change(entry(0x1600, sub=sub), is_on, count)
+    assert caught.value.abort_code == UNSUPPORTED_ACCESS
+
+
+@pytest.mark.parametrize(
+    ("mapped", "raw", "transmit", "refused"),
+    [
+        (entry(), 0x60640020, True, False),
+        (entry(), 0x60640020, False, False),
+        (entry(access="ro"), 0x60640020, True, False),
+        (entry(access="ro"), 0x60640020, False, True),
+        (entry(access="wo"), 0x60640020, False, False),
+        (entry(access="wo"), 0x60640020, True, True),
+        (entry(access="const"), 0x60640020, True, True),
+        (entry(mappable=False), 0x60640020, True, True),
+        (entry(bits=None), 0x60640020, True, True),
+        (entry(bits=24), 0x60640018, True, True),  # no whole word of a PDO
+        (entry(bits=16), 0x60640020, True, True),
+        (entry(bits=64), 0x60640040, True, False),
+        (entry(bits=8), 0x60640008, True, False),
+    ],
+)
+def test_what_a_pdo_carries(mapped, raw, transmit, refused):
+    if not refused:
+        assert mapping.check_mappable(entry(0x1A00, sub=1), raw, transmit, lambda index, sub: mapped) is mapped
+        return
+    with pytest.raises(ObjectAccessError) as caught:
+        mapping.check_mappable(entry(0x1A00, sub=1), raw, transmit, lambda index, sub: mapped)
+    assert caught.value.abort_code == CANNOT_BE_MAPPED
+
+
+@pytest.mark.parametrize(("bits", "refused"), [([], False), ([64], False), ([32, 32], False), ([32, 32, 8], True),
+                                               ([64, 8], True)])  # fmt: skip
+def test_a_pdo_carries_64_bits(bits, refused):
+    objects = {0x6000 + k: entry(0x6000 + k, one) for k, one in enumerate(bits)}
+    raws = [(0x6000 + k) << 16 | one for k, one in enumerate(bits)]
+    if not refused:
+        mapping.check_mapping(entry(0x1600), raws, False, lambda index, sub: objects[index])
+        return
+    with pytest.raises(ObjectAccessError, match=f"{len(bits)} entries make 72 bits; a PDO carries 64") as caught:
+        mapping.check_mapping(entry(0x1600), raws, False, lambda index, sub: objects[index])
+    assert caught.value.abort_code == PDO_LENGTH_EXCEEDED
+
+
+# --- what comes with each SYNC ------------------------------------------------------------------------------------
+class Port:
+    """A port that hands frames to who subscribed."""
+
+    def __init__(self):
+        self.takers, self.drained = {}, 0
+
+    def subscribe(self, can_id, taker):
+        if taker is None:
+            del self.takers[can_id]
+        else:
+            self.takers[can_id] = taker
+
+    def drain(self):
+        self.drained += 1
+
+
+def pdo(label, can_id, *members):
+    return RemotePdo(label, can_id, sum(member.size for member in members), members)
+
+
+def test_the_kth_frame_of_each_pdo_belongs_to_the_kth_sync():
+    status, position = entry(0x6041, 16, signed=False), entry()
+    port = Port()
+    of_nodes = [
+        [
+            pdo("TPDO 1 of node 1", 0x181, Member(status, 0, 0, 2)),
+            pdo("TPDO 2 of node 1", 0x281, Member(position, 0, 0, 4)),
+        ],
+        [pdo("TPDO 1 of node 2", 0x182, Member(status, 0, 0, 2), Member(position, 0, 2, 4))],
+    ]
+    samples = PdoSamples(port, of_nodes, 1)
+    assert port.drained == 1 and samples.complete() == 0
+    for k in range(3):
+        port.takers[0x181](bytes([k, 1]))
+        port.takers[0x182](bytes([k + 8, 1, 255 - k, 255, 255, 255]))
+        if k < 2:
+            port.takers[0x281](bytes([k, 0, 0, 0]))
+    assert samples.complete() == 2
+    values = samples.decode(1, 2)
+    assert values[0x6041, 0].tolist() == [[0x101, 0x109]] and values[0x6064, 0].tolist() == [[1, -2]]
+    assert samples.decode(0, 2)[0x6064, 0].tolist() == [[0, -1], [1, -2]]
+    error = str(samples.missing(3, 0.5))
+    assert error.startswith("TPDO 2 of node 1 (281h) came 2 times for 3 SYNCs, and no more within 0.5 s")
+    port.takers[0x281](bytes([1, 2]))
+    with pytest.raises(BusError, match=r"TPDO 2 of node 1 \(281h\) has 4 bytes by its mapping, and 2 came: 01 02;"):
+        samples.decode(2, 3)
+    assert samples.decode(0, 2)[0x6064, 0].tolist() == [[0, -1], [1, -2]]  # of other rows nothing is said
+    samples.close()
+    assert not port.takers
+    assert PdoSamples(port, [[], []], 1).complete() == 0

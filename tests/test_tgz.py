@@ -1,0 +1,476 @@
+"""The TGZ-D and the TGZ-S against the page "Object library" of their manual: objects, D-Mode, errors, images."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
+from drive_env.devices import find_device
+from drive_env.dictionary.aborts import SUB_INDEX_ZERO_IN_USE, VALUE_RANGE
+from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
+from drive_env.drives.speeds import per_increment
+from drive_env.firmware.record import set_lanes
+from drive_env.node.process_image import ProcessImage
+
+ROOT = Path(__file__).parents[1]
+REMOTE = 0x0200
+ENABLED, FAULT = (0x6F, 0x27), (0x4F, 0x08)
+
+# The table of the profile's objects, as printed: index, name, mapping; the second axis lies 800h above.
+PROFILE = """
+6040 control word RPDO
+6041 status word TPDO
+6060 modes of operation RPDO
+6061 modes of operation display TPDO
+6064 position actual value TPDO
+6065 following error window RPDO
+6066 following error time out RPDO
+606B velocity demand value TPDO
+606C velocity actual value TPDO
+6071 target torque RPDO
+6077 torque actual value TPDO
+607A target position RPDO
+607C home offset RPDO
+607D software position limits RPDO 2
+6081 profile velocity RPDO
+6083 profile acceleration RPDO
+6084 profile deceleration RPDO
+6085 quick stop deceleration RPDO
+6086 motion profile type RPDO
+608F position encoder resolution RPDO 2
+6094 velocity encoder resolution RPDO 2
+6098 homing method RPDO
+6099 homing speed RPDO 2
+609A homing acceleration RPDO
+60B2 torque offset RPDO
+60C1 interpolation wanted position RPDO 1
+60C2 interpolation time period RPDO 2
+60D9 supported synchronization functions No
+60E3 supported homing methods No 10
+60F4 following error actual value TPDO
+60FD digital inputs TPDO
+60FE digital outputs RPDO 2
+60FF target velocity RPDO
+6502 supported drive modes No
+"""
+# Mode of operation, and the D-Mode that it requires.
+D_MODES = {1: 7, 3: 6, 4: 1, 6: 7, 7: 3, 8: 3, 9: 2, 10: 1}
+# Default mapping of PDOs: objects of RPDO and TPDO 1 to 4.
+MAPPINGS = """
+1600 60400010 607A0020 60600008 40010008
+1601 68400010 687A0020 68600008
+1602 60810020
+1603 68810020
+1A00 60410010 60640020 60610008 10010008
+1A01 68410010 68640020 68610008 40000008
+1A02 606C0020 40020110
+1A03 686C0020 40020210
+"""
+# DSP402 error code, symbolic name, error bit.
+ERRORS = """
+3130 MAINS_PHASE 0
+3100 MAINS_SUPPLY 1
+8A00 INTERNAL_ERROR 2
+3110 OVER_VOLTAGE 3
+3120 UNDER_VOLTAGE 4
+5430 STO 5
+7110 HOLDING_BRAKE 6
+7111 HOLDING_BRAKE_SWITCH 7
+2300 CURRENT_MEASUREMENT 8
+4310 MOTOR_THERMOSTAT 9
+4110 AMBIENT_TEMPERATURE 10
+4210 HEAT_SINK_TEMPERATURE 11
+7303 FEEDBACK 12
+7122 COMMUTATION 13
+8400 OVER_SPEED 14
+8612 CONTOURING 15
+8611 TRAJECTORY 16
+8100 HOST_COMMUNICATION 17
+8600 DRIVE_RAMP_E2 18
+2200 CURRENT_REGULATION 19
+F001 EMERGENCY_STOP 20
+5110 IGBT_DRIVER_VOLTAGE 21
+7113 BRAKE_RESISTANCE 22
+5112 BRAKE_SUPPLY 23
+8310 I2T 25
+4311 MOTOR_TEMPERATURE 26
+6320 MOTOR_PARAMETER 27
+"""
+# Bits of 1001h: those of the error bits whose values the table prints (0x100 is bit 8).
+REGISTER = {1: (8, 19, 21), 2: (3, 4), 3: (9, 11), 4: (12, 17)}
+
+
+def two_axes(**options):
+    return EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1, **options)
+
+
+def rows(text):
+    return [line.split() for line in text.split("\n") if line]
+
+
+# --- the dictionary ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("row", rows(PROFILE), ids=lambda row: row[0])
+def test_an_object_of_the_profile_is_there_for_both_axes(row, axis):
+    entries = find_device("tgz_d").new_dictionary()
+    index = int(row[0], 16) + 0x800 * axis
+    *name, last = row[1:]
+    subs = range(1, int(last) + 1) if last.isdigit() else [0]
+    mapping = name[-1] if last.isdigit() else last
+    for sub in subs:
+        entry = entries.find((index, sub))
+        assert entry.pdo_mappable == (mapping != "No"), entry.label
+        if mapping == "TPDO":
+            assert entry.access == "ro"
+        elif mapping == "RPDO":
+            assert entry.access == "rw"
+    if last.isdigit():
+        assert entries.find((index, 0)).default == int(last)
+
+
+@pytest.mark.parametrize("row", rows(MAPPINGS), ids=lambda row: row[0])
+def test_pdos_are_mapped_by_default_as_printed(row):
+    entries, index = find_device("tgz_d").new_dictionary(5), int(row[0], 16)
+    mapped = [entries.find((index, sub)).default for sub in range(9)]
+    assert mapped == [len(row) - 1, *(int(text, 16) for text in row[1:]), *[0] * (9 - len(row))]
+
+
+def test_the_eds_is_made_of_the_rows():
+    from research.servo_amplifiers import make_eds
+
+    assert make_eds.EDS.read_text(encoding="utf-8") == make_eds.eds()
+
+
+def test_every_row_has_a_source_and_registers_of_ours_lie_in_their_range():
+    with (ROOT / "research" / "servo_amplifiers" / "tgz.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            assert row["source"].startswith(("003, line ", "D")), row
+            index = int(row["index"].rstrip("h"), 16)
+            ours = [range(0x23C0, 0x2400), range(0x25C0, 0x2600), range(0x33C0, 0x3400)]
+            assert ("a register of ours" in row["source"]) == any(index in one for one in ours), row["index"]
+
+
+def test_codes_and_numbers_of_errors_are_those_of_the_table():
+    found = find_device("tgz_d").emergencies
+    for code, name, bit in rows(ERRORS):
+        assert (found[name.lower()].code, found[name.lower()].extra[0]) == (int(code, 16), int(bit)), name
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+def test_torques_speeds_and_positions_have_the_scales_of_their_objects():
+    with two_axes() as drives:
+        drives.write(0x23C3, [4000, 8000])
+        np.testing.assert_allclose(ampere_per_count(drives), np.array([4.0, 8.0]) / 32767)
+        assert to_counts(drives, np.array([4.0, 4.0])).tolist() == [32767, 16384]
+        drives.write((0x6094, 1), [1, 7])
+        drives.write((0x6094, 2), [1000, 2])
+        drives.write((0x608F, 1), [4096, 8192])
+        drives.write((0x608F, 2), [1, 3])
+        turn = 2**28 * np.array([1 / 4096, 3 / 8192])
+        assert drives.read(Role.POSITION_SCALE).tolist() == turn.tolist()
+        # A revolution a second is 60 rpm, 60 divisor / numerator velocity units.
+        np.testing.assert_allclose(per_increment(drives, 0x606C) * turn, [60_000.0, 120 / 7])
+
+
+def test_what_is_written_keeps_its_integers_when_a_scale_changes():
+    with two_axes() as drives:
+        for name, value in ((0x6071, 1000), (0x607A, 12_345), (0x60FF, 777)):
+            drives.write(name, value)
+        for name, value in ((0x23C3, 9000), ((0x6094, 2), 500), ((0x608F, 2), 3)):
+            drives.write(name, value)
+        assert [drives.read(name)[0] for name in (0x6071, 0x607A, 0x60FF)] == [1000, 12_345, 777]
+
+
+# --- the D-Mode -------------------------------------------------------------------------------------------------------
+def test_a_mode_acts_with_its_own_d_mode_alone():
+    """For all pairs: with another one the axis takes no controlword, and bit 9 of its statusword is 0."""
+    with two_axes() as drives:
+        for mode, needed in D_MODES.items():
+            for d_mode in range(8):
+                drives.write(0x6060, [mode, 0])
+                drives.write(0x2303, [d_mode, 3])
+                drives.advance(0.001)
+                drives.write(0x6040, 0x06)
+                drives.advance(0.001)
+                status = drives.read(0x6041)
+                fits = d_mode == needed
+                assert bool(status[0] & REMOTE) == fits, (mode, d_mode)
+                assert bool(cia402.matches(status[0], cia402.READY_TO_SWITCH_ON)) == fits, (mode, d_mode)
+                assert cia402.matches(status[1], cia402.READY_TO_SWITCH_ON), "no mode needs no D-Mode"
+                drives.write(0x2303, [needed, 3])
+                drives.advance(0.001)
+                drives.write(0x6040, 0x00)
+                drives.advance(0.001)
+
+
+def test_an_axis_that_is_disconnected_while_it_turns_stops_and_is_off():
+    with two_axes() as drives:
+        motion.enable(drives, mode="pv")
+        drives.write(0x60FF, 300_000)
+        drives.advance(0.2)
+        drives.write(0x2303, [0, 6])
+        drives.advance(0.5)
+        status, speed = drives.read(0x6041), drives.read(0x606C)
+        assert not status[0] & REMOTE
+        assert not cia402.is_live(status[0])
+        assert abs(speed[0]) < 3000
+        assert cia402.matches(status[1], cia402.OPERATION_ENABLED)
+        assert speed[1] > 250_000
+
+
+def test_motion_brings_the_d_mode_along_and_is_heard_whatever_it_is():
+    with two_axes() as drives:
+        for mode, number in cia402.MODES.items():
+            motion.enable(drives, mode=mode)
+            assert np.all(drives.read(Role.MODE_GATE) == D_MODES[number]), mode
+            assert np.all(drives.read(0x6041) & REMOTE)
+        drives.write(Role.MODE_GATE, 0)
+        drives.advance(0.002)
+        assert not np.any(drives.read(0x6041) & REMOTE)
+        motion.disable(drives)
+        assert np.all(drives.read(0x6041) & 0x4F == 0x40)
+        assert np.all(drives.read(0x6041) & REMOTE)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+@pytest.fixture
+def wire():
+    with two_axes() as drives:
+        yield Wire(drives)
+
+
+def set_errors(wire, *bits):
+    """Set errors of each axis on the machine, by number; none where it is None. Both axes are enabled before."""
+    motion.enable(wire.drives, mode="pp")
+    word = [0 if bit is None else 1 << bit for bit in bits]
+    set_lanes(wire.drives.inside.records, "error_bits", np.array(word))
+    wire.wait(10)
+    set_lanes(wire.drives.inside.records, "error_bits", np.zeros(2, int))
+    wire.take()
+
+
+def test_the_error_register_tells_kind_and_axis(wire):
+    kinds = {bit: 1 << place for place, bits in REGISTER.items() for bit in bits}
+    for axis in (0, 1):
+        for bit in (3, 8, 9, 12, 20, 25):
+            set_errors(wire, *(bit if k == axis else None for k in range(2)))
+            expected = 0x01 | kinds.get(bit, 0) | (0x80 if axis else 0)
+            assert wire.value(0x1001, 0) == expected, (axis, bit)
+            motion.reset_fault(wire.drives)
+            assert wire.value(0x1001, 0) == 0
+
+
+def test_the_error_history_has_code_axis_and_number_the_newest_first(wire):
+    for axis, bit in ((0, 20), (1, 9)):
+        set_errors(wire, *(bit if k == axis else None for k in range(2)))
+    assert wire.value(0x1003, 0) == 2
+    assert wire.value(0x1003, 1) == 9 << 24 | 1 << 16 | 0x4310
+    assert wire.value(0x1003, 2) == 20 << 24 | 0xF001
+    assert wire.download(0x1003, 0, 1, 1) == 0x06090030
+    assert wire.download(0x1003, 0, 0, 1) == 0
+    assert wire.value(0x1003, 0) == 0
+
+
+def test_the_history_holds_sixty_four():
+    from drive_env.node.error_history import ErrorHistory
+
+    depth = sum(entry.index == 0x1003 and entry.sub > 0 for entry in find_device("tgz_d").new_dictionary())
+    assert depth == 64
+    history = ErrorHistory(depth)
+    for code in range(1, 71):
+        history.add(code)
+    assert (history.read(0), history.read(1), history.read(64)) == (64, 70, 7)
+
+
+# --- objects of the module --------------------------------------------------------------------------------------------
+def test_both_axes_have_the_same_outputs_by_either_object(wire):
+    assert wire.download(0x68FE, 2, 0x003F0000, 4) == 0
+    assert wire.download(0x60FE, 1, 0x00150000, 4) == 0
+    assert [wire.value(index, sub) for index in (0x60FE, 0x68FE) for sub in (1, 2)] == [0x150000, 0x3F0000] * 2
+    assert wire.value(0x4001, 0) == 0x15
+    assert wire.drives.machine.outputs.tolist() == [0x15, 0x15]
+    assert wire.download(0x4001, 0, 0x2A, 1) == 0
+    assert (wire.value(0x60FE, 1), wire.value(0x68FE, 1)) == (0x2A0000, 0x2A0000)
+    assert wire.download(0x60FE, 2, 0x00030000, 4) == 0  # the mask holds the others back
+    assert wire.drives.machine.outputs.tolist() == [0x02, 0x02]
+
+
+def test_both_axes_of_a_machine_show_the_same_inputs_in_bits_16_to_23():
+    with EmulatedDrives("tgz_d", "gantry", num_threads=1) as drives:
+        wire = Wire(drives)
+        drives.machine.digital_inputs = [0x80, 0x40]
+        wire.wait(1)
+        levels = wire.value(0x4000, 0)
+        assert levels & 0xC0 == 0xC0
+        assert [wire.value(index, 0) for index in (0x60FD, 0x68FD)] == [levels << 16] * 2
+
+
+def test_analog_inputs_and_drive_status_are_parts_of_registers(wire):
+    wire.drives.machine.analog_inputs = [[1234, 0], [4000, 0]]
+    assert [wire.value(0x4002, sub) for sub in (1, 2)] == [1234, 4000]
+    assert [wire.value(index, 0) >> 16 for index in (0x3328, 0x3428)] == [1234, 4000]
+    for sub, index in ((1, 0x3325), (2, 0x3425)):
+        assert (
+            wire.value(0x4003, sub)
+            == wire.value(index, 0) & 0xFFFF
+            == wire.value(index + 0x2D1C + 0x700 * (sub - 1), 0)
+        )
+
+
+# --- process images: structures as the manual prints them, but for names --------------------------------------------
+STRUCTURES = """
+1701 int32 607A uint32 60FF uint32 60FE:1 uint16 6040 int16 6071 uint16 23C6 int16 -
+1701 int32 687A uint32 68FF uint32 - uint16 6840 int16 6871 uint16 24C6 int16 -
+1702 int32 - uint32 60FF uint32 60FE:1 uint16 6040 int16 6071 uint16 23C6 int16 -
+1702 int32 - uint32 68FF uint32 - uint16 6840 int16 6871 uint16 24C6 int16 -
+1703 int32 - uint32 - uint32 60FE:1 uint16 6040 int16 6071 uint16 23C6 int16 -
+1703 int32 - uint32 - uint32 - uint16 6840 int16 6871 uint16 24C6 int16 -
+1721 int64 23C7 uint32 6040 int16 6071 uint16 23C6 int64 24C7 uint32 6840 int16 6871 uint16 24C6
+1721 uint32 - uint32 - uint32 -
+1B01 int32 6064 int32 606C uint32 60FD uint16 6041 int16 6077 uint16 4002:1 uint16 4003:1
+1B01 int32 6864 int32 686C int32 333E uint16 6841 int16 6877 uint16 4002:2 uint16 4003:2
+1B21 int64 33C0 int64 34C0 uint32 333E uint32 3325 uint32 3425 uint16 4002:1 uint16 4002:2
+1B21 int16 6077 int16 6877 uint32 @ uint32 @
+"""
+SIZES = {0x1701: 40, 0x1702: 40, 0x1703: 40, 0x1B01: 40, 0x1721: 44, 0x1B21: 44}
+
+
+def structure(number):
+    """Return object ("-" for a reserved field), first byte and length of each field, without gaps."""
+    found, start = [], 0
+    for row in rows(STRUCTURES):
+        if int(row[0], 16) == number:
+            for kind, name in zip(row[1::2], row[2::2], strict=True):
+                size = int(kind.removeprefix("u").removeprefix("int")) // 8
+                found.append((name, start, size))
+                start += size
+    return found, start
+
+
+def write(image, index, sub, raw):
+    """Write an object, as a node does at an SDO; return 0, or the abort code."""
+    port = image.dictionary.port(index, sub)
+    try:
+        port.check(raw)
+    except ObjectAccessError as error:
+        return error.abort_code
+    port.write(raw)
+    return 0
+
+
+def select(image, number):
+    """Select an image by the manual's sequence."""
+    assignment = 0x1C12 if number < 0x1A00 else 0x1C13
+    for sub, raw in ((0, 0), (1, number), (0, 1)):
+        assert write(image, assignment, sub, raw) == 0
+
+
+@pytest.fixture(scope="module")
+def machine():
+    with EmulatedDrives("tgz_d", "gantry", num_threads=1) as drives:
+        yield drives
+
+
+@pytest.mark.parametrize("number", SIZES, ids=lambda number: f"{number:04X}")
+def test_an_image_has_the_fields_of_its_structure_at_their_bytes(machine, number):
+    image = ProcessImage(machine)
+    select(image, number)
+    fields, length = structure(number)
+    assert length == SIZES[number]
+    if number >= 0x1A00:
+        assert image.input_size == length
+        machine.machine.analog_inputs = [[1111, 0], [2222, 0]]
+        machine.advance(0.002)
+        data = image.read_inputs()
+        for name, start, size in fields:
+            if name in "@-":
+                continue
+            index, _, sub = name.partition(":")
+            raw = image.dictionary.port(int(index, 16), int(sub or 0)).read()
+            assert int.from_bytes(data[start : start + size], "little") == raw % 256**size, name
+        return
+    assert image.output_size == length
+    for name, start, size in fields:
+        data = bytearray(length)
+        value = 6 if name in ("6040", "6840") else 0x11 if "60FE" not in name else 0x150000
+        data[start : start + size] = value.to_bytes(size, "little")
+        assert image.write_outputs(bytes(data))
+        others = [other for other, _, _ in fields if other not in ("-", name)]
+        for other in [*others, *([] if name == "-" else [name])]:
+            index, _, sub = other.partition(":")
+            raw = image.dictionary.port(int(index, 16), int(sub or 0)).read()
+            expected = value if other == name else 0
+            # The native set-point is 607Ah inside: in the greater units of 608Fh.
+            assert raw == expected, (name, other)
+
+
+def test_images_are_selected_in_the_demanded_order_alone(machine):
+    image = ProcessImage(machine)
+    assert write(image, 0x1C12, 1, 0x1702) == SUB_INDEX_ZERO_IN_USE
+    assert write(image, 0x1C12, 0, 0) == 0
+    assert (image.output_size, image.input_size) == (0, 40)
+    assert write(image, 0x1C12, 1, 0x1B01) == VALUE_RANGE  # an image of the other way
+    assert write(image, 0x1C12, 1, 0x1704) == VALUE_RANGE
+    assert write(image, 0x1C12, 1, 0x1721) == 0
+    assert write(image, 0x1C12, 0, 1) == 0
+    assert image.output_size == 44
+    image.restart()
+    assert image.output_size == 40  # what PDO_Out_Mapping_1C12_1 says
+
+
+def test_registers_say_which_images_a_drive_begins_with(machine):
+    image = ProcessImage(machine)
+    machine.write(0x25C0, 0x1721)
+    machine.write(0x25C1, 0x1B21)
+    with pytest.raises(ObjectAccessError):
+        machine.write(0x25C0, 0x1B21)
+    image.restart()
+    assert (image.output_size, image.input_size) == (44, 44)
+    machine.write(0x25C0, 0x1701)
+    machine.write(0x25C1, 0x1B01)
+
+
+def test_a_mapped_parameter_is_the_object_that_its_register_names(machine):
+    image = ProcessImage(machine)
+    select(image, 0x1B21)
+    machine.write(0x25C2, 0x23C30020)
+    assert image.read_inputs()[36:40] == int(machine.read(0x23C3)[0]).to_bytes(4, "little")
+    assert image.read_inputs()[40:44] == bytes(4)  # 0 names nothing
+    machine.write(0x25C2, 0x12340020)
+    assert image.read_inputs()[36:40] == bytes(4)
+    machine.write(0x25C2, 0)
+
+
+def test_a_native_set_point_has_all_of_its_bits():
+    with EmulatedDrives("tgz_d", "gantry", num_threads=1) as drives:
+        image = ProcessImage(drives)
+        select(image, 0x1721)
+        data = bytearray(44)
+        data[0:8] = (3 * 2**28 + 1).to_bytes(8, "little")
+        assert image.write_outputs(bytes(data))
+        assert image.dictionary.port(0x23C7, 0).read() == 3 * 2**28 + 1
+        assert image.dictionary.port(0x607A, 0).read() == 3 * 65_536
+
+
+# --- the TGZ-S --------------------------------------------------------------------------------------------------------
+def test_the_second_axis_of_a_tgz_s_is_there_and_does_nothing():
+    """Its objects can be written without effect, and its statusword shows an error."""
+    with EmulatedDrives("tgz_s", "inertia", num_threads=1) as drives:
+        wire = Wire(drives)
+        assert wire.value(0x6841, 0) & FAULT[0] == FAULT[1]
+        assert wire.download(0x6860, 0, 1, 1) == 0
+        for word in (0x80, 0x06, 0x07, 0x0F):
+            assert wire.download(0x6840, 0, word, 2) == 0
+            wire.wait(2)
+        assert wire.value(0x6841, 0) & FAULT[0] == FAULT[1]
+        assert wire.value(0x4003, 2) & FAULT[0] == FAULT[1]
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, 65_536, relative=True, timeout=3.0)
+        assert abs(wire.value(0x6864, 0)) == 0
+        assert wire.value(0x1001, 0) == 0
