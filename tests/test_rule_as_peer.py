@@ -13,7 +13,7 @@ from tuning.auto import choice
 from tuning.auto import moves as auto_moves
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.calmer_gains import calmer
-from tuning.auto.choice import Figures, choose_set, keep_the_better, try_rule
+from tuning.auto.choice import PeerFigures, choose_set, keep_the_better, try_rule
 from tuning.auto.moves import stand
 from tuning.auto.proving import Proof, Shown
 from tuning.auto.stages import IdentifiedAxes, RuleTried
@@ -37,7 +37,7 @@ NAN = float("nan")
 ])  # fmt: skip
 def test_what_was_found_is_kept_where_it_is_better_on_the_drive_and_on_the_twins(drive, twin, chosen):
     costs = np.array(drive)[:, None]
-    found = choose_set(costs, Figures(costs, np.array(twin)[:, None]), np.ones(1, bool), 1)
+    found = choose_set(costs, PeerFigures(costs, np.array(twin)[:, None]), np.ones(1, bool), 1)
     assert found.tolist() == [chosen]
 
 
@@ -50,7 +50,7 @@ def test_what_was_found_is_kept_where_it_is_better_on_the_drive_and_on_the_twins
 ])  # fmt: skip
 def test_a_machine_of_several_axes_is_judged_as_a_whole(rule, own, mixed, twin_own, chosen):
     costs = np.array([rule, own, mixed])
-    figures = Figures(costs[:2], np.array([(2.0, 2.0), twin_own]))
+    figures = PeerFigures(costs[:2], np.array([(2.0, 2.0), twin_own]))
     assert choose_set(costs, figures, np.ones(2, bool), 2).tolist() == [chosen, chosen]
 
 

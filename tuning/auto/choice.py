@@ -75,7 +75,7 @@ def _reset(bench: AutoBench) -> Mask:
         assert bench.ground is not None, "proving makes it"
         with bench.spending(bench.target.together(faulted)):
             bench.ground.recover(faulted)
-        bench.drop_faults("trying the baseline rule's gains, and the fault cannot be reset")
+        bench.drop_faults("moving with the baseline rule's gains, and the fault cannot be reset")
     return faulted
 
 
@@ -88,7 +88,7 @@ def _far_from_the_edge(bench: AutoBench, basis: Basis, recorded: RecordedGains) 
     return bench.whole_machines(far)
 
 
-class Figures(NamedTuple):
+class PeerFigures(NamedTuple):
     """What sets of gains are worth, each of shape (sets, num_axes); nan is not known.
 
     drive: Measured cost J of a trial. twin: Robust cost on digital twins.
@@ -132,7 +132,7 @@ def keep_the_better(bench: AutoBench, basis: Basis, recorded: RecordedGains, tar
     return _take(bench, basis, recorded, gains, changed, figures, np.choose(np.maximum(chosen, 0), costs), target)
 
 
-def choose_set(costs: Floats, figures: Figures, where: Mask, lanes: int) -> Integers:
+def choose_set(costs: Floats, figures: PeerFigures, where: Mask, lanes: int) -> Integers:
     """Return which set of gains each axis gets, (num_axes,): the same one on all axes of a machine.
 
     A set other than the rule's must be better than it on the drive, the machine as its worst axis; and those found on
@@ -151,7 +151,7 @@ def choose_set(costs: Floats, figures: Figures, where: Mask, lanes: int) -> Inte
     return np.where(where, np.repeat(best, lanes), -1)
 
 
-def _wins(figures: Figures, own: int) -> Mask:
+def _wins(figures: PeerFigures, own: int) -> Mask:
     """Return the axes whose own gains are better on the drive, and on the twins where these have scored them."""
     return np.asarray((figures.drive[own] < figures.drive[RULE]) & ~(figures.twin[own] > figures.twin[RULE]))
 
@@ -181,7 +181,7 @@ def _trial(bench: AutoBench, gains: Integers, where: Mask) -> Floats | None:
     return np.where(bench.whole_machines(proof.passed & ~faulted | ~where), proof.cost, np.inf)
 
 
-def _figures(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> Figures:
+def _figures(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> PeerFigures:
     """Return what the rule's gains and those found are worth on machines."""
     assert recorded.rule is not None, "it was tried"
     twin = np.full((2, bench.target.num_axes), np.nan)
@@ -191,7 +191,7 @@ def _figures(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mas
         axes = np.flatnonzero(known)
         both = np.stack([basis.reference[axes], recorded.gains[axes]], axis=1)
         twin[:, axes] = cost_on_twins(bench, basis, axes.tolist(), both).T
-    return Figures(np.stack([recorded.rule.cost, recorded.proof]), twin)
+    return PeerFigures(np.stack([recorded.rule.cost, recorded.proof]), twin)
 
 
 def _take(
@@ -200,7 +200,7 @@ def _take(
     recorded: RecordedGains,
     gains: Integers,
     changed: Mask,
-    figures: Figures,
+    figures: PeerFigures,
     cost: Floats,
     target: Target,
 ) -> RecordedGains:
@@ -231,7 +231,7 @@ def _take(
     )
 
 
-def _tell(bench: AutoBench, basis: Basis, gains: Integers, where: Mask, figures: Figures) -> None:
+def _tell(bench: AutoBench, basis: Basis, gains: Integers, where: Mask, figures: PeerFigures) -> None:
     """Note on axes that get the rule's gains why they do."""
     for k in map(int, np.flatnonzero(where)):
         if not np.array_equal(gains[k], basis.reference[k]):

@@ -137,7 +137,7 @@ def stand(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Targe
             last = attempt >= EASINGS or recorded.kept[k] or not bench.affordable(MOVE_TIME - OVERTIME)[k]
             if last and attempt <= EASINGS and rule_stands(recorded, k) and not is_rule(basis, recorded, k):
                 recorded = with_rule(bench, basis, recorded, k)
-                bench.journals[k].note(f"the gains of the baseline rule are kept: {why}")
+                bench.journals[k].note(f"the gains of the baseline rule are kept: with faster ones {why}")
                 again[k] = True
             elif last:
                 bench.journals[k].stop(f"it does not come to rest: {why}")

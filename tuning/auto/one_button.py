@@ -132,7 +132,6 @@ def prove_found(
         recorded = measure(bench, basis, recorded)
         say("comparing with the gains before", 0.9)
         recorded = look_back(bench, basis, recorded)
-        say("comparing with the baseline rule", 0.93)
         recorded = stand(bench, basis, try_rule(bench, basis, recorded), target)
         recorded = keep_the_better(bench, basis, recorded, target)
         verdict = judge(bench, basis, recorded)
