@@ -77,9 +77,9 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
     other = axes & (drives.read(cia402.MODE) != number)
     needed = _own_modes(drives).get(number)
     closed = axes & False if needed is None else axes & (drives.read(Role.MODE_GATE) != needed)
-    if not (other | closed).any():
-        return
-    was_on = closed & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+    was_on = closed
+    if closed.any():
+        was_on = closed & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if other.any():
         drives.write(cia402.MODE, number, where=other)
     if needed is not None and closed.any():
