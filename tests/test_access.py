@@ -347,9 +347,15 @@ def context(scaler=65536.0, **other):
     values = {
         "position_scaler": np.array([scaler]),
         "current_lsb": 100.0 / 32768.0,
+        "rated_current": 3.5,
+        "velocity_ratio": 2.5,
+        "peak_current": 12.0,
     }
     values.update(other)
     return units.Context(**{name: values[name] for name in units.Context._fields})
+
+
+SCALAR_CONTEXT = context()._replace(position_scaler=65536.0)
 
 
 def code(unit, low=-(2**31), high=2**32 - 1):
@@ -396,7 +402,7 @@ def test_what_is_encoded_is_rounded_and_saturates(unit, value):
 @given(data=st.data())
 def test_arrays_single_values_and_compiled_code_read_a_row_alike(unit, data):
     low, high = RANGES.get(unit, (-(2**31), 2**31 - 1))
-    row, factor = code(unit, low, high), code(unit).factor(units.Context(65536.0, 100.0 / 32768.0))
+    row, factor = code(unit, low, high), code(unit).factor(SCALAR_CONTEXT)
     raw = data.draw(st.one_of(st.integers(low, high), st.sampled_from([low, high])))
     si = codec.decode_one(row, raw, factor)
     assert codec.decode(row, np.array([raw]), factor).tolist() == [si]
@@ -429,6 +435,12 @@ def test_arrays_single_values_and_compiled_code_read_a_row_alike(unit, data):
         ("current P", 25600, 1.0),  # 100 LSB of duty per LSB of current: full duty per 1/100 of 100 A
         ("velocity P", 256, 100.0 / 32768.0 * 30.0 / np.pi),  # one LSB of current per rpm
         ("position P", 4096, 2.0 * np.pi / 60.0 * 65536.0 / (2.0 * np.pi)),  # one rpm per 1/65536 revolution
+        ("1/1000 rated", 500, 1.75),  # of 3.5 A
+        ("velocity unit", 24, 2.0 * np.pi),  # 24 units of 2.5 rpm
+        ("velocity unit/s", 24, 2.0 * np.pi),
+        ("1/32767 M-Ipeak", -32767, -12.0),
+        ("mV", 1500, 1.5),
+        ("0.1V", 240, 24.0),
         ("raw", 7, 7.0),
         ("position window", 0xFFFFFFFF, np.inf),  # switched off
         ("position window", 65536, 2.0 * np.pi),

@@ -608,7 +608,7 @@ def test_a_file_that_is_no_eds_of_a_drive_is_told(tmp_path):
     with pytest.raises(ValueError, match="describes no CiA 402 drive: it has no statusword"):
         CanDrives(eds=path)
     path.write_text("]garbage", encoding="utf-8")
-    with pytest.raises(ValueError, match="cannot be read as an EDS"):
+    with pytest.raises(ValueError, match="describes no CiA 402 drive: it has no statusword"):
         CanDrives(eds=path)
 
 

@@ -194,7 +194,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["scope", "--duration", "0.0004"], USER_ERROR, "--duration 0.0004 s is not a whole number of milliseconds"),
         (["scope", "--out", "nowhere/file"], USER_ERROR, "there is no folder nowhere"),
         (["diff", "missing.toml"], USER_ERROR, "there is no file missing.toml; write one with"),
-        (["commission", "nonsense"], USER_ERROR, "no motor is named 'nonsense'; there are class_1kw"),
+        (["commission", "nonsense"], USER_ERROR, "no motor is named 'nonsense'; there are am3033_e"),
         (["log", "frames.xyz"], USER_ERROR, "'.xyz' is not one of .log, .blf"),
         (["replay", "missing.log"], USER_ERROR, "there is no file missing.log"),
         (["log", "frames.log", "--duration", "nan"], USER_ERROR, "--duration nan s must be above 0 s"),

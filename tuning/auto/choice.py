@@ -64,8 +64,8 @@ def try_rule(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Recorde
 
 def _machines(bench: AutoBench, axes: Mask) -> Mask:
     """Return all axes of the machines of which some are chosen, (num_axes,)."""
-    lanes = bench.target.axes_per_machine
-    return np.asarray(np.repeat(axes.reshape(-1, lanes).any(axis=1), lanes))
+    per_machine = bench.target.axes_per_machine
+    return np.asarray(np.repeat(axes.reshape(-1, per_machine).any(axis=1), per_machine))
 
 
 def _reset(bench: AutoBench) -> Mask:
@@ -132,7 +132,7 @@ def keep_the_better(bench: AutoBench, basis: Basis, recorded: RecordedGains, tar
     return _take(bench, basis, recorded, gains, changed, figures, np.choose(np.maximum(chosen, 0), costs), target)
 
 
-def choose_set(costs: Floats, figures: PeerFigures, where: Mask, lanes: int) -> Integers:
+def choose_set(costs: Floats, figures: PeerFigures, where: Mask, per_machine: int) -> Integers:
     """Return which set of gains each axis gets, (num_axes,): the same one on all axes of a machine.
 
     A set other than the rule's must be better than it on the drive, the machine as its worst axis; and those found on
@@ -142,13 +142,13 @@ def choose_set(costs: Floats, figures: PeerFigures, where: Mask, lanes: int) -> 
         costs: Measured cost J of the rule's gains, those found and, where there are any, those mixed, (sets, num_axes).
         figures: Of the rule's gains and of those found.
         where: Axes of the machines that are judged, (num_axes,).
-        lanes: Axes of a machine.
+        per_machine: Axes of a machine.
     """
-    worst = np.where(np.isfinite(costs), costs, np.inf).reshape(len(costs), -1, lanes).max(axis=2)
-    twin = figures.twin.reshape(2, -1, lanes).max(axis=2)
+    worst = np.where(np.isfinite(costs), costs, np.inf).reshape(len(costs), -1, per_machine).max(axis=2)
+    twin = figures.twin.reshape(2, -1, per_machine).max(axis=2)
     worst[1] = np.where(twin[1] > twin[RULE], np.inf, worst[1])  # what no twin has scored is judged by the drive
     best = np.where(worst.min(axis=0) < worst[RULE], worst.argmin(axis=0), RULE)
-    return np.where(where, np.repeat(best, lanes), -1)
+    return np.where(where, np.repeat(best, per_machine), -1)
 
 
 def _wins(figures: PeerFigures, own: int) -> Mask:
