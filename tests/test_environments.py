@@ -377,7 +377,7 @@ def test_stable_baselines_view_follows_the_schedule(kind):
 # --- a wrong configuration --------------------------------------------------------------------------------------------
 @EVERY_KIND
 @pytest.mark.parametrize(("options", "says"), [
-    ({"device": "tmcm"}, "no device is named 'tmcm'; there are tmcm1636"),
+    ({"device": "tmcm"}, "no device is named 'tmcm'; there are tgz_d, tgz_s"),
     ({"load": "crane"}, "no load is named 'crane'; there are arm, ball_screw, belt"),
     ({"motor": "big"}, "qbl4208"),
     ({"friction": "wet"}, "no friction is named 'wet'; there are none, coulomb_viscous, stribeck, lugre"),

@@ -391,8 +391,8 @@ TEXT = DEFAULT.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ('device = "tmcm1636"', 'device = "abc"', "no device is named 'abc'; there are tmcm1636"),
-    ('motor = "qbl4208"', 'motor = "abc"', "no motor is named 'abc'; there are class_1kw, class_20w"),
+    ('device = "tmcm1636"', 'device = "abc"', "no device is named 'abc'; there are tgz_d, tgz_s"),
+    ('motor = "qbl4208"', 'motor = "abc"', "no motor is named 'abc'; there are am3033_e, am3041_e"),
     ('load = "two_mass"', 'load = "abc"', "no load is named 'abc'; there are arm, ball_screw, belt, cart_pendulum"),
     ('load = "two_mass"', "load = 3", "load = 3 is a whole number; it must be a text"),
     ("seed = 0", "seed = 1.5", "seed = 1.5 is a number with a fraction; it must be a whole number"),
