@@ -173,7 +173,9 @@ def test_the_command_asks_for_what_a_stepper_needs(tmp_path):
 # --- each kind to its own drives ----------------------------------------------------------------------------------
 def test_a_servo_drive_offers_no_stepper_and_a_stepper_drive_nothing_else():
     servo, stepper = find_device("tmcm1636").motors, find_device(stepper_rig.BARE).motors
-    assert set(servo) | set(stepper) == set(MOTORS)
+    mains = find_device("tgz_d").motors
+    assert set(servo) | set(stepper) | set(mains) == set(MOTORS)
+    assert set(mains) == {"am3033_e", "am3041_e"} and not set(mains) & set(servo)
     assert set(stepper) == set(STEPPERS)
     offered = CliRunner().invoke(app, ["commission", "?"]).output.split()
     assert offered == list(servo)

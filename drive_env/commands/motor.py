@@ -200,6 +200,7 @@ def _tell(file: Path, row: Motor) -> None:
     """Say what the numbers make of the motor, by which a wrong one is noticed."""
     from drive_env.devices import device_names, find_device
     from drive_env.firmware import motor_kinds
+    from drive_env.motors import is_extra_low
 
     no_load = row.voltage / math.sqrt(3.0) / (row.n_p * row.psi_m) if row.kind != "dc" else row.voltage / row.psi_m
     rpm = 30.0 / math.pi
@@ -212,6 +213,8 @@ def _tell(file: Path, row: Motor) -> None:
         print(f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * rpm:.0f} rpm without load")
         print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
     of_kind = [device for device in map(find_device, device_names()) if row.kind in motor_kinds(device.firmware_name)]
+    # Of another voltage class nobody expects it.
+    of_kind = [one for one in of_kind if is_extra_low(one.highest_supply) == is_extra_low(row.voltage)] or of_kind
     refused = {}
     for device in of_kind:
         try:
