@@ -368,7 +368,7 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
         assert both[0].default == both[1].value == value, name
     assert eds[0x1400][1].default == 0x207  # what follows the node-ID goes on following it
     assert (dcf.node_id, dcf.bitrate, dcf[0x1400][1].value) == (1, 1_000_000, 0x201)
-    assert "a.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")
+    assert "LastEDS=alpina_ax40.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")  # which it was made of
     again = run("export", tmp_path / "a.eds", "--device", folder)
     assert again.exit_code == 2 and "files are not overwritten" in again.stderr
     assert run("export", tmp_path / "a.txt", "--device", folder).exit_code == 2
