@@ -327,9 +327,9 @@ def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, mon
     (axis,) = result.axes
     assert axis.accepted, axis.reason
     assert any("lowered to 50 %" in note for note in axis.notes), axis.notes
-    np.testing.assert_array_equal(tried[-1], axis.after)
-    earlier = [round(gains[2] / axis.after[2], 1) for gains in tried[:-1]]
-    assert 2.0 in earlier
+    order = [gains.tolist() for gains in tried]
+    calmed = order.index(list(axis.after))  # the baseline rule's gains may make their trial after it
+    assert 2.0 in [round(gains[2] / axis.after[2], 1) for gains in order[:calmed]]
 
 
 @pytest.mark.slow

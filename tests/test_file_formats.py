@@ -193,6 +193,7 @@ def test_the_examples_of_the_page_are_taken(tmp_path):
 def test_device():
     read = [tomllib.loads((DEVICE.parent / name / "device.toml").read_text(encoding="utf-8"))
             for name in device_names() if not find_device(name).variant_of]  # fmt: skip
+    read.append(tomllib.loads((DEVICE.parent / "template.toml").read_text(encoding="utf-8")))  # of drives by their EDS
     assert set(fields("device")) == {key for data in read for key in data}
     own = {path.name for path in (ROOT / "tests" / "invented_drive").iterdir() if not path.name.startswith("_")}
     assert {name.replace("*", "invented") for name in fields("device", "files")} == own

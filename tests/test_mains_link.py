@@ -123,19 +123,19 @@ def test_the_sum_of_all_energies_is_0_within_a_thousandth():
 
 
 def test_what_an_axis_brakes_the_other_one_uses():
-    module = new_module(chopper_voltage=790.0)
-    run(module, 200, (10.0, 0.0))  # axis 0 runs, axis 1 stands
-    run(module, 5, (-6.0, 6.0))
-    taken = module["mains_energy"][0, 0]
+    module = new_module(chopper_voltage=900.0)  # V, which the link does not reach: the resistor stays off
+    run(module, 70, (10.0, 0.0))  # axis 0 gets to 7000 rpm, axis 1 stands
+    run(module, 15, (-6.0, 6.0))
+    taken, burnt = module["mains_energy"][0, 0], module["brake_energy"][0, 0]
     before = stored(module)
     sums, trace = run(module, 40, (-6.0, 6.0))
-    assert sums[SHAFT, 0] < -60.0
+    assert sums[SHAFT, 0] < -40.0
     assert sums[SHAFT, 1] > 5.0
     assert trace[:, 0].min() > 560.0
-    assert trace[:, 0].max() < 790.0
+    assert trace[:, 0].max() < 900.0
     assert module["mains_energy"][0, 0] - taken == pytest.approx(sums[MAINS, 0], rel=1e-9, abs=1e-6)
     assert sums[MAINS, 0] == 0.0  # the braking axis gives it all
-    assert module["brake_energy"][0, 0] == 0.0
+    assert module["brake_energy"][0, 0] == burnt
     assert (trace[:, 0] == trace[:, 1]).all()
     assert out_of_balance(module, before, sums) < 1e-3
 
@@ -169,7 +169,7 @@ def test_without_its_resistor_a_braking_axis_charges_the_link_alone():
     braked = -sums[SHAFT, :2].sum() - sums[COPPER, :2].sum() - sums[IDLE, :2].sum() - field
     assert gained == pytest.approx(fed + braked, rel=3e-3)
     assert braked > 4.0 * fed
-    assert trace[-1, 0] > 700.0
+    assert trace[-1, 0] > 650.0  # far above the 560 V of the mains
 
 
 def test_the_resistor_rests_when_it_is_too_hot_and_works_again_when_it_has_cooled():

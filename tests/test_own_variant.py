@@ -70,8 +70,12 @@ def test_its_supply_is_watched_by_its_own_limits(files, volts, present):
         assert bool(drives.read(0x6041)[0] & 0x10) is present  # bit 4: the supply is there
 
 
-def test_currents_are_counted_as_its_measuring_range_has_them(files):
-    device, base = find_device(files[0]), find_device("tmcm1636")
+def test_currents_are_counted_as_its_measuring_range_has_them(tmp_path):
+    stage = tmp_path / "stage.toml"
+    stage.write_text(
+        'title = "Servo stage, 50 A"\nvariant_of = "tmcm1636"\n[current]\nfull_scale = 50.0\novercurrent = 45.0\n'
+    )
+    device, base = find_device(str(stage)), find_device("tmcm1636")
     assert (device.current_full_scale, base.current_full_scale) == (50.0, 100.0)
     assert device.velocity_rate == base.velocity_rate
     # The same gain is twice the integer in velocity P, and half of it in current P.
@@ -107,7 +111,7 @@ def test_a_stepper_stage_of_ones_own_makes_the_current_that_it_has(tmp_path, bas
     ("text", "message"),
     [
         ("title = ", "is not a TOML file"),
-        ('variant_of = "tgz"', "variant_of is 'tgz'; it names the device that differs a little: tmcm1636"),
+        ('variant_of = "tgz"', "variant_of is 'tgz'; it names the device that differs a little: tgz_d, tmcm1636"),
         ("[supply]\novervoltage = 100.0", "variant_of is 'None'"),
         ('variant_of = "tmcm1636"\n[suply]\novervoltage = 100.0', "suply is nothing that a device has; did you mean"),
         ('variant_of = "tmcm1636"\n[supply]\npeak = 1.0', r"supply.peak is nothing that a device has"),

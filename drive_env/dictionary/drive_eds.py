@@ -18,7 +18,7 @@ _BITS = {
     16: (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.TORQUE_ACTUAL, cia402.TARGET_TORQUE, cia402.QUICK_STOP_OPTION),
     32: (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TARGET_POSITION, cia402.TARGET_VELOCITY),
 }
-_KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
+KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
 MOST_AXES = 8
 
 
@@ -42,7 +42,7 @@ def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
     if axes == 0:
         raise ValueError(f"{path} describes no CiA 402 drive: it has no statusword 6041h")
     for axis in range(axes):
-        for (index, sub), bits in _KINDS.items():
+        for (index, sub), bits in KINDS.items():
             variable = types.get((index + cia402.AXIS_OFFSET * axis, sub))
             found = None if variable is None else INTEGER_TYPES.get(variable.data_type or 0)
             if variable is not None and (found is None or found[0] != bits):

@@ -32,6 +32,7 @@ SYNC_MANAGERS_END = registers.SYNC_MANAGERS + registers.NUM_SYNC_MANAGERS * regi
 FMMUS_END = registers.FMMUS + registers.NUM_FMMUS * registers.FMMU_SIZE
 MICROSECOND = 1e-6
 ACTIVATE, REPEAT = 6, 0x02  # byte of a sync manager's registers, and its bit
+UNUSED_PORTS = 0b01010000_00000000  # of 0110h: ports 2 and 3 are closed
 DL_EVENT, AL_EVENT = 0x04, 0x08  # of 0210h
 WATCHDOG_IS_GOOD = 0x01
 
@@ -82,7 +83,7 @@ class SlaveController:
     def connect(self, ends_line: bool) -> None:
         """Tell by 0110h whether a slave comes behind: port 0 has a link, port 1 then, too; others are closed."""
         self.ends_line = ends_line
-        status = 0x5001 | 0x0010 | 0x0200 | (0x0400 if ends_line else 0x0820)
+        status = UNUSED_PORTS | 0x0001 | 0x0010 | 0x0200 | (0x0400 if ends_line else 0x0820)
         self.put_register(registers.DL_STATUS, status, 2)
         self._raise_event(DL_EVENT)
 
