@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 import canopen
 import numpy as np
 import pytest
+from canopen_wire import Wire
 from fault_injection import (
     ANSWER,
     DEAD_MASTER,
@@ -26,6 +27,7 @@ from fault_injection import (
     TURN,
     FaultyBus,
     ObservedWorld,
+    Truth,
     WorldBus,
     eds_read_once,
     no_interrupt_left,
@@ -341,28 +343,33 @@ def test_frames_of_another_master_stop_the_axes_and_the_program_is_told(inside, 
 @pytest.mark.parametrize("gate", GATES)
 def test_heartbeats_that_stay_away_stop_an_axis_that_takes_no_commands(inside, gate):
     inside.machine.reset()
-    world = ObservedWorld(inside, lockstep=True)
-    world.power_on()
-    for _ in range(100):  # until it has booted
-        world.cycle()
-    heartbeat = Frame(0x77F, b"\x05")
-    for frame in (
-        Frame(0, b"\x01\x00"), sdo(0x1016, 127 << 16 | 100, 4, 1), heartbeat, sdo(D_MODE, PV_D_MODE, 4),
-        sdo(0x2403, PV_D_MODE, 4), sdo(0x6060, 3, 1), sdo(0x6860, 3, 1), sdo(0x60FF, SPEED, 4), sdo(0x68FF, SPEED, 4),
-        *(sdo(index, word, 2) for word in (0x06, 0x07, 0x0F) for index in (0x6040, 0x6840)),
-    ):  # fmt: skip
-        world.receive(frame)
-        for _ in range(5):
-            world.cycle()
-    for _ in range(20):
-        world.receive(heartbeat)
-        for _ in range(10):
-            world.cycle()
-    assert (np.abs(world.truth.omega()[-1]) > 0.5 * RAD_PER_S).all()
+    wire, heartbeat = Wire(inside), (0x77F, "05")
+    wire.start()
+    assert wire.download(0x1029, 1, 0, 1) == 0  # out of operational, which ends operation (CiA 402)
+    assert wire.download(0x1016, 1, 127 << 16 | 100, 4) == 0  # node 127, 100 ms
+    wire.receive(*heartbeat)
+    for index, value, size in ((D_MODE, PV_D_MODE, 4), (cia402.MODE, 3, 1), (0x60FF, SPEED, 4)):
+        for further in (0, 0x100 if index == D_MODE else 0x800):
+            wire.take()
+            assert wire.download(index + further, 0, value, size) == 0
+    for word in (0x06, 0x07, 0x0F):
+        for index in (0x6040, 0x6840):
+            wire.take()
+            assert wire.download(index, 0, word, 2) == 0
+        wire.wait(5)
+    for _ in range(10):
+        wire.receive(*heartbeat)
+        wire.wait(20)
+    truth = Truth(inside)
+    assert (np.abs(truth.omega()[-1]) > 0.5 * RAD_PER_S).all()
     GATES[gate](inside)
-    for _ in range(300):
-        world.cycle()
-    assert problems(world.truth) == []
+    for _ in range(400):
+        wire.wait(1)
+        truth.sample()
+    assert problems(truth) == []
+    if gate != "stops":  # which had stopped before
+        assert np.abs(truth.omega()[90]).max() > 0.5 * RAD_PER_S
+        assert (inside.read(0x6041) & 0x4F == 0x08).all()
 
 
 @pytest.mark.parametrize("gate", ["stops", "ignores"])

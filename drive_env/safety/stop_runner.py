@@ -239,12 +239,13 @@ class StopRunner:
 
     def _ask_modes(self, stop: Stop) -> None:
         """Ask axes that ignore commands for their mode of operation: another master may have written it."""
-        entry, per_node, now = self._known.find(MODE), self._drives.description.num_axes, self._axes.now()
+        per_node, now = self._drives.description.num_axes, self._axes.now()
         for axis, one in list(stop.axes.items()):
             is_due = now >= self._asked_at.get(axis, -math.inf) + REPEAT
             if one.phase in (Phase.OFF, Phase.LOST) or not is_due or not self._ignores(axis):
                 continue
             self._asked_at[axis] = now
+            entry = self._known.find(MODE)
             node, part = divmod(axis, per_node)
             data = self._drives.sdo(node).ask(*self._drives.description.key(entry, part), answer_time(self._drives))
             if data is not None:
