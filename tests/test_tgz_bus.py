@@ -345,7 +345,7 @@ def test_heartbeats_that_stay_away_stop_an_axis_that_takes_no_commands(inside, g
     inside.machine.reset()
     wire, heartbeat = Wire(inside), (0x77F, "05")
     wire.start()
-    assert wire.download(0x1029, 1, 0, 1) == 0  # out of operational, which ends operation (CiA 402)
+    assert wire.download(0x1029, 1, 2, 1) == 0  # to stopped, which ends operation
     assert wire.download(0x1016, 1, 127 << 16 | 100, 4) == 0  # node 127, 100 ms
     wire.receive(*heartbeat)
     for index, value, size in ((D_MODE, PV_D_MODE, 4), (cia402.MODE, 3, 1), (0x60FF, SPEED, 4)):
@@ -368,7 +368,7 @@ def test_heartbeats_that_stay_away_stop_an_axis_that_takes_no_commands(inside, g
         truth.sample()
     assert problems(truth) == []
     if gate != "stops":  # which had stopped before
-        assert np.abs(truth.omega()[90]).max() > 0.5 * RAD_PER_S
+        assert np.abs(truth.omega()[60]).max() > 0.5 * RAD_PER_S
         assert (inside.read(0x6041) & 0x4F == 0x08).all()
 
 
@@ -388,6 +388,9 @@ def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
         def script():
             with CanDrives("tgz_d", bus=bus, safety=LIMITS, timeout=1.0) as drives:
                 turn(drives)
+                assert drives.bus.read((0x1029, 1))[0] == 2, (
+                    "a dead master must stop the axes, not make them pre-operational"
+                )
                 world.cycle = cut
                 drives.advance(1.0)
 
