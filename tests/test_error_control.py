@@ -62,7 +62,7 @@ def control_of(values, *, takes=None, listed=None, alive=(), num_axes=1):
             return entries[key]
 
     description = SimpleNamespace(
-        has=entries.__contains__, dictionary=Known(), answer_timeout=0.1, num_axes=num_axes,
+        has=entries.__contains__, dictionary=Known(), device=None, answer_timeout=0.1, num_axes=num_axes,
         key=lambda entry, part: (entry.index + 0x800 * part, entry.sub),
     )  # fmt: skip
     waited = []
@@ -224,7 +224,7 @@ def test_what_does_not_read_back_is_told_and_the_rest_put_back():
 
 def changed_of(values):
     objects = Objects(values)
-    return ChangedObjects(5, objects, SimpleNamespace(answer_timeout=0.1)), objects
+    return ChangedObjects(5, objects, SimpleNamespace(device=None, answer_timeout=0.1)), objects
 
 
 def test_what_is_there_already_is_not_written_and_longer_answers_count_by_their_beginning():
@@ -322,7 +322,9 @@ def controls_of(*kinds):
     values = {"heartbeat": {CONSUMER: bytes(4)}, "life guarding": {GUARD: bytes(2), LIFE: bytes(1)}}
     objects = [Objects(values[kind]) for kind in kinds]
     entries = {key: SimpleNamespace(index=key[0], sub=key[1]) for key in values[kinds[0]]}
-    description = SimpleNamespace(has=entries.__contains__, dictionary=list(entries.values()), answer_timeout=0.1)
+    description = SimpleNamespace(
+        has=entries.__contains__, dictionary=list(entries.values()), device=None, answer_timeout=0.1
+    )
     return ErrorControls(port, list(range(5, 5 + len(kinds))), objects, description), port, objects
 
 

@@ -59,9 +59,19 @@ def wait_for(
             )
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
-            raise TimeoutError(f"axis {axis} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h")
+            raise TimeoutError(
+                f"axis {axis} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h"
+                + _why_not_heard(drives, int(status[axis]))
+            )
         drives.advance(STEP)
         waited += STEP
+
+
+def _why_not_heard(drives: BasicDrives, status: int) -> str:
+    """Return, for a message, that a drive takes no commands; empty where its own mode is not why."""
+    if not _own_modes(drives) or cia402.matches(status, cia402.REMOTE):
+        return ""
+    return "; it takes no commands (bit 9 is 0), since somebody has changed its own mode or its mode of operation"
 
 
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
@@ -222,15 +232,27 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
 
 def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Switch the voltage off; the axis coasts."""
-    take_command(drives, where)
-    drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
+    _command_stop(drives, cia402.DISABLE_VOLTAGE, where)
     wait_for(drives, cia402.SWITCH_ON_DISABLED, timeout, "switch on disabled", where)
 
 
 def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
     """Command a quick stop; what follows the ramp is 605Ah's."""
+    _command_stop(drives, cia402.QUICK_STOP, where)
+
+
+def _command_stop(drives: BasicDrives, word: int, where: Mask | None) -> None:
+    """Write a controlword that stops axes; twice to those that turn out to have ignored it."""
     take_command(drives, where)
-    drives.write(cia402.CONTROLWORD, cia402.QUICK_STOP, where=where)
+    drives.write(cia402.CONTROLWORD, word, where=where)
+    if not _own_modes(drives):
+        return
+    drives.advance(STEP)  # a statusword may be of before somebody changed the drive's own mode
+    ignored = ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
+    ignored = ignored if where is None else ignored & where
+    if ignored.any():
+        take_command(drives, ignored)
+        drives.write(cia402.CONTROLWORD, word, where=ignored)
 
 
 def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:

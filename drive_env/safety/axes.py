@@ -51,6 +51,7 @@ class Axes:
         has_scale: Whether the drive says how many increments a revolution has.
         mean_current: Over the last 30 ms [unit of 6077h].
         seen: When the statusword came last [s].
+        mode_written: When the program last wrote the mode of operation, or the drive's own mode that must fit it [s].
         clock: The time of lockstep [s].
         is_counted: Whether 606Ch counts what 6064h counts, per second.
     """
@@ -77,6 +78,7 @@ class Axes:
         self.speed = np.zeros(count)
         self.mean_current = np.zeros(count)
         self.seen = np.full(count, -math.inf)
+        self.mode_written = np.full(count, -math.inf)
         self.clock = 0.0
         self.rotor = RotorAngle(count)
         self._placed = np.zeros(count, bool)  # whether a position was seen

@@ -145,6 +145,7 @@ class Envelope:
             self._before_controlword(raw, where)
             return
         self._watchdogs.check_not_held(entry)
+        self._note_mode(key, where)
         if key in SLOW_DOWN_RAMPS:
             self._check_no_ramp_runs(entry, where)
         if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
@@ -179,6 +180,7 @@ class Envelope:
     def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Take note of what was written."""
         key = (entry.index, entry.sub)
+        self._note_mode(key, where)
         if key == CONTROLWORD:
             self._after_controlword(raw, where)
         elif key == MODE:
@@ -193,6 +195,11 @@ class Envelope:
                 self._limits.lend()  # it corrects software limits
         elif entry.index == STORE and self._axes.is_armed:
             self._lend()
+
+    def _note_mode(self, key: Key, where: Mask) -> None:
+        """Take note of what may make an axis ignore commands for a moment, until it has both of its modes."""
+        if key in (MODE, self._drives.description.role(Role.MODE_GATE)):
+            self._axes.mode_written = np.where(where, self._axes.now(), self._axes.mode_written)
 
     def write_lent(self, entry: Entry, axis: int, value: int) -> bool:
         """Take a value for an object that has another one meanwhile; False if it has not."""

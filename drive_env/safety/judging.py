@@ -8,13 +8,14 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.dictionary.entries import ObjectDictionary
+from drive_env import cia402
+from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
-from drive_env.safety.objects import CSP, CURRENT, DEMAND, HM, POSITION, PP, VELOCITY
+from drive_env.safety.objects import CSP, CURRENT, DEMAND, HM, POSITION, PP, STATUSWORD, VELOCITY
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
 from drive_env.safety.rotor import wrapped
 
@@ -25,6 +26,7 @@ Mask = NDArray[np.bool_]
 # A current above its limit is no accident until it lasts: noise and overshoot are within this.
 CURRENT_MARGIN, CURRENT_CYCLES = 1.25, 10
 LATENCY = 0.010  # s from a sample to the drive's ramp
+MODE_SETTLES = 0.05  # s after a mode was written, within which a drive may not be heard yet
 
 
 class Judging:
@@ -36,6 +38,7 @@ class Judging:
         limits: Those that hold.
         modes: Returns the mode of operation of every axis.
         stop_for: Stops the drives for what is wrong, and raises SafetyError with that and a remedy.
+        mode_gate: The drive's own mode, of one that takes no commands unless it fits the mode of operation.
     """
 
     def __init__(
@@ -45,12 +48,14 @@ class Judging:
         limits: LimitsInForce,
         modes: Callable[[], Integers],
         stop_for: Callable[[str, str], NoReturn],
+        mode_gate: Entry | None = None,
     ) -> None:
         self._known = known
         self._axes = axes
         self._limits = limits
         self._modes = modes
         self._stop_for = stop_for
+        self._mode_gate = mode_gate
         count = len(axes.everywhere)
         self._over_current = np.zeros(count, np.int64)
         self._swings = [Swings() for _ in range(count)]
@@ -71,6 +76,26 @@ class Judging:
             self._judge_following(judged, rows[DEMAND] - rows[POSITION], bounds)
         if CURRENT in rows:
             self._judge_current(judged, rows[CURRENT], bounds)
+
+    def judge_heard(self, rows: Mapping[Key, Integers], were_judged: Mask) -> None:
+        """Stop for axes that have ceased to take commands by themselves: somebody has changed one of their modes.
+
+        Such an axis stops by itself, or runs on: the manual of a drive may not say which.
+
+        Args:
+            rows: Samples, each object of shape (rows, num_axes).
+            were_judged: Axes that were live, and not stopping, before these samples or by them.
+        """
+        if self._mode_gate is None or STATUSWORD not in rows:
+            return
+        ignores = np.any(rows[STATUSWORD] & cia402.REMOTE.mask != cia402.REMOTE.value, axis=0)
+        settled = self._axes.now() - self._axes.mode_written > MODE_SETTLES
+        for axis in np.flatnonzero(were_judged & ignores & settled).tolist():
+            self._stop_for(
+                f"axis {axis} has ceased to take commands (bit 9 of 6041h is 0): {self._mode_gate.label} does not fit "
+                "its mode of operation, and this program has changed neither",
+                "end the other master, or the service program, then enable again",
+            )
 
     def _judge_speed(self, judged: Mask, bounds: Bounds) -> None:
         """Hold speeds by positions against the limit of drives whose own unit of speed is not known."""

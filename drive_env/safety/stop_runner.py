@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NoReturn
 
@@ -27,10 +28,11 @@ from drive_env.safety.objects import (
     HALT_OPTION,
     HM,
     HOMING_RAMP,
+    MODE,
     PV,
     QUICK_STOP_OPTION,
 )
-from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
+from drive_env.safety.stopping import REPEAT, AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -86,6 +88,8 @@ class StopRunner:
         self._woken_at = 0.0
         self._told_of: set[int] = set()  # axes that are held under a weight
         self._opened: set[int] = set()  # axes that were told last to take commands, not which
+        self._modes: dict[int, int] = {}  # axis that ignores commands -> its mode of operation, asked for
+        self._asked_at: dict[int, float] = {}  # axis -> when its mode was asked for [s]
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
     def make_sure_of_ramps(self) -> None:
@@ -209,6 +213,7 @@ class StopRunner:
         for axis in map(int, np.flatnonzero(axes)):
             self._held.discard(axis)
             self._told_of.discard(axis)
+            self._modes.pop(axis, None)
             known = stop.axes.get(axis)
             if known is not None and known.phase not in (Phase.OFF, Phase.LOST):
                 if known.phase is Phase.REST and holds:
@@ -224,10 +229,30 @@ class StopRunner:
         stop.step(now)
 
     def hold(self) -> None:
-        """Have axes that are stopping stay in quick stop active at first: a weight would pull them on."""
+        """Have axes that are stopping stay in quick stop active at first; ask those that are not heard for a mode."""
         stop = self.current
-        if stop is None or not self._drives.description.has(QUICK_STOP_OPTION):
+        if stop is None:
             return
+        self._ask_modes(stop)
+        if self._drives.description.has(QUICK_STOP_OPTION):
+            self._lend_hold(stop)
+
+    def _ask_modes(self, stop: Stop) -> None:
+        """Ask axes that ignore commands for their mode of operation: another master may have written it."""
+        per_node, now = self._drives.description.num_axes, self._axes.now()
+        for axis, one in list(stop.axes.items()):
+            is_due = now >= self._asked_at.get(axis, -math.inf) + REPEAT
+            if one.phase in (Phase.OFF, Phase.LOST) or not is_due or not self._ignores(axis):
+                continue
+            self._asked_at[axis] = now
+            entry = self._known.find(MODE)
+            node, part = divmod(axis, per_node)
+            data = self._drives.sdo(node).ask(*self._drives.description.key(entry, part), answer_time(self._drives))
+            if data is not None:
+                self._modes[axis] = int(self._drives.description.decode(entry, data))
+
+    def _lend_hold(self, stop: Stop) -> None:
+        """Lend an option that ends in quick stop active: without it a weight would pull an axis on."""
         entry, per_node = self._known.find(QUICK_STOP_OPTION), self._drives.description.num_axes
         for axis, one in list(stop.axes.items()):
             if not one.holds or one.phase is not Phase.RAMP or axis in self._held:
@@ -275,9 +300,15 @@ class StopRunner:
     def _own_mode(self, axis: int) -> int | None:
         """Return the drive's own mode with which an axis that ignores commands takes them; None of one that does."""
         device = self._drives.device
-        if device is None or not device.mode_gate or cia402.matches(int(self._axes.status[axis]), cia402.REMOTE):
+        if device is None or not self._ignores(axis):
             return None
-        return device.mode_gate.get(int(self._axes.mode[axis]))
+        return device.mode_gate.get(self._modes.get(axis, int(self._axes.mode[axis])))
+
+    def _ignores(self, axis: int) -> bool:
+        """Return whether an axis said last that it takes no commands, of a drive whose own mode may be why."""
+        device = self._drives.device
+        gated = device is not None and bool(device.mode_gate)
+        return gated and not cia402.matches(int(self._axes.status[axis]), cia402.REMOTE)
 
     def _sample(self, axis: int) -> Sample:
         return Sample(float(self._axes.seen[axis]), int(self._axes.status[axis]), float(self._axes.speed[axis]))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.master.description import Key
 from drive_env.master.errors import BusError
 from drive_env.safety.axes import Axes
@@ -79,7 +80,9 @@ class Watch:
         self._watchdogs = watchdogs
         self._prepare = prepare
         self._poll = poll
-        self._judging = Judging(self._known, axes, limits, self.modes, stops.stop_for)
+        self._has_gate = drives.device is not None and bool(drives.device.mode_gate)
+        gate = self._known.find(Role.MODE_GATE) if self._has_gate else None
+        self._judging = Judging(self._known, axes, limits, self.modes, stops.stop_for, gate)
         self.looks = Looks(drives, axes, limits, self._observe_axis)
         self._supervisor: Supervisor | None = None
         self._missed = 0
@@ -207,13 +210,17 @@ class Watch:
                 rows = self.looks.with_unsampled(rows)
             if self._drives.time_waits:
                 self._axes.clock += len(next(iter(rows.values()))) * self._drives.description.cycle if rows else 0.0
-            self._take(rows, epoch, self._axes.everywhere if where is None else where)
+            seen = self._axes.everywhere if where is None else where
+            were_judged = self._stops.judged() if self._has_gate else seen
+            self._take(rows, epoch, seen)
             if self._drives.time_waits and self._stops.current is not None:
                 self._stops.hold()
                 self._stops.step()
             if (pending := self._pending) is not None and not self._is_supervisor():
                 self._pending = None
                 raise pending
+            if self._has_gate:
+                self._judging.judge_heard(rows, (were_judged | self._stops.judged()) & seen)
             self._judging.judge(rows, self._stops.judged())
 
     def _take(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> None:
@@ -222,7 +229,10 @@ class Watch:
 
     def _observe_axis(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> None:
         with self._axes.lock:
+            were_judged = self._stops.judged() if self._has_gate else where
             self._take(rows, epoch, where)
+            if self._has_gate:
+                self._judging.judge_heard(rows, (were_judged | self._stops.judged()) & where)
             known = {POSITION: self._axes.position, STATUSWORD: self._axes.status}
             seen = {key: np.where(where, row, known.get(key, 0)) for key, row in rows.items()}
             self._judging.judge(seen, self._stops.judged() & where)

@@ -126,7 +126,7 @@ class ErrorControl:
                 self._objects.change(_LIFE_FACTOR, bytes((BEATS_PER_TIMEOUT,)))
                 self.kind, self.time = "life guarding", 1e-3 * guard_time * BEATS_PER_TIMEOUT
             if self.kind != "none" and self._description.has(_ERROR_BEHAVIOUR):
-                self._objects.change(_ERROR_BEHAVIOUR, b"\0", only_from=bytes((STAYS,)))
+                self._have_it_stop()
             self._objects.quick_stop_on_lost_connection()
         except ObjectAccessError as error:
             raise NoWatchdogError(f"node {self._node} cannot monitor its master: {error}; {REMEDY}") from None
@@ -135,6 +135,20 @@ class ErrorControl:
                 f"node {self._node} would not stop by itself when this process dies: it has neither a heartbeat "
                 f"consumer (1016h) nor life guarding (100Ch); {REMEDY}"
             )
+
+    def _have_it_stop(self) -> None:
+        """Have a communication error lead to "stopped" where 1029h leads elsewhere: pre-operational may stop no axis.
+
+        Of a drive whose values are not known, 0 is taken where a communication error would change nothing.
+        """
+        device = self._description.device
+        known = {} if device is None else device.canopen.error_behaviour
+        stops = [raw for raw, state in sorted(known.items()) if state == "STOPPED"]
+        if not stops:
+            self._objects.change(_ERROR_BEHAVIOUR, b"\0", only_from=bytes((STAYS,)))
+            return
+        for raw in known.keys() - set(stops):
+            self._objects.change(_ERROR_BEHAVIOUR, bytes((stops[0],)), only_from=bytes((raw,)))
 
     def is_in_force(self) -> bool:
         """Return whether the drive, asked, still watches over this master.
