@@ -29,6 +29,8 @@ from rich.table import Table
 from benchmarks import bus, environments, gain_tuning, sweeps, training
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import device_names, find_device
+from drive_env.dictionary.position_scale import velocity_ratio
+from drive_env.drives.speeds import rpm_of_unit
 from drive_env.emulator.emulated_drives import MOST_MACHINES
 from drive_env.emulator.inertia_check import MisfitWarning
 from mechanics.loads import LOADS
@@ -58,6 +60,8 @@ def running_drives(
 ) -> EmulatedDrives:
     drives = EmulatedDrives(device, load, num_machines=machines, num_threads=threads)
     motion.enable(drives, mode="pv")
+    if isinstance(speed, str) and velocity_ratio(drives.device.roles) is not None:
+        speed = round(float(speed.split()[0]) / float(rpm_of_unit(drives)[0]))  # counts of a unit of the drive's own
     drives.write("Target velocity", speed)
     drives.advance(0.01)
     return drives
