@@ -17,7 +17,7 @@ from drive_env.trials.score import RobustScore
 from tuning.commands.cli import app
 from tuning.compare import comparison as compare_module
 from tuning.compare import tuners
-from tuning.compare.comparison import compare
+from tuning.compare.comparison import REPEATS, compare
 from tuning.compare.comparison_files import save
 from tuning.compare.rule_check import rule_passes
 from tuning.compare.suite import load_suite, open_group
@@ -80,7 +80,7 @@ def test_the_rule_with_the_true_inertia_is_the_yardstick():
 def test_the_score_is_hidden_j_of_the_machine():
     found = compare(RIGID, {"factory": find_tuner("factory")})
     gains, inertia = true_rule()
-    hidden = RobustScore("tmcm1636", "inertia", "qbl4208", 4)
+    hidden = RobustScore("tmcm1636", "inertia", "qbl4208", 4, repeats=REPEATS)
     with open_group(RIGID) as target:
         hidden.set_machines(target.drives.machine.parameters, target.supply)
         hidden.set_moves(plan_move(target.motor, inertia, target.drives.read((0x2058, 0)), np.full(4, np.inf)))

@@ -204,8 +204,8 @@ def test_a_fit_never_ends_worse_than_the_rule_in_force(monkeypatch):
 
 
 # --- the robust cost of machines --------------------------------------------------------------------------------------
-def bench(load, machines, **parameters):
-    score = RobustScore("tmcm1636", load, "qbl4208", machines, num_threads=1)
+def bench(load, machines, repeats=1, **parameters):
+    score = RobustScore("tmcm1636", load, "qbl4208", machines, num_threads=1, repeats=repeats)
     with EmulatedDrives(load=load, num_machines=machines, num_threads=1, parameters=parameters) as drives:
         axes = drives.load.num_axes
         score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
@@ -251,6 +251,30 @@ def test_variants_are_parallel_machines_with_their_parameters(two_mass):
     inertia = two_mass._drives.machine.parameters["load.inertia"].reshape(4, 5)
     assert stiffness[0] / stiffness[0, 0] == pytest.approx([1, 1, 1, 0.8, 1])
     assert inertia[0] / inertia[0, 0] == pytest.approx([1, 1.3, 0.7, 1, 1])
+
+
+def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
+    """E_0 is the mean of all runs, too: no run is measured by a scale of its own."""
+    repeated, alone, gains = bench("two_mass", 2, repeats=3), bench("two_mass", 2), times(1.4, 2)
+    seeds = repeated._drives._noise_seeds.reshape(2, 3, len(VARIANTS) - 1)
+    assert (seeds == seeds[:1, :, :1]).all(), "variants are compared under the same noise, and machines are"
+    assert seeds[0, 0, 0] == alone._drives._noise_seeds[0], "the first run is that of a score without repeats"
+    nominal, found = [], []
+    for seed in seeds[0, :, 0]:
+        alone._drives._noise_seeds[:] = seed
+        alone.set_reference(times(1.0, 2))
+        nominal.append(alone._reference)
+    for seed in seeds[0, :, 0]:
+        alone._drives._noise_seeds[:], alone._reference = seed, np.mean(nominal, axis=0)
+        found.append(alone.score(gains))
+    repeated.set_reference(times(1.0, 2))
+    scores = repeated.score(gains)
+    repeated.close(), alone.close()
+    assert len({one.robust_cost[0] for one in found}) == 3
+    np.testing.assert_allclose(scores.robust_cost, np.mean([one.robust_cost for one in found], axis=0))
+    np.testing.assert_allclose(scores.j, np.mean([one.j for one in found], axis=0))
+    np.testing.assert_allclose(scores.terms.settling, np.mean([one.terms.settling for one in found], axis=0))
+    np.testing.assert_allclose(scores.swing, np.max([one.swing for one in found], axis=0))
 
 
 def test_a_score_depends_on_machine_and_gains_alone(two_mass):

@@ -26,7 +26,7 @@ from drive_env.trials.open_loop import (
     with_run_current,
 )
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
-from drive_env.trials.score import RobustScore, Scores, robust_cost
+from drive_env.trials.score import RobustScore, Scores
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -39,7 +39,7 @@ class OpenLoopScore(RobustScore):
         return np.full(np.shape(filters), swing_period(self._drives.motor))
 
     def _run(self, gains: Integers) -> tuple[OpenLoopTerms, Floats, Floats]:  # type: ignore[override]
-        """Return the terms of every axis without E_d/E_0, E_d [rad s], no swing, (machines, variants, axes) each."""
+        """Return the terms of every axis without E_d/E_0, E_d [rad s], no swing, (machines, runs, axes) each."""
         drives, move, motor = self._drives, self._move, self._drives.motor
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -81,8 +81,4 @@ class OpenLoopScore(RobustScore):
 
     def _scores(self, terms: OpenLoopTerms, disturbance: Floats, swings: Floats) -> Scores:  # type: ignore[override]
         terms = terms._replace(disturbance=disturbance / self._reference[:, None])
-        j = open_loop_cost(terms)
-        worst = j.argmax(axis=-1)[..., None]
-        of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
-        j = j.max(axis=-1)
-        return Scores(robust_cost(j), j, of_worst, swings.max(axis=-1))  # type: ignore[arg-type]
+        return self._averaged(terms, open_loop_cost(terms), swings)

@@ -59,6 +59,7 @@ Mask = NDArray[np.bool_]
 TRIP = 30.0
 NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
 LOAD_SHARE = 0.3  # of the rated torque
+_NOISE = 7919.0  # between the seeds of the noise of runs that are repeated
 
 _INERTIA = ("body_inertia", "body_mass", "density")  # fields of load parameters that are the load's inertia
 _STIFFNESS = ("jnt_stiffness", "contact_stiffness")
@@ -125,8 +126,9 @@ def robust_cost(j: Floats) -> Floats:
 class Scores(NamedTuple):
     """Of every machine: the robust cost (num_machines,), and J and its terms, (num_machines, variants).
 
-    A machine with several axes is as good as its worst. swing: What a trial would measure, the largest RMS
-    increment of the current over 25 ms until the load step, over the rated one, likewise; J does not count it.
+    A machine with several axes is as good as its worst. Of several runs it is the mean of each. swing: What a trial
+    would measure, the largest RMS increment of the current over 25 ms until the load step, over the rated one,
+    likewise, and the largest of several runs; J does not count it.
     """
 
     robust_cost: Floats
@@ -141,6 +143,10 @@ class RobustScore:
     The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
     is none on this load (a stiffness where nothing is elastic) is left out.
 
+    With one run of each variant, what is scored is partly the noise: an axis that stands between two counts of its
+    encoder hunts in one run and rests in the next. `repeats` runs of each, every one with a noise of its own, and the
+    mean of their scores, say what gains are worth.
+
     Args:
         device: Name of the device.
         load: The load.
@@ -148,6 +154,7 @@ class RobustScore:
         num_machines: Machines to be scored.
         num_threads: Threads that run them; the number of cores by default.
         friction: Model of the load's friction, as in EmulatedDrives.
+        repeats: Runs of every variant of every machine, whose scores are averaged.
     """
 
     def __init__(
@@ -159,6 +166,7 @@ class RobustScore:
         *,
         num_threads: int | None = None,
         friction: str = "stribeck",
+        repeats: int = 1,
     ) -> None:
         from drive_env.devices import find_device
         from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -176,18 +184,24 @@ class RobustScore:
             and (variant.velocity_p == 1.0 or not is_open_loop)
             and (variant.run_current == 1.0 or is_open_loop)
         )
-        self.num_machines = num_machines
+        self.num_machines, self.repeats = num_machines, repeats
+        self._runs = repeats * len(self.variants)  # of a machine
         self._drives: EmulatedDrives = EmulatedDrives(
-            device, found, motor, num_machines * len(self.variants), identical=True, num_threads=num_threads,
+            device, found, motor, num_machines * self._runs, identical=True, num_threads=num_threads,
             friction=friction,
         )  # fmt: skip
+        if repeats > 1:  # the first noise is that of a score without repeats, and the variants of a run share it
+            seeds = np.tile(np.repeat(_NOISE * np.arange(1.0, repeats + 1.0), len(self.variants)), num_machines)
+            later = np.tile(np.repeat(np.arange(repeats) > 0, len(self.variants)), num_machines)
+            self._drives.machine.seed_noise(seeds, later)
         packed = one(found)
         lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()
         # Against the move, as a load that lies in the way does.
         self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(lever)
-        self._constant: Floats = np.zeros(num_machines * len(self.variants))
-        axes = (num_machines, len(self.variants), found.num_axes)
-        self._factors = np.tile(np.repeat([v.velocity_p * v.run_current for v in self.variants], axes[2]), axes[0])
+        self._constant: Floats = np.zeros(num_machines * self._runs)
+        axes = (num_machines, self._runs, found.num_axes)
+        factors = np.tile([v.velocity_p * v.run_current for v in self.variants], repeats)
+        self._factors = np.tile(np.repeat(factors, axes[2]), axes[0])
         self._axes = axes
         self._t_0 = np.ones(self._drives.num_axes)
         self._reference = np.ones((axes[0], axes[2]))  # E_0 [rad s]
@@ -196,11 +210,11 @@ class RobustScore:
 
     def set_machines(self, parameters: Mapping[str, Floats], supply: Floats, where: Mask | None = None) -> None:
         """Take the machines to score, shape (num_machines,): `drives.machine.parameters` and supply voltage."""
-        variants = len(self.variants)
+        variants = self._runs
         mask = np.ones(self.num_machines, bool) if where is None else where
         kind = {f"load.{p.name}": p.field for p in self._drives.load.parameters}
-        inertia = np.tile([v.inertia for v in self.variants], self.num_machines)
-        stiffness = np.tile([v.stiffness for v in self.variants], self.num_machines)
+        inertia = np.tile([v.inertia for v in self.variants], self.num_machines * self.repeats)
+        stiffness = np.tile([v.stiffness for v in self.variants], self.num_machines * self.repeats)
         # Its own drives know how their motors are wired; how they were wired elsewhere changes nothing of the gains.
         values = {name: np.repeat(value, variants) for name, value in parameters.items() if name not in WIRING}
         for name, field in kind.items():
@@ -217,12 +231,12 @@ class RobustScore:
 
     def set_constant_load(self, torque: Floats) -> None:
         """Set a constant load [N*m], (num_machines,), signed as `machine.load_torque`."""
-        self._constant = np.repeat(np.asarray(torque, float), len(self.variants))
+        self._constant = np.repeat(np.asarray(torque, float), self._runs)
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:
         """Take the move of every axis of the machines, shape (num_machines * axes,)."""
         lanes = np.ones(self.num_machines, bool) if where is None else where
-        each = np.repeat(lanes, len(self.variants) * self._axes[2])
+        each = np.repeat(lanes, self._runs * self._axes[2])
         old = self._move
         self._move = Move(
             np.where(each, self._spread(move.distance), old.distance),
@@ -236,7 +250,8 @@ class RobustScore:
         """Take these gains, those of the baseline rule, for E_0; return their scores, E_d/E_0 of the nominal one 1."""
         mask = np.ones(self.num_machines, bool) if where is None else where
         measured = self._run(gains)
-        self._reference = np.where(mask[:, None], measured[1][:, 0], self._reference)
+        nominal = measured[1][:, :: len(self.variants)].mean(axis=1)
+        self._reference = np.where(mask[:, None], nominal, self._reference)
         return self._scores(*measured)
 
     def score(self, gains: Integers) -> Scores:
@@ -253,13 +268,13 @@ class RobustScore:
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values of (num_machines * axes,) for the axes of all variants."""
-        machines, variants, axes = self._axes
+        machines, runs, axes = self._axes
         shape = (machines, 1, axes, *values.shape[1:])
-        full = (machines, variants, axes, *values.shape[1:])
+        full = (machines, runs, axes, *values.shape[1:])
         return np.broadcast_to(values.reshape(shape), full).reshape(-1, *values.shape[1:])
 
     def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, variants, axes) each."""
+        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, runs, axes) each."""
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -308,8 +323,15 @@ class RobustScore:
 
     def _scores(self, terms: Terms, disturbance: Floats, swings: Floats) -> Scores:
         terms = terms._replace(disturbance=disturbance / self._reference[:, None])
-        j = cost(terms)
+        return self._averaged(terms, cost(terms), swings)
+
+    def _averaged(self, terms: Any, j: Floats, swings: Floats) -> Scores:
+        """Return the scores by terms, J and swing of every axis in all runs, (machines, runs, axes)."""
         worst = j.argmax(axis=-1)[..., None]
         of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
-        j = j.max(axis=-1)
-        return Scores(robust_cost(j), j, of_worst, swings.max(axis=-1))
+        shape = (self.num_machines, self.repeats, len(self.variants))
+        j, swings = j.max(axis=-1).reshape(shape), swings.max(axis=-1).reshape(shape)
+        if self.repeats > 1:
+            tripped = of_worst.tripped.reshape(shape).any(axis=1)
+            of_worst = of_worst.each(lambda value: value.reshape(shape).mean(axis=1))._replace(tripped=tripped)
+        return Scores(robust_cost(j).mean(axis=1), j.mean(axis=1), of_worst, swings.max(axis=1))

@@ -44,6 +44,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
+# Runs of every machine and variant, each with a noise of its own, whose scores are averaged: with one run, the same
+# gains get a score that differs by 10 % on some machines, and the rule's count as worse than themselves on one of 13.
+REPEATS = 16
 WORSE = 1.05  # times the baseline rule's robust cost: from here on a tuning counts as worse
 
 
@@ -246,7 +249,10 @@ class Yardstick:
 
     def __init__(self, group: Sequence[SuiteMachine], num_threads: int | None) -> None:
         device, load, motor, friction = group[0].kind
-        self._score = RobustScore(device, load, motor, len(group), num_threads=num_threads, friction=friction)
+        self._score = RobustScore(
+            device, load, motor, len(group), num_threads=num_threads, friction=friction,
+            repeats=REPEATS,
+        )  # fmt: skip
         with open_group(group, num_threads) as target:
             drives = target.drives
             inertia = _true_inertia(target)
