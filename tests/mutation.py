@@ -13,9 +13,13 @@ import argparse
 import ast
 import csv
 import fnmatch
+import functools
+import importlib
 import os
 import random
+import select
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,11 +29,15 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, NoReturn
+
+import pytest
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
-LONGEST = 300.0  # s: tests that take longer hang, and have noticed
+LONGEST = 60.0  # s: tests that take longer hang, and have noticed
+LIBRARIES = ("numpy", "numba", "mujoco", "scipy.optimize", "scipy.signal", "canopen", "can", "gymnasium", "hypothesis")
+OURS = ("drive_env", "mechanics", "tuning", "agents", "research", "conftest")
 # Of these no test could see anything: what only a type checker or a reader of warnings sees, checks of lengths, caches.
 # Of truth values a product is an "and", a sum an "or".
 LEFT_OUT = ("RemoveDecorator", "NoOp", "Variable", "BitAnd_Mul", "BitOr_Add")
@@ -59,13 +67,18 @@ class Mutant(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a mutant: the line as it was and as it became, and whether a test noticed."""
+    """What became of a mutant: the line as it was and as it became, and which file of tests noticed, if one did."""
 
     mutant: Mutant
     before: str
     after: str
-    caught: bool
+    by: str | None
     seconds: float
+
+    @property
+    def caught(self) -> bool:
+        """Whether a test noticed."""
+        return self.by is not None
 
 
 def read_table(path: Path = HERE / "mutation.toml") -> list[Row]:
@@ -88,23 +101,37 @@ def files_of(table: Sequence[Row], wanted: str = "*") -> list[str]:
     return [file for file in there if fnmatch.fnmatch(file, wanted) and any(row.has(file) for row in table)]
 
 
-def mutants_of(file: str) -> Iterator[Mutant]:
-    """Yield the changes that a file may suffer."""
-    from cosmic_ray.ast import ast_nodes, get_ast
-    from cosmic_ray.plugins import get_operator, operator_names
+def mutants_of(file: str, line: int | None = None) -> Iterator[Mutant]:
+    """Yield the changes that a file may suffer, or one line of it."""
+    from cosmic_ray.plugins import get_operator
 
-    source = (REPOSITORY / file).read_text(encoding="utf-8")
-    lines, silent = source.splitlines(), _silent(source)
-    nodes = list(ast_nodes(get_ast(source)))
-    for name in operator_names():
-        if any(word in name for word in LEFT_OUT):
-            continue
+    text, nodes, silent = _read(file)
+    near = [node for node in nodes if line is None or node.start_pos[0] <= line <= node.end_pos[0]]
+    for name in _operator_names():
         operator = get_operator(name)()
+        if not any(line in (None, start[0]) for node in near for start, _ in operator.mutation_positions(node)):
+            continue
         places = [start for node in nodes for start, _ in operator.mutation_positions(node)]
         for occurrence, start in enumerate(places):
-            line = lines[start[0] - 1]
-            if not any(word in line for word in HARMLESS) and not any(a <= start < b for a, b in silent):
+            harmless = any(word in text[start[0] - 1] for word in HARMLESS)
+            if line in (None, start[0]) and not harmless and not any(a <= start < b for a, b in silent):
                 yield Mutant(file, start[0], name, occurrence)
+
+
+@functools.cache
+def _operator_names() -> tuple[str, ...]:
+    from cosmic_ray.plugins import operator_names
+
+    return tuple(name for name in operator_names() if not any(word in name for word in LEFT_OUT))
+
+
+@functools.cache
+def _read(file: str) -> tuple[list[str], list[Any], list[tuple[tuple[int, int], tuple[int, int]]]]:
+    """Return a file's lines, the nodes of its syntax tree, and where nothing is run."""
+    from cosmic_ray.ast import ast_nodes, get_ast
+
+    source = (REPOSITORY / file).read_text(encoding="utf-8")
+    return source.splitlines(), list(ast_nodes(get_ast(source))), _silent(source)
 
 
 def _silent(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -125,15 +152,46 @@ def _silent(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 
 
 def sample(files: Sequence[str], count: int, seed: int) -> list[Mutant]:
-    """Return so many mutants, each of another line: one that has many operators is drawn no more often for that."""
+    """Return so many mutants, each of another line: one that has many operators is drawn no more often for that.
+
+    Rooms take turns (`room_of`), so that a small sample has some of each. A line is drawn of all lines of its room, and
+    another one where there is nothing to change in it.
+    """
     chance = random.Random(seed)
-    by_line: dict[tuple[str, int], list[Mutant]] = {}
-    for file in files:
-        for mutant in mutants_of(file):
-            by_line.setdefault((file, mutant.line), []).append(mutant)
-    lines = chance.sample(sorted(by_line), min(count, len(by_line)))
-    chosen = (chance.sample(by_line[line], len(by_line[line])) for line in lines)
-    return [found for some in chosen if (found := next(filter(_is_python, some), None)) is not None]
+    rooms: dict[str, list[tuple[str, int]]] = {}
+    for file in sorted(files):
+        length = len((REPOSITORY / file).read_text(encoding="utf-8").splitlines())
+        rooms.setdefault(room_of(file), []).extend((file, line) for line in range(1, length + 1))
+    for lines in rooms.values():
+        chance.shuffle(lines)
+    waiting = sorted(rooms)
+    chance.shuffle(waiting)
+    found: list[Mutant] = []
+    while waiting and len(found) < count:
+        for room in list(waiting):
+            mutant = _next_mutant(rooms[room], chance)
+            if mutant is None:
+                waiting.remove(room)
+            elif len(found) < count:
+                found.append(mutant)
+    return found
+
+
+def room_of(file: str) -> str:
+    """Return a file's room: the folder in `drive_env/`, or a package, whose rooms are small, as a whole."""
+    package, *folders = file.split("/")[:-1]
+    return f"{package}/{folders[0]}" if package == "drive_env" and folders else package
+
+
+def _next_mutant(lines: list[tuple[str, int]], chance: random.Random) -> Mutant | None:
+    """Return a mutant of the next line that has one, and take the lines up to it away; None where none is left."""
+    while lines:
+        file, line = lines.pop()
+        of_line = list(mutants_of(file, line))
+        for mutant in chance.sample(of_line, len(of_line)):
+            if _is_python(mutant):
+                return mutant
+    return None
 
 
 def _is_python(mutant: Mutant) -> bool:
@@ -145,7 +203,7 @@ def _is_python(mutant: Mutant) -> bool:
         warnings.simplefilter("error", SyntaxWarning)
         try:
             compile(_changed((REPOSITORY / mutant.file).read_text(encoding="utf-8"), mutant), mutant.file, "exec")
-        except (SyntaxError, SyntaxWarning):
+        except (SyntaxError, SyntaxWarning, AttributeError):  # Cosmic Ray's own for "except package.SomeError"
             return False
     return True
 
@@ -174,17 +232,49 @@ class Copy:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(REPOSITORY / name, folder / name)
 
-    def passes(self, tests: Sequence[str]) -> bool:
-        """Return whether tests pass here; what hangs does not."""
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *(f"tests/{t}" for t in tests)]
-        environment = os.environ | {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    def first_failure(self, tests: Sequence[str]) -> str | None:
+        """Return which of some test files is the first that fails; None if all pass.
+
+        Those that hang, or cannot even begin, fail as a whole: the first of them is named.
+
+        They run in a child that has the libraries already: importing them takes longer than most of the tests.
+        """
+        for name in LIBRARIES:
+            importlib.import_module(name)
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
+            self._run_in_child(tests, writing)
+        os.close(writing)
+        with open(reading, encoding="utf-8") as pipe:
+            ended = select.select([pipe], [], [], LONGEST)[0]
+            if not ended:
+                os.kill(child, signal.SIGKILL)
+            said = pipe.read()
+        _, status = os.waitpid(child, 0)
+        if ended and os.waitstatus_to_exitcode(status) == 0:
+            return None
+        return next((name for name in tests if name in said), tests[0])
+
+    def _run_in_child(self, tests: Sequence[str], told: int) -> NoReturn:
+        """Run tests in this process, tell which file failed, and end it with their exit code."""
+        code = 1
         try:
-            done = subprocess.run(
-                command, cwd=self.folder, env=environment, capture_output=True, timeout=LONGEST, check=False
-            )
-        except subprocess.TimeoutExpired:
-            return False
-        return done.returncode == 0
+            os.chdir(self.folder)
+            os.environ |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
+            sys.dont_write_bytecode = True
+            # What is changed must be imported anew, and from the copy.
+            for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
+                del sys.modules[name]
+            elsewhere = [p for p in sys.path if Path(p or ".").resolve() not in (HERE, REPOSITORY)]
+            sys.path[:] = [str(self.folder), *elsewhere]
+            with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
+                os.dup2(nowhere.fileno(), 1)
+                os.dup2(nowhere.fileno(), 2)
+                arguments = ["-x", "-q", "-p", "no:cacheprovider", *(f"tests/{t}" for t in tests)]
+                code = int(pytest.main(arguments, plugins=[_Teller(told)]))
+        finally:
+            os._exit(code)
 
     def try_(self, mutant: Mutant, tests: Sequence[str]) -> Outcome:
         """Return whether tests notice a change; the file is as it was afterwards."""
@@ -195,10 +285,27 @@ class Copy:
         began = time.monotonic()
         path.write_text(changed, encoding="utf-8")
         try:
-            caught = not self.passes(tests)
+            by = self.first_failure(tests)
         finally:
             path.write_text(source, encoding="utf-8")
-        return Outcome(mutant, before.strip(), after.strip(), caught, time.monotonic() - began)
+        return Outcome(mutant, before.strip(), after.strip(), by, time.monotonic() - began)
+
+
+class _Teller:
+    """Plugin of pytest that writes where a test failed, or a file could not be read, to a file descriptor."""
+
+    def __init__(self, told: int) -> None:
+        self._told = told
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Tell of a test that failed."""
+        if report.failed:
+            os.write(self._told, report.nodeid.encode())
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Tell of a file that could not be read."""
+        if report.failed:
+            os.write(self._told, report.nodeid.encode())
 
 
 def run(mutants: Sequence[Mutant], table: Sequence[Row]) -> Iterator[Outcome]:
@@ -212,11 +319,12 @@ def run(mutants: Sequence[Mutant], table: Sequence[Row]) -> Iterator[Outcome]:
         sound: set[str] = set()
         for mutant in sorted(mutants):
             tests = tests_of(mutant.file, table)
-            for test in tests:
-                if test not in sound and not copy.passes([test]):
-                    raise ValueError(f"tests/{test} fails as the sources are; mend it first")
-                sound.add(test)
-            yield copy.try_(mutant, tests)
+            outcome = copy.try_(mutant, tests)
+            if outcome.by is not None and outcome.by not in sound:
+                if copy.first_failure([outcome.by]) is not None:
+                    raise ValueError(f"tests/{outcome.by} fails as the sources are; mend it first")
+                sound.add(outcome.by)
+            yield outcome
 
 
 def main() -> None:
