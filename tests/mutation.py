@@ -17,6 +17,7 @@ import functools
 import importlib
 import os
 import random
+import resource
 import select
 import shutil
 import signal
@@ -35,7 +36,8 @@ import pytest
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
-LONGEST = 60.0  # s: tests that take longer hang, and have noticed
+LONGEST = 60  # s of work: tests that take longer hang, and have noticed
+PATIENCE = 600.0  # s until tests that wait, and do nothing, hang
 LIBRARIES = ("numpy", "numba", "mujoco", "scipy.optimize", "scipy.signal", "canopen", "can", "gymnasium", "hypothesis")
 OURS = ("drive_env", "mechanics", "tuning", "agents", "research", "conftest")
 # Of these no test could see anything: what only a type checker or a reader of warnings sees, checks of lengths, caches.
@@ -230,7 +232,10 @@ class Copy:
         for name in filter(None, listed.split("\0")):
             if (REPOSITORY / name).is_file():
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(REPOSITORY / name, folder / name)
+                shutil.copy2(REPOSITORY / name, folder / name)
+        # Compiled once for all: Python takes what was compiled of a file with this time and length.
+        for there in filter(Path.is_dir, {(REPOSITORY / name).parent / "__pycache__" for name in listed.split("\0")}):
+            shutil.copytree(there, folder / there.relative_to(REPOSITORY))
 
     def first_failure(self, tests: Sequence[str]) -> str | None:
         """Return which of some test files is the first that fails; None if all pass.
@@ -247,7 +252,7 @@ class Copy:
             self._run_in_child(tests, writing)
         os.close(writing)
         with open(reading, encoding="utf-8") as pipe:
-            ended = select.select([pipe], [], [], LONGEST)[0]
+            ended = select.select([pipe], [], [], PATIENCE)[0]
             if not ended:
                 os.kill(child, signal.SIGKILL)
             said = pipe.read()
@@ -260,6 +265,9 @@ class Copy:
         """Run tests in this process, tell which file failed, and end it with their exit code."""
         code = 1
         try:
+            # Other processes may need the computer, too: what hangs is told by what it has done.
+            done = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
+            resource.setrlimit(resource.RLIMIT_CPU, (round(done) + LONGEST, resource.RLIM_INFINITY))
             os.chdir(self.folder)
             os.environ |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
             sys.dont_write_bytecode = True
@@ -283,6 +291,8 @@ class Copy:
         changed = _changed(source, mutant)
         before, after = next((a, b) for a, b in zip(source.splitlines(), changed.splitlines(), strict=False) if a != b)
         began = time.monotonic()
+        for compiled in path.parent.glob(f"__pycache__/{path.stem}.*"):
+            compiled.unlink()
         path.write_text(changed, encoding="utf-8")
         try:
             by = self.first_failure(tests)
