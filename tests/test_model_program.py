@@ -56,7 +56,7 @@ def test_each_trouble_is_counted_and_none_comes_where_none_is_left(kind, taken, 
 
 
 def test_what_happens_by_itself_takes_no_trouble():
-    for at in (At.PROGRAM, At.ARM, At.SEND, At.LEAVING):
+    for at in (At.PROGRAM, At.ARM, At.SEND):
         made, found = steps(at=at, rows=(ENABLE,), drive=READY, troubles=2)
         for step in found:
             if step.kind in ("library", "stall", "leave", "play", "command") or step.kind.startswith("write"):
