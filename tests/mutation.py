@@ -13,14 +13,9 @@ import argparse
 import ast
 import csv
 import fnmatch
-import functools
-import importlib
 import os
 import random
-import resource
-import select
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -30,16 +25,11 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
-
-import pytest
+from typing import NamedTuple
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
-LONGEST = 60  # s of work: tests that take longer hang, and have noticed
-PATIENCE = 600.0  # s until tests that wait, and do nothing, hang
-LIBRARIES = ("numpy", "numba", "mujoco", "scipy.optimize", "scipy.signal", "canopen", "can", "gymnasium", "hypothesis")
-OURS = ("drive_env", "mechanics", "tuning", "agents", "research", "conftest")
+LONGEST = 300.0  # s: tests that take longer hang, and have noticed
 # Of these no test could see anything: what only a type checker or a reader of warnings sees, checks of lengths, caches.
 # Of truth values a product is an "and", a sum an "or".
 LEFT_OUT = ("RemoveDecorator", "NoOp", "Variable", "BitAnd_Mul", "BitOr_Add")
@@ -69,18 +59,13 @@ class Mutant(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a mutant: the line as it was and as it became, and which file of tests noticed, if one did."""
+    """What became of a mutant: the line as it was and as it became, and whether a test noticed."""
 
     mutant: Mutant
     before: str
     after: str
-    by: str | None
+    caught: bool
     seconds: float
-
-    @property
-    def caught(self) -> bool:
-        """Whether a test noticed."""
-        return self.by is not None
 
 
 def read_table(path: Path = HERE / "mutation.toml") -> list[Row]:
@@ -103,37 +88,23 @@ def files_of(table: Sequence[Row], wanted: str = "*") -> list[str]:
     return [file for file in there if fnmatch.fnmatch(file, wanted) and any(row.has(file) for row in table)]
 
 
-def mutants_of(file: str, line: int | None = None) -> Iterator[Mutant]:
-    """Yield the changes that a file may suffer, or one line of it."""
-    from cosmic_ray.plugins import get_operator
-
-    text, nodes, silent = _read(file)
-    near = [node for node in nodes if line is None or node.start_pos[0] <= line <= node.end_pos[0]]
-    for name in _operator_names():
-        operator = get_operator(name)()
-        if not any(line in (None, start[0]) for node in near for start, _ in operator.mutation_positions(node)):
-            continue
-        places = [start for node in nodes for start, _ in operator.mutation_positions(node)]
-        for occurrence, start in enumerate(places):
-            harmless = any(word in text[start[0] - 1] for word in HARMLESS)
-            if line in (None, start[0]) and not harmless and not any(a <= start < b for a, b in silent):
-                yield Mutant(file, start[0], name, occurrence)
-
-
-@functools.cache
-def _operator_names() -> tuple[str, ...]:
-    from cosmic_ray.plugins import operator_names
-
-    return tuple(name for name in operator_names() if not any(word in name for word in LEFT_OUT))
-
-
-@functools.cache
-def _read(file: str) -> tuple[list[str], list[Any], list[tuple[tuple[int, int], tuple[int, int]]]]:
-    """Return a file's lines, the nodes of its syntax tree, and where nothing is run."""
+def mutants_of(file: str) -> Iterator[Mutant]:
+    """Yield the changes that a file may suffer."""
     from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.plugins import get_operator, operator_names
 
     source = (REPOSITORY / file).read_text(encoding="utf-8")
-    return source.splitlines(), list(ast_nodes(get_ast(source))), _silent(source)
+    lines, silent = source.splitlines(), _silent(source)
+    nodes = list(ast_nodes(get_ast(source)))
+    for name in operator_names():
+        if any(word in name for word in LEFT_OUT):
+            continue
+        operator = get_operator(name)()
+        places = [start for node in nodes for start, _ in operator.mutation_positions(node)]
+        for occurrence, start in enumerate(places):
+            line = lines[start[0] - 1]
+            if not any(word in line for word in HARMLESS) and not any(a <= start < b for a, b in silent):
+                yield Mutant(file, start[0], name, occurrence)
 
 
 def _silent(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -154,46 +125,15 @@ def _silent(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 
 
 def sample(files: Sequence[str], count: int, seed: int) -> list[Mutant]:
-    """Return so many mutants, each of another line: one that has many operators is drawn no more often for that.
-
-    Rooms take turns (`room_of`), so that a small sample has some of each. A line is drawn of all lines of its room, and
-    another one where there is nothing to change in it.
-    """
+    """Return so many mutants, each of another line: one that has many operators is drawn no more often for that."""
     chance = random.Random(seed)
-    rooms: dict[str, list[tuple[str, int]]] = {}
-    for file in sorted(files):
-        length = len((REPOSITORY / file).read_text(encoding="utf-8").splitlines())
-        rooms.setdefault(room_of(file), []).extend((file, line) for line in range(1, length + 1))
-    for lines in rooms.values():
-        chance.shuffle(lines)
-    waiting = sorted(rooms)
-    chance.shuffle(waiting)
-    found: list[Mutant] = []
-    while waiting and len(found) < count:
-        for room in list(waiting):
-            mutant = _next_mutant(rooms[room], chance)
-            if mutant is None:
-                waiting.remove(room)
-            elif len(found) < count:
-                found.append(mutant)
-    return found
-
-
-def room_of(file: str) -> str:
-    """Return a file's room: the folder in `drive_env/`, or a package, whose rooms are small, as a whole."""
-    package, *folders = file.split("/")[:-1]
-    return f"{package}/{folders[0]}" if package == "drive_env" and folders else package
-
-
-def _next_mutant(lines: list[tuple[str, int]], chance: random.Random) -> Mutant | None:
-    """Return a mutant of the next line that has one, and take the lines up to it away; None where none is left."""
-    while lines:
-        file, line = lines.pop()
-        of_line = list(mutants_of(file, line))
-        for mutant in chance.sample(of_line, len(of_line)):
-            if _is_python(mutant):
-                return mutant
-    return None
+    by_line: dict[tuple[str, int], list[Mutant]] = {}
+    for file in files:
+        for mutant in mutants_of(file):
+            by_line.setdefault((file, mutant.line), []).append(mutant)
+    lines = chance.sample(sorted(by_line), min(count, len(by_line)))
+    chosen = (chance.sample(by_line[line], len(by_line[line])) for line in lines)
+    return [found for some in chosen if (found := next(filter(_is_python, some), None)) is not None]
 
 
 def _is_python(mutant: Mutant) -> bool:
@@ -205,7 +145,7 @@ def _is_python(mutant: Mutant) -> bool:
         warnings.simplefilter("error", SyntaxWarning)
         try:
             compile(_changed((REPOSITORY / mutant.file).read_text(encoding="utf-8"), mutant), mutant.file, "exec")
-        except (SyntaxError, SyntaxWarning, AttributeError):  # Cosmic Ray's own for "except package.SomeError"
+        except (SyntaxError, SyntaxWarning):
             return False
     return True
 
@@ -232,57 +172,19 @@ class Copy:
         for name in filter(None, listed.split("\0")):
             if (REPOSITORY / name).is_file():
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(REPOSITORY / name, folder / name)
-        # Compiled once for all: Python takes what was compiled of a file with this time and length.
-        for there in filter(Path.is_dir, {(REPOSITORY / name).parent / "__pycache__" for name in listed.split("\0")}):
-            shutil.copytree(there, folder / there.relative_to(REPOSITORY))
+                shutil.copyfile(REPOSITORY / name, folder / name)
 
-    def first_failure(self, tests: Sequence[str]) -> str | None:
-        """Return which of some test files is the first that fails; None if all pass.
-
-        Those that hang, or cannot even begin, fail as a whole: the first of them is named.
-
-        They run in a child that has the libraries already: importing them takes longer than most of the tests.
-        """
-        for name in LIBRARIES:
-            importlib.import_module(name)
-        reading, writing = os.pipe()
-        child = os.fork()
-        if child == 0:
-            self._run_in_child(tests, writing)
-        os.close(writing)
-        with open(reading, encoding="utf-8") as pipe:
-            ended = select.select([pipe], [], [], PATIENCE)[0]
-            if not ended:
-                os.kill(child, signal.SIGKILL)
-            said = pipe.read()
-        _, status = os.waitpid(child, 0)
-        if ended and os.waitstatus_to_exitcode(status) == 0:
-            return None
-        return next((name for name in tests if name in said), tests[0])
-
-    def _run_in_child(self, tests: Sequence[str], told: int) -> NoReturn:
-        """Run tests in this process, tell which file failed, and end it with their exit code."""
-        code = 1
+    def passes(self, tests: Sequence[str]) -> bool:
+        """Return whether tests pass here; what hangs does not."""
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *(f"tests/{t}" for t in tests)]
+        environment = os.environ | {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
         try:
-            # Other processes may need the computer, too: what hangs is told by what it has done.
-            done = sum(resource.getrusage(resource.RUSAGE_SELF)[:2])
-            resource.setrlimit(resource.RLIMIT_CPU, (round(done) + LONGEST, resource.RLIM_INFINITY))
-            os.chdir(self.folder)
-            os.environ |= {"PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
-            sys.dont_write_bytecode = True
-            # What is changed must be imported anew, and from the copy.
-            for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
-                del sys.modules[name]
-            elsewhere = [p for p in sys.path if Path(p or ".").resolve() not in (HERE, REPOSITORY)]
-            sys.path[:] = [str(self.folder), *elsewhere]
-            with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
-                os.dup2(nowhere.fileno(), 1)
-                os.dup2(nowhere.fileno(), 2)
-                arguments = ["-x", "-q", "-p", "no:cacheprovider", *(f"tests/{t}" for t in tests)]
-                code = int(pytest.main(arguments, plugins=[_Teller(told)]))
-        finally:
-            os._exit(code)
+            done = subprocess.run(
+                command, cwd=self.folder, env=environment, capture_output=True, timeout=LONGEST, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return False
+        return done.returncode == 0
 
     def try_(self, mutant: Mutant, tests: Sequence[str]) -> Outcome:
         """Return whether tests notice a change; the file is as it was afterwards."""
@@ -291,31 +193,12 @@ class Copy:
         changed = _changed(source, mutant)
         before, after = next((a, b) for a, b in zip(source.splitlines(), changed.splitlines(), strict=False) if a != b)
         began = time.monotonic()
-        for compiled in path.parent.glob(f"__pycache__/{path.stem}.*"):
-            compiled.unlink()
         path.write_text(changed, encoding="utf-8")
         try:
-            by = self.first_failure(tests)
+            caught = not self.passes(tests)
         finally:
             path.write_text(source, encoding="utf-8")
-        return Outcome(mutant, before.strip(), after.strip(), by, time.monotonic() - began)
-
-
-class _Teller:
-    """Plugin of pytest that writes where a test failed, or a file could not be read, to a file descriptor."""
-
-    def __init__(self, told: int) -> None:
-        self._told = told
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Tell of a test that failed."""
-        if report.failed:
-            os.write(self._told, report.nodeid.encode())
-
-    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """Tell of a file that could not be read."""
-        if report.failed:
-            os.write(self._told, report.nodeid.encode())
+        return Outcome(mutant, before.strip(), after.strip(), caught, time.monotonic() - began)
 
 
 def run(mutants: Sequence[Mutant], table: Sequence[Row]) -> Iterator[Outcome]:
@@ -329,12 +212,11 @@ def run(mutants: Sequence[Mutant], table: Sequence[Row]) -> Iterator[Outcome]:
         sound: set[str] = set()
         for mutant in sorted(mutants):
             tests = tests_of(mutant.file, table)
-            outcome = copy.try_(mutant, tests)
-            if outcome.by is not None and outcome.by not in sound:
-                if copy.first_failure([outcome.by]) is not None:
-                    raise ValueError(f"tests/{outcome.by} fails as the sources are; mend it first")
-                sound.add(outcome.by)
-            yield outcome
+            for test in tests:
+                if test not in sound and not copy.passes([test]):
+                    raise ValueError(f"tests/{test} fails as the sources are; mend it first")
+                sound.add(test)
+            yield copy.try_(mutant, tests)
 
 
 def main() -> None:

@@ -220,7 +220,10 @@ def test_every_node_is_asked_who_it_is():
 @pytest.mark.parametrize(
     ("key", "said"),
     [
-        ((0x1018, 1), r"node 9 is not a tmcm1636: its vendor \(1018h:01 .*\) is 7B, and the EDS says 286h; give its own"),
+        (
+            (0x1018, 1),
+            r"node 9 is not a tmcm1636: its vendor \(1018h:01 .*\) is 7B, and the EDS says 286h; give its own",
+        ),
         ((0x1018, 2), r"node 9 is not a tmcm1636: its product \(1018h:02 .*\) is 7B, and the EDS says"),
     ],
 )

@@ -185,4 +185,4 @@ def test_a_node_that_could_not_be_proved_off_is_asked_once_more():
 
 def test_the_states_that_count_as_off():
     assert State.READY_TO_SWITCH_ON not in DISABLED and State.SWITCHED_ON not in DISABLED
-    assert NO_POWER - DISABLED == {State.READY_TO_SWITCH_ON, State.SWITCHED_ON}
+    assert {State.READY_TO_SWITCH_ON, State.SWITCHED_ON} == NO_POWER - DISABLED
