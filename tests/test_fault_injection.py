@@ -1,6 +1,6 @@
 """A fault at frame k of a session: the rotor ends at rest, disabled, inside its travel plus the stopping distance.
 
-Every k in the slow run (with FAULT_STRIDE=20 every twentieth), a sample in every run.
+Every k in the slow run (with FAULT_STRIDE=40 every fortieth), a sample in every run.
 The verdict is the emulator's inside alone (tests/fault_injection.py).
 """
 
