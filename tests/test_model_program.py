@@ -1,0 +1,188 @@
+"""What the safety model lets the program's thread do next, step by step, and how many troubles each step takes."""
+
+from __future__ import annotations
+
+import pytest
+
+from drive_env.canopen.nmt import NmtState
+from drive_env.cia402 import State
+from drive_env.safety.model.drive import Drive
+from drive_env.safety.model.program import PLAYS, WORDS, program_steps
+from drive_env.safety.model.rules import (
+    DISABLED,
+    ENABLE,
+    NO_POWER,
+    OURS,
+    OWN_ID,
+    SET_POINT,
+    SHUTDOWN,
+    TODAY,
+    Assumptions,
+)
+from drive_env.safety.model.situation import At, Hand, Held, Situation, StopStage
+
+LIVE = Drive(fsa=State.OPERATION_ENABLED, turns=True, nmt=NmtState.OPERATIONAL)
+READY = Drive(fsa=State.READY_TO_SWITCH_ON, nmt=NmtState.OPERATIONAL)
+
+
+def steps(rules=OURS, keeps_order=True, **situation):
+    made = Situation(**situation)
+    return made, list(program_steps(made, rules, Assumptions(keeps_order=keeps_order)))
+
+
+def of(kind, found):
+    """Return what is after the one step of a kind."""
+    (step,) = [step for step in found if step.kind == kind]
+    return step.after
+
+
+@pytest.mark.parametrize(
+    ("kind", "taken", "situation"),
+    [
+        ("NMT start lost", 1, {"at": At.ARM, "rows": (ENABLE,)}),
+        ("RPDO lost", 1, {"at": At.SEND, "rows": (ENABLE,), "by_pdo": True, "drive": READY}),
+        ("RPDO held", 1, {"at": At.SEND, "rows": (ENABLE,), "by_pdo": True, "drive": READY}),
+        ("SYNC lost", 1, {"at": At.SEND, "rows": (ENABLE,), "by_pdo": True, "drive": READY}),
+        ("TPDO lost", 1, {"at": At.SEND, "rows": (ENABLE,), "by_pdo": True, "drive": READY}),
+        ("heartbeat lost", OURS.beats, {"at": At.ARM, "drive": READY._replace(consumer=OWN_ID)}),
+    ],
+)
+def test_each_trouble_is_counted_and_none_comes_where_none_is_left(kind, taken, situation):
+    for troubles in (taken, taken + 1):
+        _, found = steps(troubles=troubles, **situation)
+        assert {step.after.troubles for step in found if step.kind == kind} == {troubles - taken}
+    _, found = steps(troubles=taken - 1, **situation)
+    assert kind not in {step.kind for step in found}
+
+
+def test_what_happens_by_itself_takes_no_trouble():
+    for at in (At.PROGRAM, At.ARM, At.SEND):
+        made, found = steps(at=at, rows=(ENABLE,), drive=READY, troubles=2)
+        for step in found:
+            if step.kind in ("library", "stall", "leave", "play", "command") or step.kind.startswith("write"):
+                assert step.after.troubles == made.troubles, step
+
+
+def test_the_program_may_write_play_hang_and_end():
+    _, found = steps()
+    kinds = [step.kind for step in found]
+    assert kinds == [*(f"write {word:02X}h" for word in WORDS), *["play"] * len(PLAYS), "stall", "leave"]
+    assert of("stall", found).at is At.STALLED and of("leave", found).at is At.LEAVING
+    _, found = steps(drive=LIVE)
+    assert of("command", found).rows == (SET_POINT,)
+
+
+def test_what_leads_to_motion_is_armed_for_and_counts_as_live():
+    _, found = steps()
+    for word in WORDS:
+        after = of(f"write {word:02X}h", found)
+        arms = word in OURS.arms_for
+        assert after.rows == (word,) and not after.by_pdo
+        assert after.at is (At.ARM if arms else At.SEND) and after.believed == arms
+    plays = [step.after for step in found if step.kind == "play"]
+    assert [after.rows for after in plays] == list(PLAYS) and all(after.by_pdo for after in plays)
+    _, found = steps(TODAY, armed=True)
+    assert of("write 0Fh", found).at is At.ARMED and not of("write 0Fh", found).believed
+    _, found = steps(TODAY)
+    assert of("write 0Fh", found).at is At.ARM and of("write 06h", found).at is At.SEND
+
+
+@pytest.mark.parametrize("stage", StopStage)
+def test_while_a_stop_is_under_way_or_failed_calls_are_refused(stage):
+    _, found = steps(stop=stage, drive=LIVE)
+    may = stage in (StopStage.NONE, StopStage.PROVEN)
+    assert ("write 0Fh" in {step.kind for step in found}) == may
+    if may:
+        assert of("write 0Fh", found).stop is StopStage.NONE, "another start ends the stop"
+        assert of("command", found).stop is stage, "a set-point does not"
+
+
+def test_arming_starts_the_node_writes_who_is_watched_and_beats():
+    _, found = steps(at=At.ARM, rows=(ENABLE,), drive=READY._replace(nmt=NmtState.PRE_OPERATIONAL))
+    (step,) = found
+    assert step.text == "the library sends NMT start; it writes 126 to 1016h; it sends 3 heartbeats"
+    assert step.after.at is At.ARMED and step.after.armed and not step.after.interfered
+    assert step.after.drive == READY._replace(consumer=OWN_ID, heard=True)
+    _, (step,) = steps(at=At.ARM, drive=READY._replace(consumer=OWN_ID))
+    assert step.text == "the library sends NMT start; it finds 126 in 1016h; it sends 3 heartbeats"
+    assert step.after.drive.heard
+
+
+def test_arming_is_refused_where_it_cannot_be_seen_to_have_worked():
+    _, (step,) = steps(at=At.ARM, rows=(ENABLE,), silent=True)
+    assert step.text.endswith("it refuses, since no TPDO comes") and step.after.at is At.PROGRAM
+    _, (step,) = steps(at=At.ARM, rows=(ENABLE,), twin=OWN_ID)
+    assert step.text.endswith("it hears its own node-ID from another, and refuses") and step.after.rows == ()
+    _, (step,) = steps(at=At.ARM, rows=(ENABLE,), cancelled=True, drive=READY)
+    assert step.text == "arming is broken off, since the drives are being stopped"
+    assert step.after == Situation(drive=READY)
+    _, (step,) = steps(TODAY, at=At.ARM, lockstep=True)
+    assert step.text.endswith("it leaves 1016h, since the pace is lockstep") and step.after.drive.consumer == 0
+    _, found = steps(at=At.ARM, rows=(ENABLE,), troubles=1)
+    assert of("NMT start lost", found).at is At.PROGRAM
+    _, found = steps(TODAY, at=At.ARM, rows=(ENABLE,), troubles=1)
+    assert of("NMT start lost", found).at is At.ARMED, "TODAY sends it and does not look"
+
+
+def test_a_play_sends_row_by_row_and_returns_after_the_last():
+    _, found = steps(at=At.SEND, rows=(SHUTDOWN, ENABLE), by_pdo=True, drive=READY)
+    (step,) = found
+    assert step.text == "6040h = 06h is sent in an RPDO, SYNC follows" and step.after.rows == (ENABLE,)
+    _, (step,) = steps(at=At.SEND, rows=(), by_pdo=True, drive=READY, cancelled=True)
+    assert step.after == Situation(drive=READY)
+    _, (step,) = steps(TODAY, at=At.SEND, rows=(), by_pdo=True)
+    assert step.after.believed
+
+
+def test_what_becomes_of_a_row():
+    on = READY._replace(fsa=State.SWITCHED_ON)
+    situation = {"at": At.SEND, "rows": (ENABLE,), "by_pdo": True, "drive": on}
+    _, found = steps(troubles=1, **situation)
+    sent, lost, held = (of(kind, found) for kind in ("library", "RPDO lost", "RPDO held"))
+    assert sent.drive.live and sent.hand is Hand.OURS and sent.rows == ()
+    assert not lost.drive.live and lost.held == () and lost.rows == ()
+    assert not held.drive.live and held.held == (Held("rpdo", ENABLE),) and held.rows == ()
+    unsynced, unheard = of("SYNC lost", found), of("TPDO lost", found)
+    assert unsynced.drive.latched == ENABLE and unsynced.at is At.PROGRAM
+    assert unheard.drive.live and unheard.at is At.PROGRAM
+    _, (step,) = steps(**situation | {"silent": True})
+    assert step.text.endswith("no TPDO comes: the node is silent") and step.after.drive.live
+    _, (step,) = steps(**situation | {"drive": on._replace(nmt=NmtState.PRE_OPERATIONAL), "troubles": 1})
+    assert step.text.endswith("no TPDO comes: the node is not operational") and not step.after.drive.live
+
+
+def test_a_set_point_for_a_live_axis_is_ours():
+    _, (step,) = steps(at=At.SEND, rows=(SET_POINT,), drive=LIVE, hand=Hand.OTHER)
+    assert step.after.hand is Hand.OURS and step.after.at is At.PROGRAM
+    _, (step,) = steps(at=At.SEND, rows=(SET_POINT,), drive=READY)
+    assert step.after.hand is Hand.NOBODY
+
+
+def test_leaving_stops_what_was_armed_and_proves_it_off():
+    _, (step,) = steps(at=At.LEAVING, armed=True, believed=True, drive=LIVE)
+    assert step.after.stop is StopStage.QUICK
+    _, (step,) = steps(at=At.LEAVING, armed=True)
+    assert step.after.stop is StopStage.PROVE and step.after.acknowledged
+    _, (step,) = steps(at=At.LEAVING)
+    assert step.text == "the library closes" and step.after.at is At.CLOSED
+    _, (step,) = steps(at=At.LEAVING, armed=True, stop=StopStage.PROVEN)
+    assert step.after.at is At.RESTORE
+    for stage in (StopStage.QUICK, StopStage.RAMP, StopStage.CUT, StopStage.PROVE):
+        assert steps(at=At.LEAVING, armed=True, stop=stage)[1] == []
+
+
+def test_a_node_that_could_not_be_proved_off_is_asked_once_more():
+    _, found = steps(at=At.LEAVING, armed=True, stop=StopStage.UNPROVEN, drive=READY._replace(nmt=NmtState.STOPPED))
+    closed, asked = (step.after for step in found)
+    assert closed.at is At.CLOSED
+    assert asked.stop is StopStage.PROVEN and asked.drive.nmt is NmtState.OPERATIONAL
+    assert asked.drive.fsa is State.SWITCH_ON_DISABLED
+    _, found = steps(at=At.LEAVING, armed=True, stop=StopStage.UNPROVEN, drive=LIVE._replace(consumer=OWN_ID))
+    assert found[1].text.endswith("sees a live axis, and closes") and found[1].after.drive.heard
+    _, found = steps(at=At.LEAVING, armed=True, stop=StopStage.UNPROVEN, silent=True)
+    assert found[1].text.endswith("hears nothing, and closes") and found[1].after.at is At.CLOSED
+
+
+def test_the_states_that_count_as_off():
+    assert State.READY_TO_SWITCH_ON not in DISABLED and State.SWITCHED_ON not in DISABLED
+    assert {State.READY_TO_SWITCH_ON, State.SWITCHED_ON} == NO_POWER - DISABLED
