@@ -13,13 +13,21 @@ from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
 
 
-@pytest.mark.parametrize(("device", "name", "within"), [
-    ("tmcm3313", "qsh4218_51", 0.12),
-    ("tmcm3313", "qsh6018_86", 0.12),
-    ("tmcm6212", "qsh6018_86", 0.3),  # its ramps end at 3 full steps in 6 ms, as long as a light rotor swings
-])  # fmt: skip
-@pytest.mark.parametrize("rotors", [1.2, 2.5, 6.0, 12.0, 30.0])
-def test_the_identified_inertia_is_the_machines(device, name, within, rotors):
+WITHIN = {
+    ("tmcm3313", "qsh4218_51"): 0.12,
+    ("tmcm3313", "qsh6018_86"): 0.12,
+    ("tmcm6212", "qsh6018_86"): 0.3,  # its ramps end at 3 full steps in 6 ms, as long as a light rotor swings
+}
+ROTORS = (1.2, 2.5, 6.0, 12.0, 30.0)
+BRIEF = [("tmcm3313", "qsh4218_51", 2.5), ("tmcm3313", "qsh6018_86", 20.0), ("tmcm6212", "qsh6018_86", 6.0)]
+ALL = [(*which, rotors) for which in WITHIN for rotors in ROTORS if (*which, rotors) not in BRIEF]
+
+
+@pytest.mark.parametrize(
+    ("device", "name", "rotors"), BRIEF + [pytest.param(*row, marks=pytest.mark.slow) for row in ALL]
+)
+def test_the_identified_inertia_is_the_machines(device, name, rotors):
+    within = WITHIN[device, name]
     motor = MOTORS[name]
     parameters = {"load.inertia": (rotors - 1.0) * motor.inertia}
     with emulated(device, "inertia", name, num_threads=1, parameters=parameters) as target:

@@ -40,7 +40,7 @@ from drive_env.trials.positioning import (
     wrapped,
     write_profile,
 )
-from drive_env.trials.rotor_swing import EXPLAINED, LENGTH, Swing, inertia_of_swings
+from drive_env.trials.rotor_swing import EXPLAINED, LENGTH, FreeSwing, inertia_of_swings
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -59,10 +59,11 @@ LEAST_WAY = 0.25  # of a move that an encoder must show
 # The swing by which the inertia of a light load is found: its step and how far apart its two places are [full steps],
 # the time until the one before has died away [s], speed and ramps in full steps, as far as a drive takes them.
 SWING_STEP, SWING_APART, SWING_REST = 0.25, 0.5, 0.1
+SWING_ROOM = 1.5  # full steps of travel, less than which leave no room to swing and to overshoot
 STEEP = {cia402.PROFILE_VELOCITY: 1e3, cia402.PROFILE_ACCELERATION: 2e7, cia402.PROFILE_DECELERATION: 2e7}
 _STEEPNESS = tuple(STEEP)
 HIGHEST_SHARE = 0.95  # of the highest value that a drive takes
-RAMP_ANGLE = 0.15  # sine of the load angle in the ramp, from which on that tells the inertia
+RAMP_ANGLE = 0.3  # sine of the load angle in the ramp, from which on that tells the inertia
 
 # Scales of the terms of J.
 LOAD_ANGLE = 0.5  # full steps, 45 degrees electrical: 30 % of the torque are left
@@ -149,7 +150,7 @@ def unmeasured(device: Device) -> str:
     return "no 6077h"
 
 
-def _highest(drives: Drives, name: tuple[int, int]) -> float:
+def _highest(drives: Drives, name: int) -> float:
     """Return the highest value of an object that drives take, less what a profile may be short of it."""
     high = device_of(drives).new_dictionary().find(name).high
     assert high is not None, "ramps and speeds are numbers"
@@ -286,16 +287,19 @@ class OpenLoopTrials(Trials):
         current[1:] = 0.5 * (current[1:] + current[:-1])
         speed = np.gradient(angle, CYCLE, axis=0)
         found = momentum_balance(angle, speed, current, motor)
-        swing = self._swing(origin, move, where, held)
+        has_room = where & (np.abs(reach) > SWING_ROOM * 2.0 * np.pi / (TOOTH * motor.n_p))
+        if not has_room.any():
+            return found, origin
+        swing = self._swing(origin, move, has_room, held)
         # A heavy load's ramp says more than its swing, in which what is elastic takes no part.
-        light = swing.inertia * move.acceleration / move.increments < RAMP_ANGLE * held
+        light = has_room & (swing.inertia * move.acceleration / move.increments < RAMP_ANGLE * held)
         if (trusted := light & (swing.explained > EXPLAINED)).any():
             inertia = np.where(trusted, swing.inertia, found.inertia)
             known = momentum_balance(angle, speed, current, motor, inertia)
             found = Identified(*(np.where(trusted, a, b) for a, b in zip(known, found, strict=True)))
         return found, origin
 
-    def _swing(self, origin: Integers, move: Move, where: Mask, held: Floats) -> Swing:
+    def _swing(self, origin: Integers, move: Move, where: Mask, held: Floats) -> FreeSwing:
         """Let the rotors swing after steps of a quarter of a full step, here and half a full step from here."""
         drives, motor = self._drives, self._motor
         full_step = 2.0 * np.pi * move.increments / (TOOTH * motor.n_p)

@@ -33,14 +33,14 @@ _PAIRS = np.array([(friction, start) for friction in FRICTION for start in START
 EXPLAINED = 0.85  # of the variance of a swing, that its fit must explain
 
 
-class Swing(NamedTuple):
+class FreeSwing(NamedTuple):
     """What free swings say, (num_axes,) each: the inertia [kg m^2], and the least share of variance explained."""
 
     inertia: Floats
     explained: Floats
 
 
-def inertia_of_swings(demand: Floats, position: Floats, held: Floats, age: float, motor: Motor) -> Swing:
+def inertia_of_swings(demand: Floats, position: Floats, held: Floats, age: float, motor: Motor) -> FreeSwing:
     """Return the inertia that swings in two places half a full step apart say.
 
     Args:
@@ -53,7 +53,7 @@ def inertia_of_swings(demand: Floats, position: Floats, held: Floats, age: float
     fits = [_fit(motor, d, x, held, age) for d, x in zip(demand, position, strict=True)]
     square = np.mean([omega**2 for omega, _ in fits], axis=0)
     explained = np.min([share for _, share in fits], axis=0)
-    return Swing(motor.n_p * held / square, explained)
+    return FreeSwing(motor.n_p * held / square, explained)
 
 
 def _fit(motor: Motor, demand: Floats, position: Floats, held: Floats, age: float) -> tuple[Floats, Floats]:
