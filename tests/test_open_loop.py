@@ -384,7 +384,7 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
     with pytest.raises(ValueError, match="give different ones of gain"):
         check_tried(SERVO, ())
     check_tried(STEPPER, ("run_current", "standby_current"))
-    with pytest.raises(ValueError, match="correction_velocity_p: trials have the loop open"):
+    with pytest.raises(ValueError, match="run_current: trials of correction_velocity_p close the loop"):
         check_tried(STEPPER, ("run_current", "correction_velocity_p"))
     with pytest.raises(ValueError, match="coolstep_up: a trial of an open-loop stepper shows what the phase currents"):
         check_tried(STEPPER, ("run_current", "coolstep_up"))

@@ -12,7 +12,6 @@ from drive_env.trials.rotor_swing import EXPLAINED, LENGTH, inertia_of_swings
 from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
 
-
 WITHIN = {
     ("tmcm3313", "qsh4218_51"): 0.12,
     ("tmcm3313", "qsh6018_86"): 0.12,
