@@ -51,8 +51,8 @@ def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[
     detection.gains[:, columns] = np.where(tuned[:, None], found.gains[:, columns], detection.gains[:, columns])
     for k in np.flatnonzero(detection.found.going() & ~tuned):
         detection.found.reservations[k].append(
-            "the gains of the closed loop are as they were: in every trial the axis oscillated, went into fault, or its "
-            "loop did not close"
+            "the gains of the closed loop are as they were: in every trial the axis oscillated, went into fault, or "
+            "its loop did not close"
         )
     cost = np.where(kept, found.cost, np.nan)
     return {BEFORE: np.repeat(np.exp(began), axes), AFTER: np.repeat(np.exp(cost), axes)}
