@@ -20,6 +20,7 @@ from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import Gains, write_gains
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import Trials, measured_cost, softness
+from drive_env.trials.method import Cascade
 from tuning.commands.cli import app
 from tuning.compare.suite import load_suite, open_group
 from tuning.drive_audit import KINDS, DriveAudit
@@ -127,7 +128,7 @@ def test_an_axis_that_oscillates_while_it_is_identified_is_off_within_50_ms_and_
     """Three axes have the commissioning gains, which suit them; the last has far too high ones."""
     gains = first_gains(rigid)
     gains[3, 2:4] *= 60
-    monkeypatch.setattr(trial_bench, "first_gains", lambda target: gains.copy())
+    monkeypatch.setattr(Cascade, "first", lambda method, supply: gains.copy())
     currents = []
     record = type(rigid.drives).record
 
@@ -149,7 +150,7 @@ def test_an_axis_that_oscillates_while_it_is_identified_is_off_within_50_ms_and_
 
 def test_an_axis_that_oscillates_with_any_gains_is_told(rigid, monkeypatch):
     monkeypatch.setattr(trial_bench, "SOFTER", 1)
-    monkeypatch.setattr(trial_bench, "first_gains", lambda target: np.tile(np.array(WILD), (4, 1)))
+    monkeypatch.setattr(Cascade, "first", lambda method, supply: np.tile(np.array(WILD), (4, 1)))
     with pytest.raises(RuntimeError, match="axis 0 oscillates in the moves of identification, even with 1/"):
         TrialBench(rigid).identify()
 

@@ -17,6 +17,8 @@ from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.motors import MOTORS
 from drive_env.phase_current import rated_setting
+from drive_env.trials.closed_loop import BEHIND, OVERLOAD, full_step, held_in_trial, plan_overload
+from drive_env.trials.gain_trial import Identified
 from drive_env.trials.open_loop import unmeasured
 from drive_env.trials.positioning import plan_move, start, write_profile
 from tuning.commands.cli import app
@@ -97,13 +99,17 @@ def test_an_episode_of_gain_tuning():
         env.close()
 
 
-def test_auto_commissions_and_certifies_its_load_detection(tmp_path):
+def test_auto_commissions_and_certifies_load_detection_and_closed_loop(tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.stepper.closed_loop.TRIALS", 6)  # brief
     result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
     assert axis["verdict"] == "accepted" and axis["figures"]["teeth lost at an obstacle"] == 0
     assert axis["after"]["coolstep_lower"] > 0
     assert axis["figures"]["current saved by CoolStep, by the load angle [%]"] > 5
+    by_table, tuned = (axis["figures"][f"J of the closed loop, {how}"] for how in ("by commissioning", "tuned"))
+    assert tuned < by_table
+    assert any(axis["after"][name] != axis["before"][name] for name in LOOP_GAINS)
 
 
 def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
@@ -124,20 +130,19 @@ def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
 
 
 @pytest.mark.parametrize(
-    ("name", "remedy"),
+    ("names", "remedy"),
     [
-        ("correction_velocity_p", "sweep --closed-loop"),
-        ("correction_velocity_limit", "sweep --closed-loop"),
-        ("stall_threshold", "drive-tune auto"),
+        (("stall_threshold",), "drive-tune auto"),
+        (("correction_velocity_p", "run_current"), "search the others by themselves"),
     ],
 )
-def test_what_trials_do_not_show_is_refused_before_anything_moves(name, remedy):
+def test_what_trials_do_not_show_is_refused_before_anything_moves(names, remedy):
     with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
-        with pytest.raises(ValueError, match=rf"{name}: .*{remedy}"):
-            optimise(target, Settings(trials=1, gains=(name,)))
+        with pytest.raises(ValueError, match=rf"{names[-1]}: .*{remedy}"):
+            optimise(target, Settings(trials=1, gains=names))
         assert not cia402.matches(target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED).any()
-    with pytest.raises(ValueError, match=rf"{name}: .*{remedy}"):
-        GainTuning(device="tmcm3313", motor=NAME, load="inertia", gains=(name,))
+    with pytest.raises(ValueError, match=rf"{names[-1]}: .*{remedy}"):
+        GainTuning(device="tmcm3313", motor=NAME, load="inertia", gains=names)
 
 
 # --- closed loop ------------------------------------------------------------------------------------------------------
@@ -188,8 +193,8 @@ def test_a_ramp_within_the_motors_torque_shows_no_gain_of_the_closed_loop():
 
 
 @pytest.mark.parametrize(("rotors", "acts"), [(5, False), (30, False), (100, True)])
-def test_why_trials_refuse_gains_of_the_closed_loop(rotors, acts):
-    """In the move of a trial, closed, they do nothing at the rated current where the motor is not overloaded."""
+def test_why_trials_of_the_closed_loop_overload_the_motor(rotors, acts):
+    """In the move of a servo's trial its gains do nothing at the rated current where the motor is not overloaded."""
     values = [300, 3000, 30000]
     heavy = {"load.inertia": rotors * MOTOR.inertia}
     with warnings.catch_warnings():
@@ -206,6 +211,67 @@ def test_why_trials_refuse_gains_of_the_closed_loop(rotors, acts):
         start(drives, drives.read(cia402.POSITION_ACTUAL) + move.distance)
         trace = drives.record([cia402.POSITION_ACTUAL], 0.25)[cia402.POSITION_ACTUAL]
     assert bool(np.any(trace != trace[:, :1])) is acts
+
+
+LOOP_GAINS = ("correction_velocity_p", "correction_velocity_i", "correction_velocity_limit", "correction_position_p")
+
+
+@pytest.mark.parametrize("rotors", [3.0, 6.0, 20.0])
+def test_the_ramp_of_a_trial_leaves_every_axis_behind(rotors):
+    """By BEHIND full steps by the plan's formula, at the run current of the trial; friction adds to it."""
+    zero = np.zeros(1)
+    found = Identified(np.array([rotors * MOTOR.inertia]), zero, zero, zero)
+    move = plan_overload(DEVICE, MOTOR, found, 51200.0, np.array([30.0]))
+    held = held_in_trial(DEVICE, MOTOR, np.asarray(move.share))
+    speed, ramp = move.velocity / move.increments, move.acceleration / move.increments
+    assert ramp == pytest.approx(OVERLOAD * held / found.inertia, rel=1e-3)
+    behind = found.inertia * speed**2 / (2.0 * held) * (1.0 - 1.0 / OVERLOAD) / full_step(MOTOR)
+    assert behind == pytest.approx(BEHIND, rel=0.01)
+    profile = move.distance / move.increments / speed + speed / ramp
+    assert 0.0599 < profile <= 0.0601 or speed == pytest.approx(0.5 * ramp * 0.06, rel=1e-3)
+    assert (float(move.share[0]) == 1.0) is (rotors > 10.0), "a light load is overloaded by less current"
+    short = plan_overload(DEVICE, MOTOR, found, 51200.0, np.array([-1.0]))
+    assert short.distance / short.increments == pytest.approx(-0.4, rel=1e-3) and short.velocity < move.velocity
+
+
+def test_trials_of_the_closed_loop_tell_its_gains_apart_and_give_the_loop_back():
+    with emulated("tmcm3313", "inertia", NAME, num_machines=3, num_threads=1, identical=True) as target:
+        drives = target.drives
+        bench = TrialBench(target, gains=LOOP_GAINS)
+        bench.identify()
+        assert drives.read(Role.LOOP_INITIALISED).all()
+        gains = bench.rule.copy()
+        gains[:, DEVICE.gains.names.index("correction_velocity_p")] = [30, 3000, 10000]
+        tried = bench.run(gains)
+        assert not tried.aborted.any()
+        assert tried.cost[0] > tried.cost[1] > tried.cost[2] + 0.05
+        bench.leave(gains)
+        assert np.array_equal(DEVICE.gains.read(drives), gains), "the run current of the trial was for it alone"
+        assert not drives.read(Role.LOOP_MODE).any()
+        assert np.all(drives.read(cia402.FOLLOWING_WINDOW) != 0)
+
+
+def test_an_axis_whose_loop_does_not_close_is_stopped_in_its_trial(monkeypatch):
+    monkeypatch.setattr("drive_env.trials.closed_loop.LONGEST_CLOSING", 0.1)
+    with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
+        bench = TrialBench(target, anew=True, gains=LOOP_GAINS)
+        bench.identify()
+        assert bench.run(bench.rule).aborted.all()
+
+
+def test_gain_tuning_and_its_robust_cost_tell_gains_of_the_closed_loop_apart():
+    env = GainTuning(device="tmcm3313", motor=NAME, load="inertia", trials=2, num_threads=1, gains=LOOP_GAINS[:2],
+                     distributions={"parameters": {}})  # fmt: skip
+    try:
+        _, info = env.reset(seed=1)
+        rule = float(info["robust_cost"][0])
+        _, _, _, _, info = env.step(np.array([[-0.7, -0.7]], np.float32))
+        slow = float(info["trial_robust_cost"][0])
+        assert slow > 1.05 * rule and info["trial_measured"][0] != info["measured"][0] and slow < 30.0
+        tried = info["trial_gains"][0, 0]
+        assert tried[3:5].tolist() == [1490, 10] and tried[0] == rated_setting(DEVICE, MOTOR)
+    finally:
+        env.close()
 
 
 def test_an_axis_whose_loop_does_not_close_counts_as_one_in_fault(monkeypatch):

@@ -33,7 +33,7 @@ from drive_env.gains import read_gains
 from drive_env.motors import Motor, find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost
 from drive_env.trials.method import check_tried, method_of, new_score
-from drive_env.trials.positioning import TRIAL, plan_move, reach
+from drive_env.trials.positioning import TRIAL, reach
 from drive_env.trials.score import RobustScore
 
 Integers = NDArray[np.int64]
@@ -245,7 +245,9 @@ class GainTuning(VectorEnvironment):
                 laws = Distributions.load({"include": [c.load, "stepper"], "parameters": {}}).of_machine(known)
         self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
-        self._score = new_score(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
+        self._score = new_score(
+            c.device, c.load, c.motor, num_envs, gains=c.chosen, num_threads=c.num_threads, friction=c.friction
+        )
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
@@ -262,7 +264,7 @@ class GainTuning(VectorEnvironment):
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
-        self._method = method_of(self._device, self.motor)
+        self._method = method_of(self._device, self.motor, c.chosen)
         self._highest = self._method.highest()
         self._trials = self._method.trials(self.drives, self._axes)
         self._columns = self._device.gains.columns(c.chosen)
@@ -270,7 +272,8 @@ class GainTuning(VectorEnvironment):
         self._reach = np.tile(one, n) if given_reach is None else np.broadcast_to(np.asarray(given_reach, float), axes)
         zero = np.zeros(axes)
         self._identified = Identified(zero, zero, zero, zero)
-        self._move = plan_move(self.motor, zero + self.motor.inertia, 1.0, zero)
+        rotor = Identified(zero + self.motor.inertia, zero, zero, zero)
+        self._move = self._method.plan(rotor, 1.0, zero)
         self._origin, self._direction = np.zeros(axes, np.int64), np.ones(axes, np.int64)
         self._safe, self._rule, self._best, self._last = (
             np.ones((axes, self._device.gains.count), np.int64) for _ in range(4)
@@ -303,7 +306,7 @@ class GainTuning(VectorEnvironment):
         self._origin = np.where(axes, origin, self._origin)
         self._direction = np.where(axes, 1, self._direction)
         scaler = drives.read(Role.POSITION_SCALE)
-        planned = plan_move(self.motor, self._identified.inertia, scaler, self._reach)
+        planned = self._method.plan(self._identified, scaler, self._reach)
         # Environments outside the mask keep theirs: nothing of what it follows from has changed.
         self._move = planned
         volts = self.motor.voltage if drives.device is None else drives.device.supply_of(self.motor)

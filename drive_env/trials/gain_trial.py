@@ -271,10 +271,14 @@ def _on_the_counter(position: Integers) -> Integers:
     return wrapped(position).astype(np.int64)
 
 
-def momentum_balance(angle: Floats, speed: Floats, current: Floats, motor: Motor) -> Identified:
+def momentum_balance(
+    angle: Floats, speed: Floats, current: Floats, motor: Motor, inertia: Floats | None = None
+) -> Identified:
     """Fit i = (J domega/dt) / K_t + coulomb sign(omega) + viscous omega + offset, integrated once over time.
 
     The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own.
+    With an inertia that is known already [kg m^2], (num_axes,), the viscous friction is the motor's, and dry friction
+    alone is fitted: in a short move the two look alike.
     """
     standstill = 1.0  # rad/s, one count in 1.5 ms: below it the sign is noise
     sign = np.clip(speed / standstill, -1.0, 1.0)
@@ -286,6 +290,9 @@ def momentum_balance(angle: Floats, speed: Floats, current: Floats, motor: Motor
         axis=-1,
     ).transpose(1, 0, 2)  # fmt: skip
     impulse = np.cumsum(current, axis=0).T * CYCLE
+    if inertia is not None:
+        impulse = impulse - ((inertia * speed + motor.viscous * angle) / motor.torque_constant).T
+        columns[:, :, [0, 2]] = 0.0
     scale = np.maximum(np.sqrt(np.mean(columns**2, axis=1, keepdims=True)), 1e-12)
     X = columns / scale
     # An axis that did not move says nothing; the small term keeps its equations solvable.
@@ -293,5 +300,9 @@ def momentum_balance(angle: Floats, speed: Floats, current: Floats, motor: Motor
     solved = np.linalg.solve(normal, X.transpose(0, 2, 1) @ impulse[:, :, None])[..., 0] / scale[:, 0]
     # Of a machine that left physics nothing is known, and nothing moves with less than its rotor.
     solved = np.nan_to_num(solved)
-    inertia = np.clip(solved[:, 0] * motor.torque_constant, 0.8 * motor.inertia, 300.0 * motor.inertia)
+    if inertia is None:
+        inertia = solved[:, 0] * motor.torque_constant
+    else:
+        solved[:, 2] = motor.viscous / motor.torque_constant
+    inertia = np.clip(inertia, 0.8 * motor.inertia, 300.0 * motor.inertia)
     return Identified(inertia, np.maximum(solved[:, 1], 0.0), np.maximum(solved[:, 2], 0.0), solved[:, 3])

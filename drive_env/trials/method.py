@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env.gains import (
     BASELINE_RULE,
@@ -18,8 +18,10 @@ from drive_env.gains import (
     small_time_constants,
 )
 from drive_env.phase_current import currents_for, rated_setting, swing_period, with_currents
+from drive_env.trials.closed_loop import ClosedLoopTrials, plan_overload
 from drive_env.trials.gain_trial import Identified, Trials, softness
 from drive_env.trials.open_loop import OpenLoopTrials, open_loop_cost, open_loop_softness
+from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
 SAFE_RULE = BASELINE_RULE._replace(
     speed=BASELINE_RULE.speed / 3.0, integration=3.0 * BASELINE_RULE.integration, position=0.3 * BASELINE_RULE.position
 )
+
+SLOW = 1.0 / 3.0  # of the gains of a stepper's closed loop, where a safe search begins
 
 
 class Cascade(NamedTuple):
@@ -73,6 +77,10 @@ class Cascade(NamedTuple):
         inertia = 3.0 * self.motor.inertia
         rows = [bandwidth_gains(self.device, self.motor, inertia, supply=float(v), **FIRST_HZ) for v in supply]
         return np.array(rows, np.int64)
+
+    def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
+        """Return the move of trials; arguments as `positioning.plan_move` has them."""
+        return plan_move(self.motor, found.inertia, scaler, reach)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return the gains of the baseline rule."""
@@ -144,6 +152,10 @@ class OpenLoop(NamedTuple):
         most = rated_setting(self.device, self.motor)
         return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
 
+    def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
+        """Return the move of trials."""
+        return plan_move(self.motor, found.inertia, scaler, reach)
+
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return currents with which the load takes 30 degrees of load angle in the move."""
         constant = self.motor.torque_constant
@@ -181,11 +193,93 @@ class OpenLoop(NamedTuple):
         return np.asarray(np.sqrt(terms.effort))
 
 
-Method = Cascade | OpenLoop
+class ClosedStepper(NamedTuple):
+    """A stepper whose drive closes a loop around it: the gains that act there alone, at the motor's rated current."""
+
+    device: Device
+    motor: Motor
+
+    @property
+    def measures_current(self) -> bool:
+        """It is identified in open loop, where it does not; its trials look at the torque current by themselves."""
+        return False
+
+    @property
+    def caution(self) -> int:
+        """Higher gains oscillate."""
+        return 1
+
+    def t_0(self) -> float:
+        """Return the period of the rotor's swing in its field at rated current [s]."""
+        return swing_period(self.motor)
+
+    def highest(self) -> Integers:
+        """Return the greatest integers."""
+        return OpenLoop(self.device, self.motor).highest()
+
+    def first(self, supply: Floats) -> Integers:
+        """Return the rated current, and what the device is commissioned with for its loop."""
+        gains = OpenLoop(self.device, self.motor).first(supply)
+        dictionary = self.device.new_dictionary()
+        entries = [(dictionary.find(name), value) for name, value in self.device.preset(self.motor).items()]
+        preset = {(entry.index, entry.sub): value for entry, value in entries}
+        for row in self.device.gains.closed_rows:
+            gains[:, self.device.gains.names.index(row.name)] = preset.get(row.key, row.lowest)
+        return gains
+
+    def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
+        """Return a move that overloads the motor."""
+        return plan_overload(self.device, self.motor, found, scaler, reach)
+
+    def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return what the device is commissioned with: no rule knows such a loop."""
+        return self.first(supply)
+
+    def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return a third of that: slower to catch up."""
+        gains = self.first(supply)
+        return self.device.gains.scaled(gains, SLOW, self._columns())
+
+    def keep(self, gains: Integers, present: Integers) -> Integers:
+        """Return gains with the load detection's settings that drives have at present."""
+        kept = OpenLoop(self.device, self.motor).keep(gains, present)
+        kept[:, self._columns()] = gains[:, self._columns()]
+        return kept
+
+    def trials(self, drives: Drives, axes: int) -> ClosedLoopTrials:
+        """Return what runs trials."""
+        closed = self.device.gains.closed_loop
+        assert closed is not None, "a drive that closes a loop"
+        return ClosedLoopTrials(drives, self.motor, axes, self.t_0(), closed)
+
+    def softness(self, gains: Integers) -> Floats:
+        """Return 1: how an overload is caught up with is measured in each trial."""
+        return np.ones(len(gains))
+
+    def cost(self, terms: Terms) -> Floats:
+        """Return J."""
+        return cost(terms)
+
+    def current(self, terms: Terms) -> Floats:
+        """Return the ripple of the torque current."""
+        return terms.noise
+
+    def _columns(self) -> list[int]:
+        return [self.device.gains.names.index(row.name) for row in self.device.gains.closed_rows]
 
 
-def method_of(device: Device, motor: Motor) -> Method:
-    """Return how the gains of a device are tried."""
+Method = Cascade | OpenLoop | ClosedStepper
+
+
+def closes_loop(device: Device, names: tuple[str, ...]) -> bool:
+    """Return whether gains of these names act with a stepper's loop closed alone."""
+    return any(row.name in names for row in device.gains.closed_rows)
+
+
+def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Method:
+    """Return how gains of a device are tried; with names of gains that act in a closed loop alone with it closed."""
+    if closes_loop(device, names):
+        return ClosedStepper(device, motor)
     return OpenLoop(device, motor) if device.gains.is_open_loop else Cascade(device, motor)
 
 
@@ -197,25 +291,36 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
             "tell apart; name gains of its gains.toml"
         )
     device.gains.columns(names)
-    closed = [row.name for row in device.gains.closed_rows if row.name in names]
-    if closed:
-        raise ValueError(
-            f"{', '.join(closed)}: trials have the loop open, and closed it would do no more: their moves ask for "
-            "0.4 of the rated torque, and corrections begin where the load angle is at its limit; drive-tune sweep "
-            "--closed-loop varies them in a ramp that overloads the motor"
-        )
+    closed = [row.name for row in device.gains.closed_rows]
+    if closes_loop(device, names):
+        if others := [name for name in names if name not in closed]:
+            raise ValueError(
+                f"{', '.join(others)}: trials of {', '.join(name for name in names if name in closed)} close the loop "
+                f"at the motor's rated current, and show what {', '.join(closed)} do; search the others by themselves"
+            )
+        return
     if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
+        shown = ", ".join(device.gains.outer)
+        shown += f", and with its loop closed what {', '.join(closed)} do" if closed else ""
         raise ValueError(
-            f"{', '.join(others)}: a trial of an open-loop stepper shows what the phase currents do, "
-            f"{', '.join(device.gains.outer)}; drive-tune auto finds the settings of its load detection, and "
-            "drive-tune sweep varies any gain"
+            f"{', '.join(others)}: a trial of an open-loop stepper shows what the phase currents do, {shown}; "
+            "drive-tune auto finds the settings of its load detection, and drive-tune sweep varies any gain"
         )
 
 
-def new_score(device: str, load: Any, motor: Any, num_machines: int, **options: Any) -> RobustScore:
-    """Return what scores gains of a device on emulated machines; arguments as `RobustScore` has."""
+def new_score(
+    device: str, load: Any, motor: Any, num_machines: int, *, gains: tuple[str, ...] = (), **options: Any
+) -> RobustScore:
+    """Return what scores gains of a device on emulated machines; arguments as `RobustScore` has.
+
+    With `gains`, names, that act in a closed loop alone it is closed.
+    """
     from drive_env.devices import find_device
+    from drive_env.trials.closed_loop_score import ClosedLoopScore
     from drive_env.trials.open_loop_score import OpenLoopScore
 
-    kind: Callable[..., RobustScore] = OpenLoopScore if find_device(device).gains.is_open_loop else RobustScore
+    known = find_device(device)
+    if closes_loop(known, gains):
+        return ClosedLoopScore(device, load, motor, num_machines, **options)
+    kind: Callable[..., RobustScore] = OpenLoopScore if known.gains.is_open_loop else RobustScore
     return kind(device, load, motor, num_machines, **options)

@@ -21,6 +21,7 @@ from drive_env.devices.gain_set import RUN
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import holding_torque, run_and_standby
@@ -39,6 +40,7 @@ from drive_env.trials.positioning import (
     wrapped,
     write_profile,
 )
+from drive_env.trials.rotor_swing import EXPLAINED, LENGTH, FreeSwing, inertia_of_swings
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -53,6 +55,15 @@ OPEN = 0  # of `Role.LOOP_MODE`
 STILL = 20  # samples at rest by which demand and encoder are compared
 REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
 LEAST_WAY = 0.25  # of a move that an encoder must show
+
+# The swing by which the inertia of a light load is found: its step and how far apart its two places are [full steps],
+# the time until the one before has died away [s], speed and ramps in full steps, as far as a drive takes them.
+SWING_STEP, SWING_APART, SWING_REST = 0.25, 0.5, 0.1
+SWING_ROOM = 1.5  # full steps of travel, less than which leave no room to swing and to overshoot
+STEEP = {cia402.PROFILE_VELOCITY: 1e3, cia402.PROFILE_ACCELERATION: 2e7, cia402.PROFILE_DECELERATION: 2e7}
+_STEEPNESS = tuple(STEEP)
+HIGHEST_SHARE = 0.95  # of the highest value that a drive takes
+RAMP_ANGLE = 0.3  # sine of the load angle in the ramp, from which on that tells the inertia
 
 # Scales of the terms of J.
 LOAD_ANGLE = 0.5  # full steps, 45 degrees electrical: 30 % of the torque are left
@@ -137,6 +148,13 @@ def unmeasured(device: Device) -> str:
     if (cia402.TORQUE_ACTUAL, 0) in device.bindings:
         return "in open loop 6077h is the size of the current that is set"
     return "no 6077h"
+
+
+def _highest(drives: Drives, name: int) -> float:
+    """Return the highest value of an object that drives take, less what a profile may be short of it."""
+    high = device_of(drives).new_dictionary().find(name).high
+    assert high is not None, "ramps and speeds are numbers"
+    return HIGHEST_SHARE * high
 
 
 def encoder_age(device: Device) -> float:
@@ -268,7 +286,43 @@ class OpenLoopTrials(Trials):
         # The rotor swings a hundred times a second: the impulse is summed by trapezoids, up to the speed's own sample.
         current[1:] = 0.5 * (current[1:] + current[:-1])
         speed = np.gradient(angle, CYCLE, axis=0)
-        return momentum_balance(angle, speed, current, motor), origin
+        found = momentum_balance(angle, speed, current, motor)
+        has_room = where & (np.abs(reach) > SWING_ROOM * 2.0 * np.pi / (TOOTH * motor.n_p))
+        if not has_room.any():
+            return found, origin
+        swing = self._swing(origin, move, has_room, held)
+        # A heavy load's ramp says more than its swing, in which what is elastic takes no part.
+        light = has_room & (swing.inertia * move.acceleration / move.increments < RAMP_ANGLE * held)
+        if (trusted := light & (swing.explained > EXPLAINED)).any():
+            inertia = np.where(trusted, swing.inertia, found.inertia)
+            known = momentum_balance(angle, speed, current, motor, inertia)
+            found = Identified(*(np.where(trusted, a, b) for a, b in zip(known, found, strict=True)))
+        return found, origin
+
+    def _swing(self, origin: Integers, move: Move, where: Mask, held: Floats) -> FreeSwing:
+        """Let the rotors swing after steps of a quarter of a full step, here and half a full step from here."""
+        drives, motor = self._drives, self._motor
+        full_step = 2.0 * np.pi * move.increments / (TOOTH * motor.n_p)
+        toward = np.where(move.distance < 0, -1.0, 1.0) * full_step
+        before = {name: drives.read(name) for name in _STEEPNESS}
+        for name in _STEEPNESS:
+            most = np.minimum(STEEP[name] * full_step * per_increment(drives, name), _highest(drives, name))
+            drives.write(name, most.astype(np.int64), where=where)
+        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]
+        places = []
+        self._prepare(objects)
+        for place in (0.0, SWING_APART):
+            self.go(np.rint(origin + place * toward).astype(np.int64), where)
+            drives.advance(SWING_REST)
+            self.go(np.rint(origin + (place + SWING_STEP) * toward).astype(np.int64), where)
+            trace = self._record(objects, LENGTH)
+            places.append([wrapped(trace[name] - trace[name][0]) / move.increments for name in objects])
+        self.go(origin, where)
+        drives.advance(SWING_REST)
+        for name, value in before.items():
+            drives.write(name, value, where=where)
+        position, demand = (np.stack(parts) for parts in zip(*places, strict=True))
+        return inertia_of_swings(demand, position, held, encoder_age(device_of(drives)), motor)
 
     def run(  # type: ignore[override]
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask

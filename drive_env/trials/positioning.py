@@ -36,13 +36,17 @@ BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is 
 
 
 class Move(NamedTuple):
-    """A positioning move: 607Ah from rest at 0, its speed and ramp, and what it is in SI, each of shape (num_axes,)."""
+    """A positioning move: 607Ah from rest at 0, its speed and ramp, and what it is in SI, each of shape (num_axes,).
+
+    share: Run current of the move over the rated one, of a stepper that is to be overloaded.
+    """
 
     distance: Integers  # inc, with its sign
     velocity: Integers  # pps
     acceleration: Integers  # pps^2
     increments: Floats  # per radian
     counts: float  # of the encoder per radian
+    share: Floats | float = 1.0
 
 
 def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayLike) -> Move:

@@ -278,7 +278,7 @@ class _Part:
         self._robust.set_constant_load(self._spread(pull))
         inertia = np.array([one.plant.inertia for one in known])
         move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]))
-        distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:-1])
+        distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:4])
         self._robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
         self._robust.set_reference(self._spread(rule_gains(device, motor, inertia)))
 

@@ -318,6 +318,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
 
     from drive_env.devices import find_device
     from tuning.search.optimise import COST
+    from tuning.search.trials_files import is_tried_open
     from tuning.search.trials_files import titles as titles_of
 
     searches = sorted({row.search for row in found.rows})
@@ -326,7 +327,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     several = settings.objectives != (COST,)
     shown = (COST, *(name for name in settings.objectives if name != COST))
     titles = [name.replace("_", "\n") for name in find_device(device).gains.names] + [
-        _on_two_lines(titles_of(device)[name]) for name in shown
+        _on_two_lines(titles_of(device, settings.gains)[name]) for name in shown
     ]
     columns = [Column("", "name"), *map(Column, titles)]
     for search in searches:
@@ -349,7 +350,12 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
             which = f"search {row.search}, trial" if len(searches) > 1 else "trial"
             lines.append(f"{which} {row.number} was stopped: the drive reported {row.cause}")
     lines += sorted({note for note in found.notes if note})
-    if find_device(device).gains.is_open_loop:
+    if not is_tried_open(device, settings.gains) and find_device(device).gains.is_open_loop:
+        lines.append(
+            "The loop was closed in trials, at the motor's rated current or less: the ramp asks for more than the "
+            "motor gives, and in place of E_d/E_0 J has 1 + b/t_0, b the time for which the axis is behind its demand."
+        )
+    elif find_device(device).gains.is_open_loop:
         from drive_env.trials.open_loop import unmeasured
 
         lines.append(

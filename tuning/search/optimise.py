@@ -159,7 +159,7 @@ def optimise(
     check_tried(target.device, chosen)  # before anything moves
     columns = target.device.gains.columns(chosen)
     with timed(target) as (watched, clock):
-        bench = TrialBench(watched, anew=anew)
+        bench = TrialBench(watched, anew=anew, gains=chosen)
         bench.identify()
         search = _Search(bench, settings, columns, shared, bench if log is None else LoggedTrials(bench, clock, log))
         while search.generation():
@@ -336,7 +336,7 @@ class _Search:
             self._note(
                 k,
                 f"the axis oscillated with the safe gains, and with 1/{2 ** (SAFE_STARTS - 1)} of them: no safe start"
-                if self._bench.method.measures_current
+                if self._bench.method.caution > 0
                 else "the axis was stopped even at its motor's rated current: no safe start",
             )
 

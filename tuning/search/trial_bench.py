@@ -21,7 +21,7 @@ from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import Identified, Trial, measured_cost
 from drive_env.trials.method import method_of
-from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_move, wrapped, write_profile
+from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, wrapped, write_profile
 from drive_env.trials.score import TRIP
 from tuning.auto.fallback_gains import FallbackGains
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
@@ -72,20 +72,21 @@ class TrialBench:
         target: What is tuned; the drives may have any gains, also none.
         anew: Put emulated machines to rest at zero before every trial, so that a trial follows from machine, gains
             and its number alone; drives on a bus go on from where they are.
+        gains: Names of those that will be tried; with one that acts in a closed loop alone the loop is closed.
 
     Attributes:
         t_0: Settling times are relative to this [s].
         began: Where the axes were before their first trial [inc], (num_axes,).
     """
 
-    def __init__(self, target: Target, *, anew: bool = False) -> None:
+    def __init__(self, target: Target, *, anew: bool = False, gains: tuple[str, ...] = ()) -> None:
         self.target = target
         self.num_machines = target.num_axes // target.axes_per_machine
         self.aborts = np.zeros(target.num_axes, np.int64)
         self.moves = np.zeros(target.num_axes, np.int64)
         self._anew = anew and target.drives.machine is not None
         motor = target.motor
-        self.method = method_of(target.device, motor)
+        self.method = method_of(target.device, motor, gains)
         self.t_0 = self.method.t_0()
         self.highest = self.method.highest()
         self._fallback = FallbackGains(target.num_axes, motor.rated_current)
@@ -122,14 +123,14 @@ class TrialBench:
         if self._anew:
             machine_of(drives).reset()
         present = read_gains(target)
-        gains = self.method.keep(first_gains(target), present)
+        gains = self.method.keep(self.method.first(target.supply), present)
         write_gains(drives, gains)  # before anything is enabled: the drives may have any
         self._trials.recover(self._where)
         drives.advance(CALM)
         self.identified, self._origin = self._moved(gains)
         self.began = self._origin.copy()
         self._trials.recover(self._where)
-        self.move = plan_move(target.motor, self.identified.inertia, drives.read(Role.POSITION_SCALE), self._reach)
+        self.move = self.method.plan(self.identified, drives.read(Role.POSITION_SCALE), self._reach)
         self.rule, self.safe = (
             self.method.keep(rule(self.identified, self.move, target.supply), present)
             for rule in (self.method.rule, self.method.safe)

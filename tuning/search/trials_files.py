@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drive_env.devices import find_device
+from drive_env.trials.method import closes_loop
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_toml
 from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
@@ -62,7 +63,7 @@ def save(
     """
     table = io.StringIO()
     writer = csv.writer(table)
-    told = titles(machine["device"])
+    told = titles(machine["device"], settings.gains)
     names, gains_there_are = (COST, *OBJECTIVES), find_device(machine["device"]).gains.names
     writer.writerow(
         [
@@ -88,14 +89,20 @@ def save(
     lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
     write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
     picture = io.BytesIO()
-    is_open_loop = find_device(machine["device"]).gains.is_open_loop
+    is_open_loop = is_tried_open(machine["device"], settings.gains)
     trials_figure(found, settings, is_open_loop=is_open_loop).savefig(picture, dpi=120)
     write_whole(folder / "trials.png", picture.getvalue())
 
 
-def titles(device: str) -> dict[str, str]:
-    """Return the title of each objective, for a device."""
-    return OPEN_LOOP_TITLES if find_device(device).gains.is_open_loop else TITLES
+def titles(device: str, gains: tuple[str, ...] | None) -> dict[str, str]:
+    """Return the title of each objective, for gains of a device."""
+    return OPEN_LOOP_TITLES if is_tried_open(device, gains) else TITLES
+
+
+def is_tried_open(device: str, gains: tuple[str, ...] | None) -> bool:
+    """Return whether gains of a device are tried in open loop: a stepper's, but those of the loop that it closes."""
+    known = find_device(device)
+    return known.gains.is_open_loop and not closes_loop(known, gains or ())
 
 
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:

@@ -23,6 +23,7 @@ from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.open_loop import encoder_age
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, restore
+from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
 from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
 from tuning.stepper.moves import WorkingMoves
 from tuning.stepper.obstacle import REACTION, can_load, prove_with_load
@@ -107,6 +108,9 @@ def commission(
             say("proving", 0.8)
             detection.prove()
         proof_figures = _prove(watched, detection, moves, speed)
+        if target.device.gains.closed_loop is not None and found.going().any():
+            say("tuning the closed loop", 0.9)
+            proof_figures |= tune_loop(watched, detection, roles)
         say("writing", 0.95)
         accepted = found.going()
         _leave(bench, transaction, detection.gains, accepted, roles)
@@ -247,6 +251,7 @@ def _axis(
         "current saved by CoolStep, by the load angle [%]": figure(100.0 * found.saved[k]),
         "teeth lost at an obstacle": figure(proof["lost"][k]),
     }
+    figures |= {name: figure(values[k]) for name, values in proof.items() if name in LOOP_FIGURES}
     return StepperAxis(
         dict(zip(names, map(int, before[k]), strict=True)), dict(zip(names, map(int, after), strict=True)), reason,
         tuple(found.reservations[k]), figures,

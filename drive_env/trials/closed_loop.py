@@ -1,0 +1,254 @@
+"""One trial of the gains of a stepper's closed loop: a ramp that overloads the motor, and how it is caught up with.
+
+Within the motor's torque the corrections of a closed loop do nothing. So the ramp of the trial asks for more than the
+run current gives: the axis falls behind by `BEHIND` full steps, and the corrections take it back to the demand. A light
+load is overloaded by a smaller run current, for the trial alone. What is seen is what a master sees: encoder, demand,
+and 6077h, which is the torque current once the encoder commutates.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import cia402
+from drive_env.devices import Device
+from drive_env.devices.gain_set import ClosedLoop
+from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.interface import Drives, device_of
+from drive_env.gains import write_gains
+from drive_env.motors import Motor
+from drive_env.phase_current import amplitude, holding_torque, rated_setting
+from drive_env.trials.gain_trial import PHASES, Identified, Mask, clear
+from drive_env.trials.open_loop import NO_WINDOW, OPEN, TOOTH, OpenLoopTrials, with_run_current
+from drive_env.trials.oscillation import shakes
+from drive_env.trials.positioning import (
+    CYCLE,
+    PROFILE,
+    TRAVEL_SHARE,
+    TRIAL,
+    WATCH,
+    Move,
+    move_terms,
+    start,
+    wrapped,
+    write_profile,
+)
+from drive_env.trials.score import Terms, cost
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+BEHIND = 3.0  # full steps, by which the ramp leaves the axis behind; up to one the field holds it
+OVERLOAD = 4.0  # acceleration of the ramp over what the run current of the trial gives
+FAST = 1.5  # speed of the ramp over the rated one, up to which the supply carries the rated current
+_LEFT = 1.0 - 1.0 / OVERLOAD
+LEAST_SHARE = 0.3  # of the rated current: with less the detent torque decides
+FRICTION_SHARE = 0.5  # of the trial's torque, that friction and a constant load take at most
+PROBE = 0.8  # run current of the probe over that of the trial: a greater overload
+CLOSING, LONGEST_CLOSING = 0.6, 3.2  # s: the rotor swings in for 0.4 s, and for 3 s at most
+LOOK = 0.05  # s
+LOAD_ANGLE = 1  # of `Role.LOOP_MODE`: it alone has an initialisation
+
+
+class ClosedLoopTrial(NamedTuple):
+    """What a trial showed, as `gain_trial.Trial` has it."""
+
+    terms: Terms  # its disturbance is (1 + b/t_0): b is how long the axis is behind its demand
+    following: Floats
+    aborted: Mask
+    error: Floats
+    culprit: Mask
+
+    def costs(self, softness: Floats) -> Floats:
+        """Return J by measured terms of every phase, (phases, num_axes); E_d/E_0 is times `softness`."""
+        return cost(self.terms._replace(disturbance=self.terms.disturbance * softness, tripped=self.aborted))
+
+
+def full_step(motor: Motor) -> float:
+    """Return a full step [rad]."""
+    return 2.0 * np.pi / (TOOTH * motor.n_p)
+
+
+def held_in_trial(device: Device, motor: Motor, share: Floats) -> Floats:
+    """Return the torque [N m] that a share of the rated run current holds, (num_axes,)."""
+    return holding_torque(motor, share * float(amplitude(device, rated_setting(device, motor))))
+
+
+def trial_share(device: Device, motor: Motor, found: Identified) -> Floats:
+    """Return the share of the rated run current with which a ramp leaves the axes behind by `BEHIND`, (num_axes,)."""
+    speed = FAST * motor.rated_speed
+    torque = found.inertia * speed**2 * _LEFT / (2.0 * BEHIND * full_step(motor))
+    taken = motor.torque_constant * (found.coulomb + np.abs(found.offset) + found.viscous * speed)
+    # As in `phase_current.current_for`: iron saturates.
+    needed = np.maximum(torque, taken / FRICTION_SHARE) / motor.torque_constant
+    current = needed / np.sqrt(np.maximum(1.0 - motor.saturation * needed**2, 1e-6))
+    return np.clip(current / float(amplitude(device, rated_setting(device, motor))), LEAST_SHARE, 1.0)
+
+
+def plan_overload(device: Device, motor: Motor, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
+    """Return a move of 60 ms whose ramp asks for `OVERLOAD` times the torque of the trial's run current.
+
+    While the motor reaches the ramp's speed v with the torque T it falls behind by J v^2 (1 - 1/r) / 2 T, r the
+    overload: a heavy load has a slower ramp.
+
+    Args:
+        device: The drive.
+        motor: The motor.
+        found: What was identified, (num_axes,).
+        scaler: Increments per revolution.
+        reach: How far the rotor may go, with its sign [rad].
+    """
+    to, time = np.asarray(reach, float), PROFILE * CYCLE
+    share = trial_share(device, motor, found)
+    given = held_in_trial(device, motor, share) / found.inertia
+    acceleration = OVERLOAD * given
+    fastest = np.minimum(FAST * motor.rated_speed, np.sqrt(2.0 * BEHIND * full_step(motor) * given / _LEFT))
+    speed = np.minimum(fastest, 0.5 * acceleration * time)
+    angle = np.minimum(speed * (time - speed / acceleration), TRAVEL_SHARE * np.abs(to))
+    # A short way takes its 60 ms at a lower speed.
+    root = np.sqrt(np.maximum((acceleration * time) ** 2 - 4.0 * acceleration * angle, 0.0))
+    speed = 0.5 * (acceleration * time - root)
+    increments = np.broadcast_to(np.asarray(scaler, float), angle.shape) / (2.0 * np.pi)
+    return Move(
+        np.rint(np.copysign(angle, to) * increments).astype(np.int64),
+        np.ceil(speed * increments).astype(np.int64) + 1,
+        np.ceil(np.maximum(acceleration * increments, 1.0)).astype(np.int64),
+        increments,
+        motor.encoder_counts / (2.0 * np.pi),
+        share,
+    )
+
+
+class ClosedLoopTrials(OpenLoopTrials):
+    """Runs trials on steppers whose loop is closed, as `Trials` does on servo drives.
+
+    The machine is identified with the loop open; it is closed then, and is what it was after `leave`.
+    """
+
+    def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float, closed: ClosedLoop) -> None:
+        super().__init__(drives, motor, axes, t_0)
+        self._closed = closed
+        self._closes = np.zeros(drives.num_axes if drives is not None else 0, bool)
+
+    def recover(self, where: Mask) -> None:
+        """Bring axes to pp, enabled, and close the loops of those that have been identified."""
+        super().recover(where)
+        self._watch_no_window()
+        self._close(where & self._closes, LONGEST_CLOSING)
+
+    def power_up(self, where: Mask) -> None:
+        """Do so with drives that were switched on just now, in as many milliseconds whatever becomes of them."""
+        super().power_up(where)
+        self._watch_no_window()
+        if self._closes.any():
+            self._drives.write(Role.LOOP_MODE, self._closed.mode, where=where & self._closes)
+            self._drives.advance(CLOSING)
+
+    def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
+        """Identify with the loop open; close it."""
+        drives = self._drives
+        self._closes &= ~where
+        drives.write(Role.LOOP_MODE, OPEN, where=where)
+        drives.advance(LOOK)
+        found, origin = super().identify(reach, where)
+        self._closes |= where
+        return found, origin
+
+    def go(self, target: Integers, where: Mask) -> None:
+        """Set off for a position of the encoder, which is the axis' own in a closed loop."""
+        if np.any(where & self._closes):
+            start(self._drives, wrapped(target).astype(np.int64), where)
+        else:
+            super().go(target, where)
+
+    def run(  # type: ignore[override]
+        self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
+    ) -> ClosedLoopTrial:
+        """Try gains in a move from the origin, back, and there again with less current; as `Trials.run` has it."""
+        drives, count = self._drives, self._drives.num_axes
+        device = device_of(drives)
+        away = origin + direction * move.distance
+        shape = (len(PHASES), count)
+        aborted = np.zeros(shape, bool)
+        stopped, culprit = ~self._is_closed() & where, np.zeros(count, bool)
+        settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
+        first_error = np.zeros((TRIAL, count))
+        size = np.maximum(np.abs(move.distance), 1)
+        write_profile(drives, move, where)
+        for phase, (target, share) in enumerate(((away, 1.0), (origin, 1.0), (away, PROBE))):
+            used = np.where(stopped[:, None], incumbent, with_run_current(device, gains, share * move.share))
+            write_gains(drives, used, where)
+            position, demand, current, stopped, new = self._overload(target, incumbent, stopped, where)
+            culprit |= new
+            aborted[phase] = stopped
+            sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
+            settling[phase], noise[phase], overshoot[phase] = move_terms(
+                position, current * ampere_per_count(drives), move, self._t_0, self._motor.rated_current, target, sign
+            )
+            error = wrapped(demand - position) / size
+            following[phase] = np.abs(error).sum(axis=0) * CYCLE
+            if phase == 0:
+                first_error = error
+        write_gains(drives, np.where(stopped[:, None], incumbent, gains), where)
+        terms = Terms(settling, 1.0 + following / self._t_0, noise, overshoot, aborted)
+        return ClosedLoopTrial(terms, np.maximum(following, 0.5 * CYCLE), aborted, first_error, culprit)
+
+    def _overload(
+        self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
+    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+        """Move; return position, demand, current, the machines stopped so far, and the axes that caused it now."""
+        drives, to = self._drives, wrapped(target).astype(np.int64)
+        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
+        traces = []
+        culprit = np.zeros(len(stopped), bool)
+        self._prepare(objects)
+        start(drives, to, where)
+        for _ in range(TRIAL // WATCH):
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
+                trace = self._record(objects, WATCH)
+            traces.append(trace)
+            down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
+            shaking = shakes(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives), self._motor.rated_current)
+            new = self._whole_lanes(down | shaking) & where & ~stopped
+            if new.any():
+                write_gains(drives, incumbent, new)
+                stopped = stopped | new
+                culprit |= new & (down | shaking)
+            if down.any():
+                clear(drives, down)
+                start(drives, to, down)
+        position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
+        return position, demand, current, stopped, culprit
+
+    def _watch_no_window(self) -> None:
+        """Take 6065h away, which drives have again that were switched on: an axis that is overloaded falls behind."""
+        drives = self._drives
+        if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
+            drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
+
+    def _close(self, where: Mask, longest: float) -> None:
+        """Close loops that are open, and wait until they commutate; one that does not is stopped in its trial."""
+        drives = self._drives
+        if not np.any(opened := where & ~self._is_closed()):
+            return
+        drives.write(Role.LOOP_MODE, self._closed.mode, where=opened)
+        for _ in range(round(longest / LOOK)):
+            drives.advance(LOOK)
+            if not np.any(opened & ~self._is_closed()):
+                break
+
+    def _is_closed(self) -> Mask:
+        """Return whose loop is closed: of load angle control, once the encoder commutates."""
+        drives = self._drives
+        asked = drives.read(Role.LOOP_MODE) == self._closed.mode
+        return np.asarray(asked & ((self._closed.mode != LOAD_ANGLE) | (drives.read(Role.LOOP_INITIALISED) != 0)))
+
+
+def _full_step(motor: Motor) -> float:
+    return 2.0 * np.pi / (4.0 * motor.n_p)
