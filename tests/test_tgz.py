@@ -201,7 +201,7 @@ def test_quantities_are_by_the_scales_of_each_axis():
         drives.write((0x6094, 2), 500, where=np.array([True, False]))
         drives.write("Target velocity", "500 rpm")
         assert drives.read("Target velocity").tolist() == [250_000, 143]
-        with pytest.raises(ValueError, match="6071h:00 Target torque is not a quantity in 'rpm'; it takes .*, A, mA"):
+        with pytest.raises(ValueError, match=r"6071h:00 Target torque is not a quantity in 'rpm'; it takes .*, A, mA"):
             drives.write("Target torque", "3 rpm")
 
 
