@@ -1,12 +1,17 @@
+import functools
 import signal
 
 import numpy as np
 import pytest
+import typer.testing
 
 from drive_env import EmulatedDrives, motion
 from drive_env.master.description import Description
 
 ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
+
+# Typer makes a program's commands anew for each call, which takes longer than most commands.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 # A shell starts what runs in the background deaf to Ctrl-C, and nohup to the terminal's end; some tests send both.
 signal.signal(signal.SIGINT, signal.default_int_handler)
