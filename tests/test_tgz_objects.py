@@ -145,6 +145,7 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x23E2: (Scene(turn), 0, 1),
     0x23E3: (Scene(switch_on, rows={0x2303: 3}), 3, 0),
     0x23E4: (Scene(switch_on, rows={0x2303: 3}), 3, 0),
+    0x23E5: (Scene(turn, rows={0x23E4: 1}), 1000, 3000),
     0x6040: (Scene(wait, rows={0x2303: 3, 0x6060: 8}), 0, 6),
     0x6060: (Scene(wait), 0, 3),
     0x6065: (Scene(push, rows={0x6066: 10}), 0, 500),
