@@ -225,8 +225,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     short = f"{TOO_SHORT}: the field pulled the rotor to where less than {LEAST_TURN:g} electrical turns are free"
     reasons = [short if chosen and not can else "" for chosen, can in zip(where, able, strict=True)]
     field, hall = np.array(seen).transpose(1, 2, 0)
-    none = Halls(reason="the drive reads no halls")
-    halls = [judge_halls(*both) if has_halls else none for both in zip(field, hall, strict=True)]
+    halls = [judge_halls(*both) if has_halls else Halls() for both in zip(field, hall, strict=True)]
     return stands[1] - stands[0], stands[2] - stands[1], turned, halls, reasons
 
 
