@@ -12,13 +12,14 @@ from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
 from drive_env.master.quantities import (
     UNITS,
+    AxisScale,
     find_unit,
     in_unit,
-    increments_per_revolution,
     integers,
     is_quantity,
     parse,
     parse_raw,
+    scales_of,
     show,
 )
 
@@ -39,6 +40,7 @@ def entry(unit, low=-(2**31), high=2**31 - 1):
         ("mA", "current", 0.001), ("V", "voltage", 1.0), ("0.1V", "voltage", 0.1), ("s", "time", 1.0),
         ("ms", "time", 0.001), ("10ms", "time", 0.01), ("100us", "time", 0.0001), ("us", "time", 1e-6),
         ("512 clocks", "time", 32e-6),  # of 16 MHz
+        ("inc 64", "angle", 2**-28),
     ],
 )  # fmt: skip
 def test_every_unit_is_so_much_of_its_dimensions_own(unit, dimension, value):
@@ -127,12 +129,41 @@ def test_an_integer_is_shown_with_its_unit_and_as_people_say_it(raw, unit, incre
     assert show(raw, entry(unit), increments) == text
 
 
+# Numerator 3 over divisor 1000 (6094h): a velocity unit is 0.003 rpm. M-Ipeak is 8 A.
+OF_ITS_OWN = AxisScale(TURN, 3 / 1000, 8.0)
+
+
+@pytest.mark.parametrize(("text", "unit", "raw"), [
+    ("30 rpm", "velocity unit", 10_000), ("0.5 rev/s", "velocity unit", 10_000), ("-3 rpm", "velocity unit", -1000),
+    ("600 rpm/s", "velocity unit/s", 200_000), ("1 rev/s^2", "velocity unit/s", 20_000),
+    ("8 A", "1/32767 M-Ipeak", 32_767), ("-2 A", "1/32767 M-Ipeak", -8192), ("17", "velocity unit", 17),
+])  # fmt: skip
+def test_a_velocity_unit_and_a_part_of_the_peak_current_follow_their_own_scales(text, unit, raw):
+    assert parse(text, entry(unit), OF_ITS_OWN) == raw
+    if " " in text:
+        with pytest.raises(ValueError, match=r"has no unit that .* could be turned into"):
+            parse(text, entry(unit), TURN)
+
+
+def test_what_has_a_scale_of_its_own_is_shown_with_it():
+    assert show(10_000, entry("velocity unit"), OF_ITS_OWN) == "10000 velocity unit (30 rpm)"
+    assert show(20_000, entry("velocity unit/s"), OF_ITS_OWN) == "20000 velocity unit/s (1 rev/s^2)"
+    assert show(32_767, entry("1/32767 M-Ipeak"), OF_ITS_OWN) == "32767 1/32767 M-Ipeak (8 A)"
+
+
 @pytest.mark.parametrize(("values", "roles", "expected"), [
     ({}, {}, [None, None]), ({(0x608F, 1): (4096, 0)}, {}, [4096.0, None]),
     ({(0x2058, 0): (65536, 1)}, {Role.POSITION_SCALE: (0x2058, 0)}, [65536.0, 1.0]),
+    (
+        {(0x6094, 1): (1, 7), (0x6094, 2): (1000, 2), (0x23C3, 0): (4000, 8000)},
+        {
+            Role.VELOCITY_NUMERATOR: (0x6094, 1), Role.VELOCITY_DIVISOR: (0x6094, 2), Role.PEAK_CURRENT: (0x23C3, 0)
+        },
+        [(None, 0.001, 4.0), (None, 3.5, 8.0)],
+    ),
 ])  # fmt: skip
-def test_increments_of_a_revolution_where_the_drive_says_them(values, roles, expected):
+def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
     drives = HeldObjects(values, 2)
     drives.description.dictionary.roles.update(roles)
-    drives.read = lambda name: drives.values[roles.get(name, name)]
-    assert increments_per_revolution(drives) == expected
+    drives.read = lambda name: np.array(drives.values[roles.get(name, name)])
+    assert scales_of(drives) == expected

@@ -178,6 +178,33 @@ def test_torques_speeds_and_positions_have_the_scales_of_their_objects():
         np.testing.assert_allclose(per_increment(drives, 0x606C) * turn, [60_000.0, 120 / 7])
 
 
+def test_quantities_are_by_the_scales_of_each_axis():
+    """6094h, 608Fh and M-Ipeak, which differ from axis to axis; read with their units they are what was written."""
+    with two_axes() as drives:
+        drives.write(0x23C3, [4000, 8000])
+        drives.write((0x6094, 1), [1, 7])
+        drives.write((0x6094, 2), [1000, 2])
+        drives.write((0x608F, 1), [4096, 8192])
+        for name, text, raw in (
+            ("Target velocity", "500 rpm", [500_000, 143]),
+            ("Profile acceleration", "10 rev/s^2", [600_000, 171]),
+            ("Target torque", "2 A", [16384, 8192]),
+            ("Target position", "-0.25 rev", [-16384, -8192]),
+        ):
+            drives.write(name, text)
+            assert drives.read(name).tolist() == raw, name
+        trace = drives.record([0x60FF, 0x6071, 0x607A], 0.001)
+        np.testing.assert_allclose(trace[0x60FF, "rpm"], [[500.0, 500.5]])
+        np.testing.assert_allclose(trace[0x60FF, "rad/s"], [np.array([500.0, 500.5]) * np.pi / 30])
+        np.testing.assert_allclose(trace[0x6071, "A"], [[2.0, 2.0]], rtol=1e-4)
+        np.testing.assert_allclose(trace[0x607A, "rev"], [[-0.25, -0.25]])
+        drives.write((0x6094, 2), 500, where=np.array([True, False]))
+        drives.write("Target velocity", "500 rpm")
+        assert drives.read("Target velocity").tolist() == [250_000, 143]
+        with pytest.raises(ValueError, match=r"6071h:00 Target torque is not a quantity in 'rpm'; it takes .*, A, mA"):
+            drives.write("Target torque", "3 rpm")
+
+
 def test_what_is_written_keeps_its_integers_when_a_scale_changes():
     with two_axes() as drives:
         for name, value in ((0x6071, 1000), (0x607A, 12_345), (0x60FF, 777)):

@@ -153,6 +153,24 @@ def test_the_same_script_gives_the_same_integers_over_the_bus(inside, script, sa
     assert (np.ptp(moved, axis=0) > TURN // 100).all(), "every axis moves"
 
 
+def test_quantities_are_by_the_scales_of_each_axis_over_the_bus(inside):
+    with lockstep(inside) as drives:
+        drives.write((0x6094, 1), [1, 7])
+        drives.write((0x6094, 2), [1000, 2])
+        for name, text, raw in (
+            ("Target velocity", "500 rpm", [500_000, 143]),
+            ("Profile deceleration", "600 rpm/s", [600_000, 171]),
+        ):
+            drives.write(name, text)
+            assert drives.read(name).tolist() == inside.read(name).tolist() == raw
+        drives.write("Target torque", "2 A")
+        peak = inside.read(Role.PEAK_CURRENT) * 1e-3
+        assert drives.read("Target torque").tolist() == np.rint(2.0 * 32767 / peak).astype(int).tolist()
+        trace = drives.record([0x60FF, 0x6071], 0.001)
+        np.testing.assert_allclose(trace[0x60FF, "rpm"], [[500.0, 500.5]])
+        np.testing.assert_allclose(trace[0x6071, "A"], [[2.0, 2.0]], rtol=1e-3)
+
+
 def test_modes_are_changed_over_the_bus_while_the_axes_are_enabled(inside):
     with lockstep(inside) as drives:
         for mode in ("pv", "pp", "csp", "csv", "pv"):

@@ -150,9 +150,10 @@ def _emulated_node(
     if seed is not None:
         import numpy as np
 
-        from drive_env.envs.randomisation import Distributions, RandomMachines
+        from drive_env.envs.randomisation import RandomMachines, laws_of
 
-        RandomMachines(drives, Distributions.load(load)).redraw([np.random.default_rng(seed)], np.ones(1, bool), 1.0)
+        laws = laws_of(load, drives.device, drives.machine.parameters)
+        RandomMachines(drives, laws).redraw([np.random.default_rng(seed)], np.ones(1, bool), 1.0)
     if drives.num_axes > 1:
         drives.close()
         raise ValueError(f"load {load!r} has {drives.num_axes} axes; an agent tunes one axis: choose a load with one")

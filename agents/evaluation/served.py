@@ -53,17 +53,17 @@ def draw_machines(config: Any, count: int, seed: int) -> list[Machine]:
         ValueError: For a load that is not a name, or friction that is not served.
     """
     from drive_env.emulator.emulated_drives import EmulatedDrives
-    from drive_env.envs.randomisation import BESIDE, Distributions, RandomMachines, shipped
+    from drive_env.envs.randomisation import BESIDE, Distributions, RandomMachines, laws_of, shipped
 
     if not isinstance(config.load, str) or config.friction != "stribeck":
         raise ValueError(
             f"load {config.load} with friction {config.friction!r} is not served; take a load by name, with stribeck"
         )
-    laws = config.distributions
-    if laws is None:
-        laws = config.load if config.load in shipped() else {"parameters": {}}
     with EmulatedDrives(config.device, config.load, config.motor, count, num_threads=1) as drives:
-        axes = drives.load.num_axes
+        axes, laws = drives.load.num_axes, config.distributions
+        if laws is None:
+            known = drives.machine.parameters
+            laws = laws_of(config.load, drives.device, known) if config.load in shipped() else {"parameters": {}}
         random = RandomMachines(drives, Distributions.load(laws))
         random.redraw([np.random.default_rng((seed, k)) for k in range(count)])
         drawn = [name for name in random.distributions.laws if name not in BESIDE]

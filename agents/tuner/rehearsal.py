@@ -248,8 +248,10 @@ def _motor(target: Target, axis: int) -> Iterator[Check]:
 def _supply(target: Target, axis: int) -> Iterator[Check]:
     volts = float(target.supply[axis])
     text = f"{volts:g} V entered; the drive cannot measure it: measure it yourself, since the gains scale with it"
-    if _read(target, Role.BRAKE_CHOPPER, axis) and _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1 <= volts:
-        chopper = _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1
+    # A drive without objects of its chopper looks after it by itself.
+    chops = Role.BRAKE_CHOPPER in target.device.roles and _read(target, Role.BRAKE_CHOPPER, axis) != 0
+    chopper = _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1 if chops else np.inf
+    if chopper <= volts:
         yield Check("supply", NO, f"{volts:g} V entered, and the brake chopper acts from {chopper:g} V on: it would "
                                   "overheat; correct one of them")  # fmt: skip
     else:
@@ -335,7 +337,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     yield Role.CURRENT_LIMIT, f"up to {amperes}", "current limit during identification", False
     yield Role.OPEN_LOOP_CURRENT, f"0...{amperes}", "current of the encoder's check", False
     for role, wrong in FINDINGS.items():
-        yield role, "0, 1", f"if the check finds it wrong: {wrong}", True
+        if role in target.device.roles:
+            yield role, "0, 1", f"if the check finds it wrong: {wrong}", True
     yield Role.COMMUTATION, "1, 3", "open loop for the encoder's check, then the encoder again", False
     yield (cia402.FOLLOWING_WINDOW, 0), "up to 100 turns", "following error during the frequency response", False
     for sub, value in ((1, "1"), (2, "-3")):

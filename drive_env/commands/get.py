@@ -29,15 +29,16 @@ from drive_env.commands.options import (
     connect,
     errors_as_exit_codes,
     fail,
-    increments_per_revolution,
     look_first,
     object_name,
     print_json,
+    scales_of,
 )
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
     from drive_env.master.bus_drives import BusDrives
+    from drive_env.master.quantities import Scale
 
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
@@ -61,11 +62,11 @@ def get(
         connect(interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout, safety=False) as drives,
     ):
         entries = [drives.description.dictionary.find(object_name(name)) for name in objects]
-        increments = [None] * drives.num_axes if raw else increments_per_revolution(drives)
+        scales = [None] * drives.num_axes if raw else scales_of(drives)
         rows = []
         for entry in entries:
             values = drives.read((entry.index, entry.sub))
-            rows += [(k, entry, values[k], increments[k]) for k in axes_of(drives, entry, axis)]
+            rows += [(k, entry, values[k], scales[k]) for k in axes_of(drives, entry, axis)]
         if json:
             print_json([axis_place(drives, k) | _row(*row) for k, *row in rows])
             return
@@ -109,19 +110,18 @@ def set_object(
         chosen = axes_of(drives, entry, axis)
         is_controlword = cia402.of_first_axis(entry.index) == cia402.CONTROLWORD
         # A controlword has no unit, and one that stops is not kept waiting for what one would need.
-        increments = [None] * drives.num_axes if raw or is_controlword else increments_per_revolution(drives)
+        scales = [None] * drives.num_axes if raw or is_controlword else scales_of(drives)
         wanted: list[Any] = [value] * drives.num_axes
         if drives.description.is_number(entry):
             wanted = [
-                quantities.parse_raw(value, entry) if raw else quantities.parse(value, entry, scale)
-                for scale in increments
+                quantities.parse_raw(value, entry) if raw else quantities.parse(value, entry, scale) for scale in scales
             ]
         if is_controlword:
             _refuse_to_enable(entry, wanted[0])
         if is_of_a_watchdog(entry.index):
             _keep_watchdog(drives, entry)
         if dry_run:
-            _tell_plan(drives, entry, chosen, wanted, increments, value, raw=raw, json=json)
+            _tell_plan(drives, entry, chosen, wanted, scales, value, raw=raw, json=json)
             return
         if not is_controlword:
             _ask_where_live(drives, f"{entry.label} = {value}", yes)
@@ -131,10 +131,10 @@ def set_object(
         readable = entry.access != "wo"
         found = drives.read((entry.index, entry.sub)) if readable else wanted
         if json:
-            print_json([axis_place(drives, k) | _row(entry, found[k], increments[k]) for k in chosen])
+            print_json([axis_place(drives, k) | _row(entry, found[k], scales[k]) for k in chosen])
         else:
             for k in chosen:
-                print(f"{axis_name(drives, k)}  {entry.label} = {_text(found[k], entry, increments[k], raw)}")
+                print(f"{axis_name(drives, k)}  {entry.label} = {_text(found[k], entry, scales[k], raw)}")
         asked = _without_remote_frames(entry, [wanted[k] for k in chosen], [found[k] for k in chosen])
         differs = readable and any(found[k] != one for k, one in zip(chosen, asked, strict=True))
         # Stores and the like take a signature and read something else.
@@ -147,7 +147,7 @@ def _tell_plan(
     entry: Entry,
     axes: list[int],
     wanted: list[Any],
-    increments: list[Any],
+    scales: list[Any],
     text: str,
     *,
     raw: bool,
@@ -170,7 +170,7 @@ def _tell_plan(
         print_json(rows)
         return
     for axis in axes:
-        scale = increments[axis]
+        scale = scales[axis]
         now = "" if found[axis] is None else f" is {_text(found[axis], entry, scale, raw)};"
         then = _text(wanted[axis], entry, scale, raw) if is_number else text
         print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written (dry run: nothing was written)")
@@ -279,22 +279,22 @@ def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:
         ask(f"{who} is enabled by its statusword, and reacts at once (to stop it, set 6040 to 2). Write {what}?", yes)
 
 
-def _row(entry: Any, value: Any, increments: float | None) -> dict[str, Any]:
+def _row(entry: Any, value: Any, scale: Scale) -> dict[str, Any]:
     from drive_env.master import quantities
 
     row = {"index": f"{entry.index:04X}", "sub": entry.sub, "name": entry.name, "raw": value}
     if not isinstance(value, str):
         row["unit"] = entry.unit
-        row["text"] = quantities.show(int(value), entry, increments)
+        row["text"] = quantities.show(int(value), entry, scale)
     return row
 
 
-def _text(value: Any, entry: Any, increments: float | None, raw: bool) -> str:
+def _text(value: Any, entry: Any, scale: Scale, raw: bool) -> str:
     from drive_env.master import quantities
 
     if isinstance(value, str):
         return str(value)
     if raw or entry.bits is None:
         return str(value)
-    text = quantities.show(int(value), entry, increments)
+    text = quantities.show(int(value), entry, scale)
     return text if entry.unit else f"{text} ({int(value) & (1 << entry.bits) - 1:X}h)"

@@ -26,9 +26,9 @@ from drive_env.commands.options import (
     cycle_for,
     errors_as_exit_codes,
     fail,
-    increments_per_revolution,
     look_first,
     print_json,
+    scales_of,
 )
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectDictionary
     from drive_env.master.bus_drives import BusDrives
     from drive_env.master.description import Description
+    from drive_env.master.quantities import Scale
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
@@ -98,7 +99,7 @@ def jog(
             look_first(interface, channel, [node], bitrate, device, eds, timeout)
         with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
             one = _OneAxis(drives, axis)
-            scale = increments_per_revolution(drives)[axis]
+            scale = scales_of(drives)[axis]
             movement = _asked_for(one, known, scale, speed, by, duration)
             start = one.read(cia402.POSITION_ACTUAL)
             if dry_run:
@@ -199,7 +200,7 @@ class _Movement:
 
 
 def _asked_for(
-    one: _OneAxis, known: ObjectDictionary, scale: float | None, speed: str, by: str | None, duration: float
+    one: _OneAxis, known: ObjectDictionary, scale: Scale, speed: str, by: str | None, duration: float
 ) -> _Movement:
     """Return the movement that the arguments ask for, before the axis is enabled; ValueError for one that cannot be."""
     from drive_env.dictionary.access import check_limits
@@ -220,7 +221,7 @@ def _asked_for(
     return _Movement(velocity, duration, distance)
 
 
-def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale: float | None, axis: int) -> None:
+def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale: Scale, axis: int) -> None:
     """Write a recorded movement as table and picture, as scope does."""
     entries = [known.find(key) for key in DEFAULT_KEYS if known.has(key)]
     rows = {entry: trace[entry.index, entry.sub][:, axis : axis + 1] for entry in entries}
@@ -244,7 +245,7 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
         reasons.append(str(error).partition(";")[0])
 
 
-def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: float | None) -> str:
+def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> str:
     """Return what a speed is, and how rpm are written where it was a bare number."""
     from drive_env.master import quantities
 
@@ -283,7 +284,7 @@ def _tell_plan(
     by: str | None,
     duration: float,
     start: int,
-    scale: float | None,
+    scale: Scale,
     *,
     json: bool,
 ) -> None:

@@ -24,14 +24,15 @@ from drive_env.commands.options import (
     connect,
     default_objects,
     errors_as_exit_codes,
-    increments_per_revolution,
     object_name,
     print_json,
+    scales_of,
 )
 from drive_env.commands.tables import Column, tables
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
+    from drive_env.master.quantities import Scale
 
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
@@ -101,7 +102,7 @@ def _lines(drives: BusDrives, axes: list[int], entries: list[Any], period: float
 def _table(drives: BusDrives, axes: list[int], entries: list[Any], period: float, end: float) -> None:
     from rich.live import Live
 
-    increments = increments_per_revolution(drives)
+    scales = scales_of(drives)
     emergencies: list[str] = []
     with Live(auto_refresh=False) as live:
         while True:
@@ -109,7 +110,7 @@ def _table(drives: BusDrives, axes: list[int], entries: list[Any], period: float
                 when = time.strftime("%H:%M:%S")
                 emergencies.append(f"{when}  {axis_name(drives, message.axis)}: {message.code:04X}h {message.name}")
             live.update(
-                _draw(drives, axes, _look(drives, axes, entries), increments, emergencies[-5:], live.console.width),
+                _draw(drives, axes, _look(drives, axes, entries), scales, emergencies[-5:], live.console.width),
                 refresh=True,
             )
             if time.monotonic() + period > end:
@@ -121,7 +122,7 @@ def _draw(
     drives: BusDrives,
     axes: list[int],
     values: dict[Any, Any],
-    increments: list[float | None],
+    scales: list[Scale],
     emergencies: list[str],
     width: int,
 ) -> Any:
@@ -142,6 +143,6 @@ def _draw(
             elif entry.bits is None:
                 cells.append(str(value))
             else:
-                cells.append(show(int(value), entry, increments[axis]))
+                cells.append(show(int(value), entry, scales[axis]))
         rows.append((entry.label, *cells))
     return Group(*tables(columns, rows, width), *map(Text, emergencies))

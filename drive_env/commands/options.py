@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
     from drive_env.master.bus_drives import BusDrives
     from drive_env.master.description import Description
+    from drive_env.master.quantities import Scale
 
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
 AXIS_CYCLE = 0.001  # s of a bus of 1 Mbit/s for each axis of a node: seven frames
@@ -236,11 +237,11 @@ def ask(question: str, yes: bool) -> None:
         raise RuntimeError("nothing was changed")
 
 
-def increments_per_revolution(drives: BusDrives) -> list[float | None]:
-    """Return the position increments of a revolution of every axis, None where the drive does not say."""
+def scales_of(drives: BusDrives) -> list[Scale]:
+    """Return what the units of every axis follow, as far as the drive says it."""
     from drive_env.master import quantities
 
-    return quantities.increments_per_revolution(drives)
+    return quantities.scales_of(drives)
 
 
 def default_objects(known: ObjectDictionary, names: Iterable[str]) -> list[str]:

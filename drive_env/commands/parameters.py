@@ -27,9 +27,9 @@ from drive_env.commands.options import (
     connect,
     errors_as_exit_codes,
     fail,
-    increments_per_revolution,
     look_first,
     print_json,
+    scales_of,
 )
 from drive_env.commands.tables import Column, print_table
 from mechanics.untrusted import read_toml
@@ -37,6 +37,7 @@ from mechanics.untrusted import read_toml
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
     from drive_env.master.identity import Identity
+    from drive_env.master.quantities import Scale
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
@@ -121,7 +122,7 @@ def diff(
                 _check_axis(drives, axis)
                 differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
                 _tell_of_changes(file)
-                scale = increments_per_revolution(drives)[axis]
+                scale = scales_of(drives)[axis]
         _print(differences, "drive" if other is None else other.name, file.name, scale, json)
         if differences:
             raise typer.Exit(REFUSED)
@@ -252,7 +253,7 @@ def _exchange(
         _check_axis(drives, axis)
         check(drives)
         differences = compare(drives, wanted, axis)
-        scale = increments_per_revolution(drives)[axis]
+        scale = scales_of(drives)[axis]
         if not json:
             _print(differences, "drive", name, scale, json)
         if dry_run:
@@ -283,7 +284,7 @@ def _exchange(
         print(f"{len(changes)} written, {len(wanted)} verified by a second reading{kept}")
 
 
-def _tell_plan(differences: list[Any], scale: float | None, node: int, *, store: bool, json: bool) -> None:
+def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, json: bool) -> None:
     """Say what would be written."""
     if json:
         rows = [_row(difference, scale) for difference in differences]
@@ -392,7 +393,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not TOML, or incomplete: {error}; take another copy") from error
 
 
-def _print(differences: Iterable[Any], found: str, wanted: str, scale: float | None, json: bool) -> None:
+def _print(differences: Iterable[Any], found: str, wanted: str, scale: Scale, json: bool) -> None:
     rows = [_row(difference, scale) for difference in differences]
     if json:
         print_json(rows)
@@ -404,7 +405,7 @@ def _print(differences: Iterable[Any], found: str, wanted: str, scale: float | N
     print_table(columns, [(row["object"], row["found text"], row["wanted text"]) for row in rows])
 
 
-def _row(difference: Any, scale: float | None) -> dict[str, Any]:
+def _row(difference: Any, scale: Scale) -> dict[str, Any]:
     from drive_env.master.quantities import show
 
     entry, wanted, found = difference

@@ -29,13 +29,14 @@ from drive_env.commands.options import (
     default_objects,
     errors_as_exit_codes,
     fail,
-    increments_per_revolution,
     object_name,
     print_json,
+    scales_of,
 )
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
+    from drive_env.master.quantities import Scale
 
 # Response and commands of the usual modes: what `drive-env check-model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
@@ -92,7 +93,7 @@ def scope(
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
             condition = None if trigger is None else _parse(trigger, known)
             axes = axes_of_nodes(drives, axis)
-            every_scale = increments_per_revolution(drives)
+            every_scale = scales_of(drives)
             scales = [every_scale[k] for k in axes]
             labels = [axis_name(drives, k) for k in axes]
             rows, start, broken = _record(drives, axes, entries, condition, scales, duration, before, wait)
@@ -156,7 +157,7 @@ def _parse(text: str, known: Any) -> Trigger:
     return Trigger(known.find(object_name(found[1])), found[2], found[3])
 
 
-def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
+def _fires(trigger: Trigger, values: Any, scales: list[Scale]) -> Any:
     """Return in which rows the condition holds on any of the axes."""
     import operator
 
@@ -224,7 +225,7 @@ def _record(
     axes: list[int],
     entries: list[Any],
     trigger: Trigger | None,
-    scales: list[float | None],
+    scales: list[Scale],
     duration: float,
     before: float,
     wait: float,
@@ -243,7 +244,7 @@ def _record(
 
 
 def _wait_for(
-    trigger: Trigger, samples: _Samples, scales: list[float | None], keep: int, wait: float
+    trigger: Trigger, samples: _Samples, scales: list[Scale], keep: int, wait: float
 ) -> tuple[dict[Any, Any], int]:
     """Return the rows around the trigger, at least `keep` before it if there were so many, and at which row it fired.
 
@@ -288,10 +289,8 @@ def write_table(path: Path, entries: list[Any], labels: list[str], t: Any, rows:
             writer.writerow([f"{time:.3f}", *(int(v) for entry in entries for v in rows[entry][k])])
 
 
-def draw(
-    path: Path, entries: list[Any], labels: list[str], scales: list[float | None], t: Any, rows: dict[Any, Any]
-) -> None:
-    """Draw samples as PNG, a panel for each entry, in units where the scale of positions [inc/rev] is known."""
+def draw(path: Path, entries: list[Any], labels: list[str], scales: list[Scale], t: Any, rows: dict[Any, Any]) -> None:
+    """Draw samples as PNG, a panel for each entry, in units where their scales are known."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

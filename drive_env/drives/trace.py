@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.master.quantities import INCREMENTAL, SHOWN, find_unit, in_unit
+from drive_env.master.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
-Scale = Callable[[], Sequence[float | None]]
+Scales = Callable[[], Sequence[Scale]]
 
 
 class Trace:
@@ -31,8 +31,8 @@ class Trace:
         t: Sample times [s].
         values: Integers by index and sub-index.
         dictionary: Where names and units are found.
-        scale: Gives the position increments per revolution of each axis, None where the drive does not say; asked
-            when a unit needs them. Without it they are not known.
+        scale: Gives what the units of each axis follow, as far as the drive says it; asked when a unit needs it.
+            Without it nothing of it is known.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Trace:
         t: Floats,
         values: dict[tuple[int, int], Integers],
         dictionary: ObjectDictionary,
-        scale: Scale | None = None,
+        scale: Scales | None = None,
     ) -> None:
         self.t = t
         self._values = values
@@ -54,7 +54,7 @@ class Trace:
     def __getitem__(self, name: ObjectName | tuple[ObjectName, str]) -> Integers | Floats:
         if isinstance(name, tuple) and isinstance(name[1], str):
             entry = self._dictionary.find(name[0])
-            return in_unit(self[name[0]], entry, name[1], self._increments(entry))
+            return in_unit(self[name[0]], entry, name[1], self._scales(entry))
         entry = self._dictionary.find(name)
         if (entry.index, entry.sub) not in self._values:
             recorded = ", ".join(self._dictionary.find(key).label for key in self._values)
@@ -118,7 +118,7 @@ class Trace:
         panels = figure.subplots(len(self._values), 1, sharex=True, squeeze=False)[:, 0]
         for panel, (key, values) in zip(panels, self._values.items(), strict=True):
             entry = self._dictionary.find(key)
-            scale = self._increments(entry)
+            scale = self._scales(entry)
             units = {
                 None if unit is None else SHOWN[unit.dimension]
                 for unit in (find_unit(entry.unit, one) for one in scale)
@@ -145,8 +145,8 @@ class Trace:
             for axis in range(values.shape[-1]):
                 yield (name if self._axes == 1 else f"{name} (axis {axis})"), values[:, axis]
 
-    def _increments(self, entry: Entry) -> Sequence[float | None]:
+    def _scales(self, entry: Entry) -> Sequence[Scale]:
         # Not asked of a drive where no unit follows them.
-        if self._scale is None or entry.unit not in INCREMENTAL:
+        if self._scale is None or not follows_scale(entry.unit):
             return [None] * self._axes
         return self._scale()

@@ -39,7 +39,7 @@ from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
-from drive_env.master.quantities import integers, is_quantity
+from drive_env.master.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.motors import Motor, find_motor
 from mechanics.load import Load
 from mechanics.loads import find_load
@@ -181,7 +181,7 @@ class EmulatedDrives:
         if serial is not None:
             self._objects.engrave(serial, np.repeat(numbers + 1, self.load.num_axes))
         self._objects.restart(np.ones(self.num_axes, bool))
-        self._scale: tuple[int, list[float | None]] = (-1, [])
+        self._scale: tuple[int, list[Scale]] = (-1, [])
 
     @property
     def codes(self) -> Mapping[tuple[int, int], Code]:
@@ -210,14 +210,16 @@ class EmulatedDrives:
         if is_quantity(value):
             entry = self._objects.entries.find(name)
             if entry.bits is not None:
-                value = integers(str(value), entry, self._increments(), axes)
+                value = integers(str(value), entry, self._scales(), axes)
         self._objects.write(name, value, axes)
 
-    def _increments(self) -> list[float | None]:
-        """Return the position increments per revolution of each axis, read again once they were written."""
+    def _scales(self) -> list[Scale]:
+        """Return what the units of each axis follow, read again once it was written."""
         if self._scale[0] != self._objects.scale_changes:
-            read = self.read(Role.POSITION_SCALE).tolist()
-            self._scale = self._objects.scale_changes, [float(scaler) or None for scaler in read]
+            found = self._objects.context()
+            every = (found.position_scaler, found.velocity_ratio, found.peak_current)
+            rows = np.stack([np.broadcast_to(np.asarray(one, float), (self.num_axes,)) for one in every], axis=1)
+            self._scale = self._objects.scale_changes, [AxisScale(*row) for row in rows.tolist()]
         return self._scale[1]
 
     def advance(self, duration: float) -> None:
@@ -282,7 +284,7 @@ class EmulatedDrives:
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
         t = np.arange(rows, dtype=np.float64) * (every * self._cycle)
-        scale = self._increments()
+        scale = self._scales()
         return Trace(t, values, self._objects.entries, lambda: scale)
 
     def emergencies(self) -> list[EmergencyMessage]:

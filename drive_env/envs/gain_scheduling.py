@@ -25,7 +25,7 @@ from drive_env.envs.changing_payload import PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
+from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, small_time_constants, write_gains
 from drive_env.motors import Motor, find_motor
@@ -359,7 +359,8 @@ class GainScheduling(VectorEnvironment):
                 raise ValueError("distributions are of emulated machines; leave them out on a bus")
             return
         if laws is None:
-            laws = self.config.load if self.config.load in shipped() else {"parameters": {}}
+            load, known = self.config.load, self.drives.device
+            laws = laws_of(load, known, machine.parameters) if known and load in shipped() else {"parameters": {}}
         self._machines = RandomMachines(machine.drives, Distributions.load(laws))
         changes = max(1, round(self.config.duration / self.config.payload_every))
         self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)

@@ -27,7 +27,7 @@ from drive_env.envs.gain_observation import (
     true_entries,
 )
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
+from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.gains import read_gains
 from drive_env.motors import Motor, find_motor
@@ -239,10 +239,8 @@ class GainTuning(VectorEnvironment):
         c = self.config
         laws = c.distributions
         if laws is None:
-            laws = c.load if c.load in shipped() else {"parameters": {}}
-            if laws == c.load and self._device.gains.is_open_loop:  # the load's set has a servo motor's laws, too
-                known = machine_of(self.drives).parameters
-                laws = Distributions.load({"include": [c.load, "stepper"], "parameters": {}}).of_machine(known)
+            known = machine_of(self.drives).parameters
+            laws = laws_of(c.load, self._device, known) if c.load in shipped() else {"parameters": {}}
         self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
         self._score = new_score(

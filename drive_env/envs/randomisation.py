@@ -26,6 +26,7 @@ from drive_env.faults.table import FAULTS, names_of
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
+    from drive_env.devices import Device
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
 Floats = NDArray[np.float64]
@@ -335,6 +336,20 @@ class RandomMachines:
 def shipped() -> list[str]:
     """Return the names of the shipped sets."""
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def laws_of(load: str, device: Device, parameters: Collection[str]) -> Distributions:
+    """Return the set that ships for a load, with what the device's machines have otherwise than servo drives.
+
+    Args:
+        load: Name of a load that has a set.
+        device: The device.
+        parameters: Names of what its machines have; the set's others are left out.
+    """
+    own = "stepper" if device.gains.is_open_loop else device.firmware_name
+    if own not in shipped():
+        return Distributions.load(load)
+    return Distributions.load({"include": [load, own], "parameters": {}}).of_machine(parameters)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from drive_env.master.description import Description
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.link import Link, ObjectClient
 from drive_env.master.pace import Pace, Timing
-from drive_env.master.quantities import INCREMENTAL, increments_per_revolution, integers, is_quantity
+from drive_env.master.quantities import follows_scale, integers, is_quantity, scales_of
 from drive_env.master.sampling import run_cycles
 from drive_env.safety.envelope import Envelope
 from drive_env.safety.limits import Limits
@@ -126,8 +126,8 @@ class BusDrives:
                 self.write_axis(entry, int(axis), value)
             return
         if is_quantity(value):
-            scale = increments_per_revolution(self) if entry.unit in INCREMENTAL else [None] * self.num_axes
-            value = integers(str(value), entry, scale, axes)
+            scales = scales_of(self) if follows_scale(entry.unit) else [None] * self.num_axes
+            value = integers(str(value), entry, scales, axes)
         raw = checked_values(entry, value, self.num_axes)
         if self.safety is not None:
             self.safety.before_write(entry, raw, axes)
@@ -196,7 +196,7 @@ class BusDrives:
             key = (entry.index, entry.sub)
             values[key] = np.tile(self.read_entry(entry), (rows, 1)) if self.is_dry else found[key][::every]
         times = np.arange(rows, dtype=np.float64) * (every * self._description.cycle)
-        return Trace(times, values, self._description.dictionary, lambda: increments_per_revolution(self))
+        return Trace(times, values, self._description.dictionary, lambda: scales_of(self))
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.

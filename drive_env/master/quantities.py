@@ -1,6 +1,7 @@
 """Quantities as people write them: `1000 rpm`, `7 A`, `0.5 rev`; and the integers that a drive has instead.
 
-The EDS names the unit of each object (`Entry.unit`); positions and speeds count increments of a revolution.
+The EDS names the unit of each object (`Entry.unit`). Most drives count positions and speeds in increments of a
+revolution; some have a unit of velocity of their own (6094h), or tell torques in parts of the motor's peak current.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
-from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.position_scale import position_scale, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import split_unit
+from drive_env.drives.currents import MILLIAMPERE
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -30,11 +32,26 @@ class EnteredUnit(NamedTuple):
     factor: float
 
 
+class AxisScale(NamedTuple):
+    """What units of an axis follow, each None where it is not known.
+
+    These are position increments of a revolution, rpm of a velocity unit, and the motor's peak current [A].
+    """
+
+    increments: float | None = None
+    rpm: float | None = None
+    peak_current: float | None = None
+
+
+# What units of an axis follow; of most drives that is the increments of a revolution alone. None: nothing is known.
+Scale = AxisScale | float | None
+
 UNITS = {
     "rev": EnteredUnit("angle", 1.0),
     "deg": EnteredUnit("angle", 1.0 / 360.0),
     "rad": EnteredUnit("angle", 0.5 / math.pi),
     "1/65536 rev": EnteredUnit("angle", 1.0 / 65536.0),
+    "inc 64": EnteredUnit("angle", 2.0**-28),
     "rev/s": EnteredUnit("speed", 1.0),
     "rpm": EnteredUnit("speed", 1.0 / 60.0),
     "rad/s": EnteredUnit("speed", 0.5 / math.pi),
@@ -53,29 +70,54 @@ UNITS = {
     "100us": EnteredUnit("time", 1e-4),
     "us": EnteredUnit("time", 1e-6),
 }
-# Units that follow the increments of a revolution.
-INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
+# Units that follow the increments of a revolution, the rpm of a velocity unit, the motor's peak current.
+_INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
+_BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s"}
+_OF_PEAK = {"1/32767 M-Ipeak": 1.0 / 32767.0}
 SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "A", "voltage": "V", "time": "s"}
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$")
 
 
-def find_unit(name: str, increments: float | None) -> EnteredUnit | None:
-    """Return a unit by name; `increments` per revolution, None where they are unknown."""
-    if name in INCREMENTAL:
-        return None if not increments else EnteredUnit(INCREMENTAL[name], 1.0 / increments)
+def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
+    """Return a unit by name, None of one that there is not, or whose scale is not known."""
+    known = scale if isinstance(scale, AxisScale) else AxisScale(scale)
+    if name in _INCREMENTAL:
+        return EnteredUnit(_INCREMENTAL[name], 1.0 / known.increments) if known.increments else None
+    if name in _BY_RATIO:
+        unit = UNITS[_BY_RATIO[name]]
+        return unit._replace(factor=known.rpm * unit.factor) if known.rpm else None
+    if name in _OF_PEAK:
+        return EnteredUnit("current", known.peak_current * _OF_PEAK[name]) if known.peak_current else None
     if name in UNITS:
         return UNITS[name]
     number, base = split_unit(name)
-    row = None if base == name else find_unit(base, increments)
+    row = None if base == name else find_unit(base, scale)
     return None if row is None else row._replace(factor=number * row.factor)
 
 
-def increments_per_revolution(drives: BusDrives) -> list[float | None]:
-    """Return the position increments of a revolution of every axis, None where the drive does not say.
+def follows_scale(name: str) -> bool:
+    """Return whether a unit follows a scale of its axis, which a drive is to be asked for then."""
+    return split_unit(name)[1] in (*_INCREMENTAL, *_BY_RATIO, *_OF_PEAK)
+
+
+def scales_of(drives: BusDrives) -> list[Scale]:
+    """Return what the units of every axis follow, as far as the drive says it.
 
     Args:
         drives: On a bus.
     """
+    increments, roles = _increments_of(drives), drives.description.dictionary.roles
+    ratio = velocity_ratio(roles)
+    if ratio is None and Role.PEAK_CURRENT not in roles:
+        return list(increments)
+    unknown: list[float | None] = [None] * drives.num_axes
+    rpm = unknown if ratio is None else ratio.increments([drives.read(key).astype(float) for key in ratio.keys])
+    peak = unknown if Role.PEAK_CURRENT not in roles else MILLIAMPERE * drives.read(Role.PEAK_CURRENT).astype(float)
+    return [AxisScale(*one) for one in zip(increments, rpm, peak, strict=True)]
+
+
+def _increments_of(drives: BusDrives) -> list[float | None]:
+    """Return the position increments of a revolution of every axis, None where the drive does not say."""
     known = drives.description
     encoder = (cia402.ENCODER_RESOLUTION, 1)
     own = position_scale(known.dictionary.roles) is not None
@@ -84,13 +126,13 @@ def increments_per_revolution(drives: BusDrives) -> list[float | None]:
     return [float(value) or None for value in drives.read(Role.POSITION_SCALE if own else encoder)]
 
 
-def parse(text: str, entry: Entry, increments: float | None) -> int:
+def parse(text: str, entry: Entry, scale: Scale) -> int:
     """Return the integer for an object that is written as text: a plain integer (also 0x...), or a quantity.
 
     Args:
         text: What was written.
         entry: The object.
-        increments: Position increments per revolution, None where they are unknown.
+        scale: What the axis' units follow.
 
     Raises:
         ValueError: For what is no number, or a unit that does not fit the object.
@@ -111,7 +153,7 @@ def parse(text: str, entry: Entry, increments: float | None) -> int:
                 f"{entry.label} takes integers{_counted(entry)}; {text} is not one, choose {round(number)}"
             )
         return int(number)
-    count = number / _factor(entry, name, increments)
+    count = number / _factor(entry, name, scale)
     if not math.isfinite(count):
         raise ValueError(_too_large(text, entry))
     return round(count)
@@ -126,14 +168,14 @@ def is_quantity(value: object) -> bool:
 
 
 def integers(
-    text: str, entry: Entry, scale: Sequence[float | None], where: NDArray[np.bool_] | None = None
+    text: str, entry: Entry, scale: Sequence[Scale], where: NDArray[np.bool_] | None = None
 ) -> NDArray[np.int64]:
     """Return the integer of each axis for an object that is written as a quantity, 0 where the mask is not true.
 
     Args:
         text: As `parse` takes it.
         entry: The object.
-        scale: Position increments per revolution of each axis, None where they are unknown.
+        scale: What the units of each axis follow.
         where: Axes.
 
     Raises:
@@ -143,14 +185,14 @@ def integers(
     return np.array([parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)], np.int64)
 
 
-def in_unit(raw: NDArray[np.int64], entry: Entry, unit: str, scale: Sequence[float | None]) -> NDArray[np.float64]:
+def in_unit(raw: NDArray[np.int64], entry: Entry, unit: str, scale: Sequence[Scale]) -> NDArray[np.float64]:
     """Return integers of an object in a unit, of the same shape; axes are the last dimension.
 
     Args:
         raw: As the wire carries them.
         entry: The object.
         unit: A row of the units, or the object's own.
-        scale: Position increments per revolution of each axis, None where they are unknown.
+        scale: What the units of each axis follow.
 
     Raises:
         ValueError: For a unit that does not fit the object.
@@ -160,9 +202,9 @@ def in_unit(raw: NDArray[np.int64], entry: Entry, unit: str, scale: Sequence[flo
     return np.asarray(raw * np.array([_factor(entry, unit, one) for one in scale]), np.float64)
 
 
-def _factor(entry: Entry, name: str, increments: float | None) -> float:
+def _factor(entry: Entry, name: str, scale: Scale) -> float:
     """Return how many of a unit one count of an object is."""
-    own, given = find_unit(entry.unit, increments), find_unit(name, increments)
+    own, given = find_unit(entry.unit, scale), find_unit(name, scale)
     if own is None:
         raise ValueError(f"{entry.label} has no unit that {name} could be turned into; give its integer")
     if given is None or given.dimension != own.dimension:
@@ -181,10 +223,10 @@ def parse_raw(text: str, entry: Entry) -> int:
         ) from None
 
 
-def show(raw: int, entry: Entry, increments: float | None) -> str:
+def show(raw: int, entry: Entry, scale: Scale) -> str:
     """Return an integer with its unit and, where that helps, as a quantity: `1092267 pps (1000 rpm)`."""
     text = f"{raw} {entry.unit}".rstrip()
-    unit = find_unit(entry.unit, increments)
+    unit = find_unit(entry.unit, scale)
     if unit is None or SHOWN[unit.dimension] == entry.unit:
         return text
     shown = SHOWN[unit.dimension]

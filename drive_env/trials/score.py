@@ -8,7 +8,7 @@ Lower is better. Every machine is judged on its own scales:
     t_0 = four times the sum of the small time constants
     E_d = integral of |e| dt after a load step of 0.3 rated torque; E_0 that with the gains of the baseline rule
     n   = RMS increment of the demanded current from millisecond to millisecond, at rest before the load step, over the
-          rated current; on a bus that of the actual current
+          rated current; on a bus, and of a drive that does not tell its current's error, that of the actual current
     os  = largest way beyond the target over the move
 
 An open-loop stepper has a J of its own (`open_loop.py`).
@@ -60,6 +60,8 @@ TRIP = 30.0
 NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
 LOAD_SHARE = 0.3  # of the rated torque
 _NOISE = 7919.0  # between the seeds of the noise of runs that are repeated
+# Parts of the demanded current. What a drive has no object for, it does not tell.
+_DEMANDED: tuple[ObjectName, ...] = (cia402.TORQUE_ACTUAL, Role.TORQUE_ERROR)
 
 _INERTIA = ("body_inertia", "body_mass", "density")  # fields of load parameters that are the load's inertia
 _STIFFNESS = ("jnt_stiffness", "contact_stiffness")
@@ -286,16 +288,12 @@ class RobustScore:
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             power_up(drives)
             start(drives, move.distance)
-            objects: list[ObjectName] = [
-                cia402.POSITION_ACTUAL,
-                cia402.TORQUE_ACTUAL,
-                Role.TORQUE_ERROR,
-                cia402.STATUSWORD,
-            ]
+            demanded = [name for name in _DEMANDED if not isinstance(name, Role) or name in drives.device.roles]
+            objects: list[ObjectName] = [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
             free = drives.record(objects, SETTLED * CYCLE)
             drives.machine.load_torque = self._constant + self._load_torque
             loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
-        current = (free[cia402.TORQUE_ACTUAL] + free[Role.TORQUE_ERROR]) * ampere_per_count(drives)
+        current = sum(free[name] for name in demanded) * ampere_per_count(drives)
         direction = np.where(move.distance < 0, -1, 1)
         settling, noise, overshoot = move_terms(
             free[cia402.POSITION_ACTUAL].astype(float),

@@ -54,6 +54,9 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
     for name, value in zip(_keys(target, names := _commissioning(target)), names.values(), strict=True):
         if name not in findings(target.device):
             target.drives.write(name, value, where=fresh)
+    bench.note(fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
+    if Role.LIMIT_SWITCHES not in target.device.roles:
+        return fresh
     # No axis is at both ends: switches that say so are not there.
     unwired = fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
     target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
@@ -61,7 +64,6 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
     bench.note(
         unwired, f"both limit switches were active at once, so they are not connected: they are ignored ({index:04X}h)"
     )
-    bench.note(fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
     return fresh
 
 
@@ -111,10 +113,9 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
     for k, values in enumerate(transaction.before.axes):
         wanted = dict(values)
         if fresh[k]:
-            commissioned = [
-                *_keys(bench.target, _commissioning(bench.target)),
-                bench.target.device.roles[Role.LIMIT_SWITCHES],
-            ]
+            commissioned = _keys(bench.target, _commissioning(bench.target))
+            if Role.LIMIT_SWITCHES in bench.target.device.roles:
+                commissioned.append(bench.target.device.roles[Role.LIMIT_SWITCHES])
             wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
         wanted |= {key: int(drives.read(key)[k]) for key in findings(bench.target.device) if key in values}
         axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.envs.randomisation import Distributions, shipped
+from drive_env.envs.randomisation import laws_of, shipped
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
@@ -291,7 +292,7 @@ def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int
     defaults = _checked_defaults(where, device, load, motor)
     if load not in shipped():
         raise ExperimentError(f"{where}: load {load!r} has no distributions; there are {', '.join(shipped())}")
-    laws = Distributions.load(load)
+    laws = laws_of(load, find_device(device), defaults)
     rng = np.random.default_rng((seed, number))
     known = defaults | {_SUPPLY: find_motor(motor).voltage}
     for _ in range(_TRIES):

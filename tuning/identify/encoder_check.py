@@ -23,7 +23,7 @@ from drive_env.drives.currents import to_counts
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.wiring import Halls, judge_halls
-from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, still_enabled, switch_off
+from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, read_role, still_enabled, switch_off
 from tuning.oscillation_watch import shaken
 from tuning.stop_causes import stop_causes
 
@@ -88,7 +88,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
         drives.write(Role.COMMUTATION, commutation, where=where)
     # Counting up is the field's direction unless 2057h turns the sign of positions around.
-    shaft = 1.0 - 2.0 * drives.read(Role.SHAFT_DIRECTION)
+    shaft = 1.0 - 2.0 * read_role(target, Role.SHAFT_DIRECTION)
     found = []
     causes = [] if alive.all() else stop_causes(drives)
     for k in range(count):
@@ -191,7 +191,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
         why an axis was not turned.
     """
     drives = working.target.drives
-    current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
+    current = to_counts(drives, SHARE * working.current)
     for k in range(1, 5):
         drives.write(Role.OPEN_LOOP_CURRENT, current * k // 4, where=where)
         drives.advance(RAISE // 4 * CYCLE)
@@ -201,7 +201,8 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     turn = np.where(able, turn, 0.0)
     # Smooth, so that the rotor does not swing: a raised cosine of speed.
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
-    seen = [(_angle(working, Role.FIELD_ANGLE), _angle(working, Role.HALL_ANGLE))]
+    has_halls = Role.HALL_ANGLE in working.target.device.roles
+    seen = [_field_and_halls(working)]
     for sign in (1.0, -1.0):
         speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
         raw = np.where(where, np.rint(speed * working.speed_counts()), 0).astype(np.int64)
@@ -214,7 +215,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
             )
             now = _angle(working, Role.FIELD_ANGLE)
             if sign > 0.0:
-                seen.append((now, _angle(working, Role.HALL_ANGLE)))
+                seen.append(_field_and_halls(working))
             passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
             before = now
             stay_inside(working, where)
@@ -224,7 +225,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     short = f"{TOO_SHORT}: the field pulled the rotor to where less than {LEAST_TURN:g} electrical turns are free"
     reasons = [short if chosen and not can else "" for chosen, can in zip(where, able, strict=True)]
     field, hall = np.array(seen).transpose(1, 2, 0)
-    halls = [judge_halls(*both) for both in zip(field, hall, strict=True)]
+    halls = [judge_halls(*both) if has_halls else Halls() for both in zip(field, hall, strict=True)]
     return stands[1] - stands[0], stands[2] - stands[1], turned, halls, reasons
 
 
@@ -238,6 +239,12 @@ def stay_inside(working: Working, where: Mask) -> None:
 
 def _angle(working: Working, name: Role) -> Floats:
     return np.asarray(working.target.drives.read(name) * (2.0 * np.pi / 65536.0))
+
+
+def _field_and_halls(working: Working) -> tuple[Floats, Floats]:
+    """Return the angles of field and halls [electrical rad]; the latter is 0 of a drive that reads none."""
+    halls = read_role(working.target, Role.HALL_ANGLE) * (2.0 * np.pi / 65536.0)
+    return _angle(working, Role.FIELD_ANGLE), np.asarray(halls)
 
 
 def _rest(working: Working) -> Floats:

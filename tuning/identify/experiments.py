@@ -32,6 +32,7 @@ from tuning.identify.working_state import (
     cautious_gains,
     enable,
     go_back,
+    read_role,
     still_enabled,
     working_state,
 )
@@ -210,7 +211,7 @@ class Experiments:
         gains = cautious_gains(target, GUESS * target.motor.inertia)
         write_gains(drives, gains, working.where)
         go_back(working, "csv")
-        sign = 1.0 - 2.0 * drives.read(Role.SHAFT_DIRECTION)
+        sign = 1.0 - 2.0 * read_role(target, Role.SHAFT_DIRECTION)
         windings = identify_winding(
             working, pulses, np.asarray(electrical, np.float64), float(target.motor.n_p) * float(sign[0])
         )
@@ -323,7 +324,7 @@ def _aligned_by_halls(working: Working) -> Mask:
     """Return which drives commutate by an encoder that the halls align."""
     drives = working.target.drives
     by_encoder = drives.read(Role.COMMUTATION) == BY_ENCODER
-    return np.asarray(by_encoder & (drives.read(Role.ENCODER_INITIALISATION) == ALIGNED_BY_HALLS))
+    return np.asarray(by_encoder & (read_role(working.target, Role.ENCODER_INITIALISATION) == ALIGNED_BY_HALLS))
 
 
 def _in_real_time(working: Working) -> bool:

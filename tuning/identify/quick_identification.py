@@ -24,7 +24,7 @@ from tuning.identify.encoder_check import PULSED
 from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
-from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, switch_off
+from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, read_role, switch_off
 from tuning.oscillation_watch import shaken
 from tuning.response.frequency_response import measure
 from tuning.stop_causes import stop_causes
@@ -103,7 +103,7 @@ class _Brief(Experiments):
         with shaken(drives, PULSED * working.current):
             pulses = pulse(working, holding, BRIEFLY)
         working = self.calm(working)
-        sign = 1.0 - 2.0 * float(drives.read(Role.SHAFT_DIRECTION)[0])
+        sign = 1.0 - 2.0 * float(read_role(target, Role.SHAFT_DIRECTION)[0])
         self.take_windings(
             working, identify_winding(working, pulses, np.asarray(electrical, np.float64), target.motor.n_p * sign)
         )

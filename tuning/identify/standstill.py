@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, to_counts
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
 from tuning.identify.encoder_check import able, stay_inside
@@ -45,7 +46,7 @@ def standstill_resistances(working: Working) -> list[Estimate]:
     where, reasons = able(working)
     if not where.any():
         return [refused("ohm", reason) for reason in reasons]
-    commutation = drives.read(Role.COMMUTATION)
+    commutation, per_count = drives.read(Role.COMMUTATION), ampere_per_count(drives)
     levels = [share for k in range(ROUNDS) for share in LEVELS[:: 1 if k % 2 == 0 else -1]]
     currents, duties, errors, angles = (np.zeros((len(levels), target.num_axes)) for _ in range(4))
     try:
@@ -53,15 +54,15 @@ def standstill_resistances(working: Working) -> list[Estimate]:
         drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
         for row, share in enumerate(levels):
-            raw = np.rint(1e3 * share * working.current).astype(np.int64)
+            raw = to_counts(drives, share * working.current)
             drives.write(Role.OPEN_LOOP_CURRENT, raw, where=where)
             drives.advance(SETTLE * CYCLE)
             stay_inside(working, where)
             for _ in range(READINGS):
                 drives.advance(APART * CYCLE)
                 duties[row] += drives.read(Role.FLUX_ERROR_SUM) / (READINGS * 32768.0 * 256.0)
-                errors[row] += drives.read(Role.FLUX_ERROR) * (1e-3 / READINGS)
-            currents[row] = raw * 1e-3
+                errors[row] += drives.read(Role.FLUX_ERROR) * (per_count / READINGS)
+            currents[row] = raw * per_count
             angles[row] = working.angle(drives.read(cia402.POSITION_ACTUAL))
         field = drives.read(Role.FIELD_ANGLE) * (2.0 * np.pi / 65536.0)
         alive = still_enabled(working, drives.read(cia402.STATUSWORD))

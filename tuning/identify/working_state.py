@@ -39,14 +39,23 @@ STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is al
 
 
 def borrowed(device: Device) -> tuple[ObjectName, ...]:
-    """Return what experiments change, in the order in which it is given back."""
-    return (
+    """Return what experiments change, in the order in which it is given back, as far as the device has it."""
+    names: tuple[ObjectName, ...] = (
     Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
     Role.ENCODER_STEPS, *FINDINGS,
     cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
     Role.LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
     (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
 )  # fmt: skip
+    return tuple(name for name in names if not isinstance(name, Role) or name in device.roles)
+
+
+def read_role(target: Target, role: Role) -> Integers:
+    """Return an object by its role, shape (num_axes,); 0 of a drive that has none such, which is as if it were unused.
+
+    So a drive without a setting of the shaft's direction turns it nowhere, and one without flags aligns no encoder.
+    """
+    return target.drives.read(role) if role in target.device.roles else np.zeros(target.num_axes, np.int64)
 
 
 BRUSHED, BRUSHLESS = 1, 3  # 2050h
@@ -159,7 +168,8 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
         drives.write(Role.COMMUTATION, BY_ENCODER, where=fresh)
         # No axis is at both ends: switches that say so are not there.
         unwired = fresh & (drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
-        drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+        if Role.LIMIT_SWITCHES in target.device.roles:
+            drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     own = before[Role.CURRENT_LIMIT] * ampere_per_count(drives)
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
     drives.write(Role.CURRENT_LIMIT, to_counts(drives, current), where=axes)
@@ -202,12 +212,16 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
         if aligns.any():  # the flags are those of the millisecond before; and what was switched on comes to rest
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
-        while np.any(aligns & (drives.read(Role.MOTOR_FLAGS) & STOP_MODE != 0)) and waited < ALIGNMENT_TIME:
+        while waited < ALIGNMENT_TIME and np.any(aligns & _is_aligning(working.target)):
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
     except (TimeoutError, RuntimeError) as error:
         causes = ", ".join(sorted({message.name for message in drives.emergencies()}))
         raise RuntimeError(f"{error}{f' ({causes})' if causes else ''}") from error
+
+
+def _is_aligning(target: Target) -> Mask:
+    return np.asarray(read_role(target, Role.MOTOR_FLAGS) & STOP_MODE != 0)
 
 
 def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:

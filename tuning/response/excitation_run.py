@@ -95,7 +95,9 @@ class Shaker:
         # A set-point is reached within a millisecond, which is when the next comes.
         for name, value in zip(INTERPOLATION, (1, -3), strict=True):
             drives.write(name, value, where=where)
-        self._offset = np.asarray(drives.read(OFFSET[self._loop]), float)
+        # A drive without such an object adds nothing.
+        has_offset = OFFSET[self._loop] in self._target.device.bindings
+        self._offset = np.asarray(drives.read(OFFSET[self._loop]), float) if has_offset else np.zeros(len(where))
         motion.enable(drives, mode=MODE[self._loop], where=where)
         self._origin = drives.read(cia402.POSITION_ACTUAL)
         return self

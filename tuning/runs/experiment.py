@@ -158,7 +158,8 @@ def load_experiment(config: str | Path | None = None, *, closed_loop: bool = Fal
         config: The file.
         closed_loop: Without a file take the one that ships for steppers whose loop is closed.
         overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
-            sweeps the same gains of any device, over the same range in its units.
+            sweeps the same gains of any device, over the same range in its units, with the device's usual motor where
+            its own is none of that device's.
 
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
@@ -177,6 +178,10 @@ def load_experiment(config: str | Path | None = None, *, closed_loop: bool = Fal
     experiment = replace(written, **{key: value for key, value in overrides.items() if value is not None})
     if path == DEFAULT and config is None and experiment.device != written.device:
         experiment = replace(experiment, sweep=_same_gains(written, experiment.device))
+    if config is None and overrides.get("device") is not None and overrides.get("motor") is None:
+        device = find_device(experiment.device)
+        if experiment.motor not in device.motors:
+            experiment = replace(experiment, motor=device.default_motor)
     resolve(experiment)
     return experiment
 

@@ -49,6 +49,7 @@ def watch_motion(drive, lane, dt):
     omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
     runs_away = (
         drive.stage_on[lane] > 0.0
+        and drive.torque_share[lane] > 0.0  # in open loop the current is not asked to turn anything
         and abs(asked) > most
         and asked * omega < 0.0
         and abs(omega) > abs(slow)

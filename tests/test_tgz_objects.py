@@ -1,0 +1,271 @@
+"""Every writable object of the TGZ-D varied as an engineer would: on the first axis, with the second one beside it.
+
+The same scene runs twice, and the value differs on that axis alone: there something is different, and on the other one
+nothing is, to the bit. What the objects do in figures, test_servo_mains.py and test_tgz.py have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives, motion
+from drive_env.devices import find_device
+from drive_env.firmware.record import get_lanes
+from mechanics.loads import find_load
+
+DEVICE = find_device("tgz_d")
+TURN = 65536
+RPM = 1000  # velocity units, as a drive is commissioned
+SEEN = (0x6041, 0x6061, 0x6062, 0x6064, 0x606B, 0x606C, 0x6077, 0x60F4)
+TRUE = ("theta_m", "omega_m", "i_q", "i_d", "i_q_ref", "stage_on", "u_q")
+
+
+class Scene(NamedTuple):
+    """What is done with drives, and what is seen; `rows` are objects that it needs."""
+
+    play: Any
+    load: Any = "inertia"
+    rows: Mapping[Any, int] = MappingProxyType({})
+
+
+def look(drives):
+    """Return what the bus and the machines show now."""
+    inside = (get_lanes(drives.inside.records, name, 2) for name in TRUE)
+    return np.array([*(drives.read(name) for name in SEEN), *inside], dtype=float)
+
+
+def through(drives, seconds, play=None):
+    """Let time pass, and return what is seen of it, sampled and at its end."""
+    if play:
+        play = {name: np.broadcast_to(path[:, None], (len(path), 2)) for name, path in play.items()}
+    trace = drives.record(list(SEEN), seconds, play)
+    return np.concatenate([*(trace[name].astype(float) for name in SEEN), look(drives)])
+
+
+def go(drives, turns=0.1):
+    """A move in pp."""
+    motion.enable(drives, mode="pp")
+    given = drives.read(0x607A)
+    drives.write(0x607A, np.where(given, given, round(turns * TURN)))
+    drives.write(0x6040, 0x1F)
+    return through(drives, 0.15)
+
+
+def turn(drives):
+    motion.enable(drives, mode="pv")
+    given = drives.read(0x60FF)
+    drives.write(0x60FF, np.where(given, given, 200 * RPM))
+    return through(drives, 0.05)
+
+
+def stop_quickly(drives):
+    turn(drives)
+    motion.quick_stop(drives)
+    return through(drives, 0.05)
+
+
+def twist(drives):
+    motion.enable(drives, mode="cst")
+    return through(drives, 0.01)
+
+
+def follow(drives):
+    """Targets in csp, every fourth millisecond a new one."""
+    motion.enable(drives, mode="csp")
+    return through(drives, 0.04, {0x607A: np.arange(40) // 4 * 60})
+
+
+def hold(drives):
+    """In csp, without a new target."""
+    motion.enable(drives, mode="csp")
+    return through(drives, 0.03)
+
+
+def push(drives):
+    """A closed brake, and a target beyond it."""
+    motion.enable(drives, mode="csp")
+    drives.machine.brake = "closed"
+    drives.write(0x607A, 2000)
+    return through(drives, 0.06)
+
+
+def home(drives):
+    motion.enable(drives, mode="hm")
+    drives.write(0x6040, 0x1F)
+    return through(drives, 1.0)
+
+
+def switch_on(drives):
+    """Enabling word by word."""
+    found = []
+    drives.write(0x6060, 8)
+    for word in (6, 7, 15):
+        drives.write(0x6040, word)
+        found.append(through(drives, 0.01))
+    return np.concatenate(found)
+
+
+def wait(drives):
+    return through(drives, 0.005)
+
+
+def outputs(drives):
+    return np.array([drives.machine.outputs, drives.read((0x60FE, 1)), drives.read(0x4001)], float)
+
+
+def belt(start):
+    """Return a belt whose carriage begins there [m]; its home switch is from -0.06 to -0.02 m."""
+    return dataclasses.replace(find_load("belt"), start={"pulley": start})
+
+
+FREE = {0x6065: 0}
+HOMING = FREE | {0x6098: 21, (0x6099, 1): 300 * RPM, (0x6099, 2): 60 * RPM, 0x609A: 20_000 * RPM}
+
+# Object: scene, one value, another.
+ROWS: dict[Any, tuple[Scene, int, int]] = {
+    0x2303: (Scene(switch_on), 3, 6),
+    0x23C3: (Scene(twist, rows={0x6071: 3000}), 4000, 8000),
+    0x23C5: (Scene(twist, rows={0x6071: 3000}), 32767, 1000),
+    0x23C6: (Scene(twist, rows={0x6071: 3000}), 0, 32_000),
+    0x23C7: (Scene(hold, rows=FREE), 0, 2**22),
+    0x23D0: (Scene(twist, rows={0x6071: 3000}), 256, 512),
+    0x23D1: (Scene(twist, rows={0x6071: 3000}), 256, 0),
+    0x23D2: (Scene(turn), 256, 512),
+    0x23D3: (Scene(turn), 0, 256),
+    0x23D4: (Scene(follow, rows=FREE), 256, 512),
+    0x23E0: (Scene(twist, rows={0x6071: 3000}), 5, 4),
+    0x23E1: (Scene(turn), 65536, 32768),
+    0x23E2: (Scene(turn), 0, 1),
+    0x23E3: (Scene(switch_on, rows={0x2303: 3}), 3, 0),
+    0x23E4: (Scene(switch_on, rows={0x2303: 3}), 3, 0),
+    0x23E5: (Scene(turn, rows={0x23E4: 1}), 1000, 3000),
+    0x6040: (Scene(wait, rows={0x2303: 3, 0x6060: 8}), 0, 6),
+    0x6060: (Scene(wait), 0, 3),
+    0x6065: (Scene(push, rows={0x6066: 10}), 0, 500),
+    0x6066: (Scene(push, rows={0x6065: 500}), 10, 30),
+    0x6067: (Scene(go), 1, TURN),
+    0x6068: (Scene(go, rows={0x6067: TURN}), 0, 100),
+    0x6071: (Scene(twist), 1000, 3000),
+    0x607A: (Scene(go), 3000, 6000),
+    0x607C: (Scene(home, belt(-0.01), HOMING), 0, 1000),
+    (0x607D, 1): (Scene(lambda drives: go(drives, -0.1)), -(2**31), -2000),
+    (0x607D, 2): (Scene(go), 2**31 - 1, 2000),
+    0x6081: (Scene(go), 300 * RPM, 30 * RPM),
+    0x6083: (Scene(go), 20_000 * RPM, 2000 * RPM),
+    0x6084: (Scene(go), 20_000 * RPM, 2000 * RPM),
+    0x6085: (Scene(stop_quickly), 50_000 * RPM, 2000 * RPM),
+    (0x608F, 1): (Scene(go), 4096, 8192),
+    (0x608F, 2): (Scene(go), 1, 2),
+    (0x6094, 1): (Scene(turn), 1, 2),
+    (0x6094, 2): (Scene(turn), 1000, 500),
+    0x6098: (Scene(home, belt(0.0), HOMING), 21, 35),
+    (0x6099, 1): (Scene(home, belt(0.0), HOMING), 300 * RPM, 100 * RPM),
+    (0x6099, 2): (Scene(home, belt(-0.019), HOMING), 60 * RPM, 10 * RPM),
+    0x609A: (Scene(home, belt(0.0), HOMING), 20_000 * RPM, 2000 * RPM),
+    0x60B2: (Scene(twist, rows={0x6071: 1000}), 0, 500),
+    (0x60C1, 1): (Scene(hold, rows=FREE), 0, 1000),
+    (0x60C2, 1): (Scene(follow), 1, 4),
+    (0x60C2, 2): (Scene(follow), -3, -2),
+    0x6086: (Scene(go), 0, 1),
+    0x60FF: (Scene(turn), 100 * RPM, 200 * RPM),
+}  # fmt: skip
+# Objects whose effect other tests find.
+ELSEWHERE = {
+    (0x23C0, 0): "test_a_mask_says_which_input_a_switch_is",
+    (0x23C1, 0): "the same",
+    (0x23C2, 0): "the same",
+    (0x25C0, 0): "test_tgz.py: images with which a drive begins",
+    (0x25C1, 0): "the same",
+    (0x25C2, 0): "test_tgz.py: the mapped parameters",
+    (0x25C3, 0): "the same",
+    (0x4001, 0): "test_tgz.py: outputs, which both axes share",
+    (0x60FE, 1): "the same",
+    (0x60FE, 2): "the same",
+}
+
+
+def keys():
+    return {name if isinstance(name, tuple) else (name, 0) for name in ROWS}
+
+
+def label(name):
+    index, sub = name if isinstance(name, tuple) else (name, 0)
+    return f"{index:04X}-{sub}"
+
+
+def vary(name, scene, one, other, axis=0):
+    """Return what a scene shows with one value of an object, and with another on an axis."""
+    found = []
+    for last in (one, other):
+        with EmulatedDrives("tgz_d", scene.load, num_machines=2, num_threads=1) as drives:
+            for row, raw in scene.rows.items():
+                if row != name:
+                    drives.write(row, raw)
+            values = np.full(2, one)
+            values[axis] = last
+            if name == 0x23C7 or name == (0x60C1, 1):  # a target: of an axis that is enabled
+                motion.enable(drives, mode="csp")
+            drives.write(name, values)
+            found.append(scene.play(drives))
+    return found
+
+
+def acts_on_one_axis(name, axis):
+    scene, one, other = ROWS[name]
+    first, second = vary(name, scene, one, other, axis)
+    assert np.isfinite(first).all() and np.isfinite(second).all()
+    differs = [not np.array_equal(first[:, k], second[:, k]) for k in range(2)]
+    assert differs[axis], f"{one} and {other} are the same to this drive"
+    assert sum(differs) == 1, f"axis {axis} alone has another value: {differs}"
+
+
+@pytest.mark.slow  # some 90 lives of a drive
+@pytest.mark.parametrize("name", ROWS, ids=label)
+def test_an_object_has_an_effect_on_its_axis_and_on_no_other(name):
+    acts_on_one_axis(name, 0)
+
+
+@pytest.mark.parametrize("name", [0x23C3, 0x23D2, 0x6094, 0x60FF], ids=hex)
+def test_so_it_is_on_the_second_axis(name):
+    acts_on_one_axis((name, 1) if name == 0x6094 else name, 1)
+
+
+def test_an_object_of_an_axis_is_at_its_own_index_on_the_bus():
+    """100h further on for the second axis, 800h of CiA 402; what is written there is read there alone."""
+    with EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1) as drives:
+        wire, known = Wire(drives), DEVICE.new_dictionary()
+        for name, (_, one, other) in ROWS.items():
+            index, sub = name if isinstance(name, tuple) else (name, 0)
+            if index in (0x6040, 0x6060, 0x23C7, 0x607A, 0x60C1):  # commands, and one target by three objects
+                continue
+            entry = known.find((index, sub))
+            offset = 0x800 if index >= 0x6000 else 0x100
+            for axis in range(2):
+                before = [wire.value(index + offset * k, sub) for k in range(2)]
+                raw = other if drives.read(name)[axis] != other else one
+                code = wire.download(index + offset * axis, sub, raw % 2**entry.bits, entry.bits // 8)
+                assert code == 0, label(name)
+                before[axis] = raw
+                after = [wire.value(index + offset * k, sub) for k in range(2)]
+                assert np.mod(after, 2**entry.bits).tolist() == np.mod(before, 2**entry.bits).tolist(), label(name)
+
+
+def test_every_writable_object_of_an_axis_is_varied():
+    """Those of communication (1000h to 1FFFh) have their own tests; nothing of an axis is refused."""
+    writable = {
+        (entry.index, entry.sub)
+        for entry in DEVICE.new_dictionary()
+        if entry.access in ("rw", "rww", "wo")
+        and entry.index >= 0x2000
+        and DEVICE.locate(entry.index)[1] == entry.index
+    }
+    assert writable == keys() | set(ELSEWHERE)
+    assert not keys() & set(ELSEWHERE)
+    assert not {key for key in DEVICE.unsupported if key[0] >= 0x2000}
