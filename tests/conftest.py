@@ -1,17 +1,49 @@
+import functools
+import os
 import signal
+from collections import Counter
 
 import numpy as np
 import pytest
+import typer.testing
 
 from drive_env import EmulatedDrives, motion
 from drive_env.master.description import Description
 
 ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
 
+# Typer makes a program's commands anew for each call, which takes longer than most commands.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
+
 # A shell starts what runs in the background deaf to Ctrl-C, and nohup to the terminal's end; some tests send both.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Of the rows of a test that is marked `every(n)` and are not slow each n-th is in each run; the others are slow.
+
+    SLOW_STRIDE=n takes of each test's slow rows the first of n alone.
+    """
+    stride = int(os.environ.get("SLOW_STRIDE", "1"))
+    rows, slow, left_out = Counter(), Counter(), []
+    for item in items:
+        test = item.nodeid.partition("[")[0]
+        every = item.get_closest_marker("every")
+        if every is not None and item.get_closest_marker("slow") is None:
+            if rows[test] % every.args[0]:
+                item.add_marker(pytest.mark.slow)
+            rows[test] += 1
+        if item.get_closest_marker("slow") is not None:
+            if slow[test] % stride:
+                left_out.append(item)
+            slow[test] += 1
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        gone = set(left_out)
+        items[:] = [item for item in items if item not in gone]
 
 
 @pytest.fixture

@@ -369,7 +369,7 @@ RANGES = {"1/65536 turn": (-(2**15), 2**15 - 1), "counter": (-(2**31), 2**31 - 1
 
 
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_every_unit_makes_the_round_trip(unit, data):
     scaler = data.draw(st.sampled_from([65536.0, 1.0, 4096.0, 1e6, 2147483647.0, -65536.0]))
@@ -381,7 +381,7 @@ def test_every_unit_makes_the_round_trip(unit, data):
 
 
 @pytest.mark.parametrize("unit", sorted(name for name, row in units.UNITS.items() if not row.period))
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(value=st.floats(-1e12, 1e12))
 def test_what_is_encoded_is_rounded_and_saturates(unit, value):
     row = code(unit, -1000, 2000)
@@ -398,7 +398,7 @@ def test_what_is_encoded_is_rounded_and_saturates(unit, value):
 
 
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_arrays_single_values_and_compiled_code_read_a_row_alike(unit, data):
     low, high = RANGES.get(unit, (-(2**31), 2**31 - 1))

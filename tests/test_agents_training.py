@@ -61,6 +61,7 @@ def test_one_seed_gives_the_same_agent(algorithm, tmp_path):
     assert (tmp_path / "a" / AGENT).read_bytes() == (tmp_path / "b" / AGENT).read_bytes()
 
 
+@pytest.mark.slow
 def test_another_seed_gives_another_agent(tmp_path):
     run = tiny()
     other = TrainingRun(run.environment, run.algorithm, run.hyperparameters, seed=4, segments=4)
@@ -95,6 +96,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(algorithm, tmp_path, monkeypa
     assert steps[1] == sorted(set(steps[1])) and steps[1][-1] == steps[0][-1] == 480
 
 
+@pytest.mark.slow
 def test_a_curriculum_goes_on_where_a_run_was_cut(tmp_path, monkeypatch):
     stages = []
     kind = type(make_environments("tracking", 1, TINY["ServoDrive/Tracking-v0"]))
@@ -138,6 +140,7 @@ def test_what_is_left_of_a_run(tmp_path):
     assert json.dumps(bundle.card)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_bundle_acts_as_the_model(algorithm, tmp_path):
     bundle = train(tiny(algorithm=algorithm), tmp_path)
@@ -272,6 +275,7 @@ def test_there_are_hyperparameters_for_every_environment_and_algorithm(environme
     env.close()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
 def test_every_environment_trains(environment, algorithm, tmp_path):
@@ -396,6 +400,7 @@ def drawn_in(folder):
     return [(trial.state.name, trial.params["learning_rate"], trial.value) for trial in study.trials]
 
 
+@pytest.mark.slow
 def test_a_killed_search_goes_on_behind_the_lost_trial_and_draws_anew(tmp_path, monkeypatch):
     run, trained = tiny(timesteps=32), []
 

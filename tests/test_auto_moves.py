@@ -87,6 +87,7 @@ def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkey
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch, tmp_path):
     target, good = axes
     write_gains(target.drives, np.stack([faster(target.device.gains, good, 0.6)] * 2))
@@ -500,6 +501,7 @@ def swing_of(drives):
     return np.std(seen, axis=0) / drives.motor.rated_current
 
 
+@pytest.mark.slow
 def test_gains_that_swing_on_after_a_load_step_are_calmed_until_they_stand(monkeypatch, tmp_path):
     finds(monkeypatch, np.array(SWINGING))
     # The rule's gains are not looked at: what is looked at here is how those that were found are calmed.
@@ -521,6 +523,7 @@ def test_gains_that_swing_on_after_a_load_step_are_calmed_until_they_stand(monke
         assert loaded[0] < 2.0 * RESTLESS and swing_of(drives)[0] < 2.0 * RESTLESS
 
 
+@pytest.mark.slow
 def test_what_shakes_in_spite_of_everything_is_rolled_back(monkeypatch, tmp_path):
     monkeypatch.setattr(auto_moves, "RESTLESS", 0.001)
     monkeypatch.setattr(proving_module, "RESTLESS", 0.001)

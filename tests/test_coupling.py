@@ -6,13 +6,13 @@ resonance of 150 Hz and 0.3 % up to 450 Hz.
 
 import numpy as np
 import pytest
+from stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle
 from drive_env.firmware.record import LANES, get_lanes
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.trials import response
-from mechanics import stepping
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
@@ -28,18 +28,10 @@ DURATION = 0.4
 ORACLE_SUBSTEPS = 4  # 10 us: 100 steps per ms
 
 
-@cached()
 def step_load(plant, torque, moment, h):
     """Step one copy through mean torques and first moments (n,); return angle and speed of the rotor, every qvel."""
-    dofs = plant.damping.shape[0]
-    theta, omega, reaction, position = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)
-    motion_ = np.zeros((torque.shape[0], 2 + dofs))
-    for n in range(torque.shape[0]):
-        stepping.step(plant, torque[n : n + 1], moment[n : n + 1], h, theta, omega, reaction, position)
-        motion_[n, 0] = theta[0]
-        motion_[n, 1] = omega[0]
-        motion_[n, 2:] = plant.qvel[:dofs]
-    return motion_
+    found = stepped(plant, torque, h, moment)
+    return np.hstack([found.theta, found.omega, found.qvel])
 
 
 @cached()

@@ -91,7 +91,7 @@ def envelope_of(is_armed=False, live=True):
     done, nothing = [], lambda *arguments: None
     made = Envelope.__new__(Envelope)
     made._drives = SimpleNamespace(
-        description=SimpleNamespace(dictionary=SimpleNamespace(roles={}), has=lambda key: False)
+        description=SimpleNamespace(dictionary=SimpleNamespace(roles={}), has=lambda key: False, role=lambda part: None)
     )
     made._axes = SimpleNamespace(is_armed=is_armed)
     made._watch, made._watchdogs = SimpleNamespace(await_stop=nothing), SimpleNamespace(check_not_held=nothing)

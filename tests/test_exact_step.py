@@ -6,11 +6,10 @@ import math
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from stepped_load import stepped
 
-from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 H = 200e-6  # the default: 5 steps per ms
 FINE = 62.5e-6
@@ -19,24 +18,11 @@ LEAD = 0.005 / (2 * math.pi)
 G = 9.81
 
 
-@cached()
-def step_plant(plant, torque, moment, h, theta, omega, qvel):
-    """Step one copy of one axis through torques and their first moments, (n, 1); write angle, speed and every qvel."""
-    rows = np.zeros((2, 1))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n], moment[n], h, theta[n], omega[n], rows[0], rows[1])
-        qvel[n] = plant.qvel
-
-
 def run(machine, torque, moment=None):
     """Return the rotor's angle and speed and the joints' speeds at every step's end, (n,), (n,) and (n, D)."""
-    n = len(torque)
-    theta, omega = np.zeros((2, n, 1))
-    qvel = np.zeros((n, machine.num_dofs))
-    moment = np.zeros(n) if moment is None else moment
-    step_plant(machine.plant, torque[:, None].copy(), moment[:, None].copy(), machine.h, theta, omega, qvel)
+    found = stepped(machine.plant, torque, machine.h, moment)
     assert not machine.plant.diverged.any()
-    return theta[:, 0], omega[:, 0], qvel
+    return found.theta[:, 0], found.omega[:, 0], found.qvel
 
 
 def machine_of(load, h=H, **parameters):

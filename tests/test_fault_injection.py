@@ -1,6 +1,6 @@
 """A fault at frame k of a session: the rotor ends at rest, disabled, inside its travel plus the stopping distance.
 
-Every k in the slow run (with FAULT_STRIDE=20 every twentieth), a sample in every run.
+Every k in the slow run (with FAULT_STRIDE=40 every fortieth), a sample in every run.
 The verdict is the emulator's inside alone (tests/fault_injection.py).
 """
 
@@ -73,6 +73,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert np.ptp(truth.theta()) > 0.02 * 2 * np.pi
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind):

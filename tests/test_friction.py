@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
+from stepped_load import stepped
 
 from mechanics import friction
-from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 
 @njit(error_model="numpy")
@@ -28,20 +27,9 @@ REST = 1e-12  # rad/s, three nanoradians in an hour
 COULOMB, BREAKAWAY, STRIBECK, VISCOUS = 2e-3, 3e-3, 2.0, 2e-5
 
 
-@cached()
-def step_plant(plant, torque, h, qvel):
-    """Step one copy through torques (n,); write every qvel, shape (n, D)."""
-    theta, omega, reaction, position, moment = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)
-    for n in range(torque.shape[0]):
-        step(plant, torque[n : n + 1], moment, h, theta, omega, reaction, position)
-        qvel[n] = plant.qvel
-
-
 def run(load, torque, h=H):
     """Return qvel after every step, shape (n, D)."""
-    qvel = np.zeros((len(torque), load.num_dofs))
-    step_plant(load.plant, np.ascontiguousarray(torque, float), h, qvel)
-    return qvel
+    return stepped(load.plant, torque, h).qvel
 
 
 def machine(name, motor=(0.0, 0.0, 1.0, 0.0), h=H, **parameters):

@@ -83,6 +83,7 @@ def compare(target, tally):
 
 
 # --- values -----------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_known_machines_are_identified():
     """Machines that are linear but for dry friction: three rigid, four with one spring, two on a belt."""
     machines = load_suite("public")

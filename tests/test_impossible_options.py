@@ -153,6 +153,7 @@ def retyped(path, index, kind):
     return path
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("kind", ["0x000F", "0x0009", "0x0008", "0x0011", "0x001B", "0x0005"])
 @pytest.mark.parametrize("index", [index for index, _ in KINDS if index != 0x605A])
 def test_an_eds_whose_objects_are_of_another_kind_is_refused(index, kind, tmp_path):

@@ -6,40 +6,25 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.linalg import eigh, null_space
+from stepped_load import stepped
 
 from drive_env.motors import MOTORS
-from mechanics.compiled import cached
 from mechanics.friction import FRICTION_MODELS
 from mechanics.load import Contact, Friction, Roll
 from mechanics.loads import LOADS, find_load
 from mechanics.model import motion_of
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 H = 200e-6  # the default: 5 steps per ms
 FINE = 62.5e-6  # 16 steps per ms
 J_M = MOTORS["qbl4208"].inertia
 
 
-@cached()
-def step_plant(plant, torque, h, qpos, qvel, carried):
-    """Step all copies through torques (n, C A); write every qpos and qvel, (n, C D), and contact force, (n, C, B)."""
-    rows = np.zeros((5, torque.shape[1]))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n], rows[0], h, rows[1], rows[2], rows[3], rows[4])
-        qpos[n] = plant.qpos
-        qvel[n] = plant.qvel
-        carried[n] = plant.carried
-
-
 def run(load, torque):
     """Return qpos and qvel after every step, (n, copies, D), and contact forces, (n, copies, B); torque (n, C A)."""
-    n = len(torque)
-    qpos, qvel = np.zeros((2, n, load.model.nv))
-    carried = np.zeros((n, *load.plant.carried.shape))
-    step_plant(load.plant, np.ascontiguousarray(torque), load.h, qpos, qvel, carried)
-    shape = (n, load.copies, load.num_dofs)
-    return qpos.reshape(shape), qvel.reshape(shape), carried
+    found = stepped(load.plant, torque, load.h)
+    shape = (len(torque), load.copies, load.num_dofs)
+    return found.qpos.reshape(shape), found.qvel.reshape(shape), found.carried
 
 
 class Twin:
@@ -290,6 +275,7 @@ def is_stop(name):
     return np.array([not contact.transmits for contact in LOADS[name].contacts], bool)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("friction", list(FRICTION_MODELS))
 @pytest.mark.parametrize("name", list(LOADS))
 def test_energy_is_accounted_for_at_16_steps_per_millisecond(name, friction):
@@ -302,6 +288,7 @@ def test_energy_is_accounted_for_at_16_steps_per_millisecond(name, friction):
         assert error < 1e-3
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("friction", list(FRICTION_MODELS))
 @pytest.mark.parametrize("name", list(LOADS))
 def test_energy_is_accounted_for_at_the_default_step_within_the_bound_of_the_row(name, friction):

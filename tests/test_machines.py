@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.inertia_check import MisfitWarning
-from mechanics.compiled import cached
 from mechanics.load import Friction, Load
 from mechanics.loads import LOADS, find_load
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 TURN = 65536  # increments
 H = 200e-6
@@ -59,15 +58,6 @@ def run_at(drives, rpm, settle=0.5, measure=0.4):
     drives.advance(settle)
     seen = watch(drives, measure, lambda: (drives.machine.motor_torque[0], drives.machine.rotor_speed[0]))
     return seen.mean(axis=0)
-
-
-@cached()
-def step_plant(plant, torque, h, qvel):
-    """Step one copy of one axis through torques (n,); write every qvel, shape (n, D)."""
-    theta, omega, reaction, position, moment = np.zeros((5, 1))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n : n + 1], moment, h, theta, omega, reaction, position)
-        qvel[n] = plant.qvel
 
 
 # --- dry friction holds -----------------------------------------------------------------------------------------------
@@ -323,8 +313,7 @@ def test_a_winder_s_radius_and_inertia_grow_by_closed_form(turns):
     load = PackedLoad(find_load("winder"), np.full((1, 1), J_M), np.zeros((1, 1, 4)), {}, H, friction="none")
     load.data.qpos[0] = 2 * math.pi * turns
     load.plant.load_torque[:] = 3.0  # N
-    qvel = np.zeros((50, 1))
-    step_plant(load.plant, np.zeros(50), H, qvel)
+    qvel = stepped(load.plant, np.zeros(50), H).qvel
     radius = 0.025 + 2e-4 * turns
     inertia = 2e-5 + J_M * 2.5**2 + math.pi / 2 * 24 * (radius**4 - 0.02**4)
     assert qvel[-1, 0] == pytest.approx(3.0 * radius / inertia * 50 * H, rel=1e-4)
@@ -334,8 +323,7 @@ def test_a_winder_never_unwinds_below_its_core():
     load = PackedLoad(find_load("winder"), np.full((1, 1), J_M), np.zeros((1, 1, 4)), {}, H, friction="none")
     load.data.qpos[0] = -2 * math.pi * 100
     load.plant.load_torque[:] = 3.0
-    qvel = np.zeros((50, 1))
-    step_plant(load.plant, np.zeros(50), H, qvel)
+    qvel = stepped(load.plant, np.zeros(50), H).qvel
     assert qvel[-1, 0] == pytest.approx(3.0 * 0.02 / (2e-5 + J_M * 2.5**2) * 50 * H, rel=1e-4)
 
 

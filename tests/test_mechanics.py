@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
-from mechanics.compiled import cached
 from mechanics.loads import LOADS, find_load
 from mechanics.model import compile_packed, motion_of
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 H = 200e-6
 J_M = 4.8e-6  # rotor of the QBL4208-class motor
@@ -18,23 +17,11 @@ MOTOR_SIDE = J_M + J_HUB
 FRICTIONLESS = {"coulomb": 0.0, "breakaway": 0.0, "viscous": 0.0}
 
 
-@cached()
-def step_plant(plant, torque, h, qpos, qvel):
-    """Step all copies through torques (n, C); write every qpos and qvel, shape (n, C D)."""
-    rows = np.zeros((5, torque.shape[1]))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n], rows[0], h, rows[1], rows[2], rows[3], rows[4])
-        qpos[n] = plant.qpos
-        qvel[n] = plant.qvel
-
-
 def run(load, torque):
     """Return qpos and qvel after every step, shape (n, copies, D); torque is (n,) or (n, copies)."""
-    torque = np.ascontiguousarray(np.broadcast_to(np.asarray(torque, float).T, (load.copies, len(torque))).T)
-    qpos, qvel = np.zeros((2, len(torque), load.model.nv))
-    step_plant(load.plant, torque, load.h, qpos, qvel)
+    found = stepped(load.plant, np.broadcast_to(np.asarray(torque, float).T, (load.copies, len(torque))).T, load.h)
     shape = (len(torque), load.copies, load.num_dofs)
-    return qpos.reshape(shape), qvel.reshape(shape)
+    return found.qpos.reshape(shape), found.qvel.reshape(shape)
 
 
 def machines(name, copies=1, h=H, bearing=(0.0, 0.0, 1.0, 0.0), integrator="leapfrog", **parameters):

@@ -502,6 +502,7 @@ def node(tmp_path, monkeypatch):
     world.close()
 
 
+@pytest.mark.slow
 def test_the_emergency_that_ended_a_trial_is_printed_and_in_the_table(node, tmp_path, monkeypatch):
     machine, arguments = node
     fails_in_its_second_trial(monkeypatch, machine)

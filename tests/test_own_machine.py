@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from mechanics import Contact, Friction, Load, Parameter
-from mechanics.compiled import cached
 from mechanics.loads import find_load
 from mechanics.model import CONSTRAINED_PACKING_BOUND, compile_packed, copies_per_model, is_constrained, read_model
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 pytestmark = pytest.mark.filterwarnings("ignore::drive_env.emulator.inertia_check.MisfitWarning")
 
@@ -108,15 +107,6 @@ def file(tmp_path):
 
 def two(actuators=""):
     return TWO.replace("ACTUATORS", f"<actuator>{actuators}</actuator>" if actuators else "")
-
-
-@cached()
-def step_plant(plant, torque, h, qpos):
-    """Step all copies through torques (n, C A); write every qpos, shape (n, C D)."""
-    theta, omega, reaction, position, moment = np.zeros((5, torque.shape[1]))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n], moment, h, theta, omega, reaction, position)
-        qpos[n] = plant.qpos
 
 
 # --- which joints -----------------------------------------------------------------------------------------------------
@@ -265,11 +255,9 @@ def test_friction_loss_of_the_file_is_dry_friction_of_ours(file):
     assert not load.constrained
     assert np.all(load.model.dof_frictionloss == 0.0)
     assert [row.coulomb for row in load.load.frictions] == [0.002]
-    qpos = np.zeros((500, 1))
-    step_plant(load.plant, np.full((500, 1), 0.0019), H, qpos)
-    assert np.all(qpos == 0.0)
-    step_plant(load.plant, np.full((500, 1), 0.003), H, qpos)
-    assert qpos[-1, 0] == pytest.approx(0.5 * 0.001 / (2e-3 + J_M) * 0.1**2, rel=5e-3)
+    assert np.all(stepped(load.plant, np.full(500, 0.0019), H).qpos == 0.0)
+    moved = stepped(load.plant, np.full(500, 0.003), H).qpos[-1, 0]
+    assert moved == pytest.approx(0.5 * 0.001 / (2e-3 + J_M) * 0.1**2, rel=5e-3)
 
 
 def test_numbers_of_the_model_can_be_parameters(file):
@@ -304,8 +292,7 @@ def swing(load, chosen, copies, duration=0.6):
     t = (np.arange(n) + 0.5) * H
     torque = (amplitude * np.sin(2 * np.pi * frequency * t[:, None, None]))[:, chosen].reshape(n, -1)
     found = packed(load, len(chosen))
-    qpos = np.zeros((n, found.model.nq))
-    step_plant(found.plant, np.ascontiguousarray(torque), H, qpos)
+    qpos = stepped(found.plant, torque, H).qpos
     assert not found.plant.diverged.any()
     return qpos.reshape(n, len(chosen), -1)
 
@@ -398,6 +385,7 @@ def script(*arguments):
     ).stdout  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_example_runs():
     lines = script("--gear", "40").splitlines()
     assert len(lines) == 3
@@ -424,8 +412,7 @@ def test_a_tendon_s_spring_acts_though_inertia_and_gravity_are_constant(file):
     load = PackedLoad(
         find_load(Load(path, joints=("x",), start={"x": 0.05})), np.full((1, 1), J_M), np.zeros((1, 1, 4)), {}, H
     )
-    qpos = np.zeros((2000, 1))
-    step_plant(load.plant, np.zeros((2000, 1)), H, qpos)
+    qpos = stepped(load.plant, np.zeros(2000), H).qpos
     w = np.sqrt(400.0 / (1.0 + J_M))
     # The first position counts as the middle of the first step.
     expected = 0.05 * np.cos(w * H * np.arange(1, 2001))

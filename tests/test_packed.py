@@ -8,13 +8,12 @@ from functools import cache
 import mujoco
 import numpy as np
 import pytest
+from stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
-from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.model import COPIES_OF_MANY, compile_packed, copies_per_model
 from mechanics.packed import PackedLoad, pack
-from mechanics.stepping import step
 from mechanics.template import Template
 
 STEPS = 400
@@ -23,20 +22,6 @@ COPY = 5
 J_M = 4.8e-6
 INTEGRATORS = ("leapfrog", "rk4")
 END_STOPS = [name for name, row in LOADS.items() if any(not contact.transmits for contact in row.contacts)]
-
-
-@cached()
-def step_plant(plant, torque, h, motion_, carried):
-    """Step all copies through torques (n, C A); write angle, speed and reaction of each axis, shape (n, 3, C A).
-
-    `carried`, shape (C, B), becomes the greatest force of each contact.
-    """
-    rows = np.zeros((2, torque.shape[1]))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n], rows[0], h, motion_[n, 0], motion_[n, 1], motion_[n, 2], rows[1])
-        for k in range(carried.shape[0]):
-            for b in range(carried.shape[1]):
-                carried[k, b] = max(carried[k, b], abs(plant.carried[k, b]))
 
 
 def near_the_end_stops(load):
@@ -93,14 +78,13 @@ def simulate(name, integrator, friction, chosen, copies, *, stops=False):
     )
     load.plant.load_torque[:] = 0.01 * rows / copies
     assert len(set(load.get("viscous"))) == load.copies
-    found = np.zeros((STEPS, 3, load.copies * load.num_axes))
-    carried = np.zeros((load.copies, len(row.contacts)))
     torque = torques(copies, load.num_axes)[:, rows].reshape(STEPS, -1)
-    step_plant(load.plant, np.ascontiguousarray(torque), H, found, carried)
+    found = stepped(load.plant, torque, H)
     assert not load.plant.diverged.any()
     shape = (STEPS, 3, load.copies, load.num_axes)
     at = load.data.qpos.reshape(load.copies, -1).copy()
-    return found.reshape(shape), at, load.plant.bristle.copy(), carried
+    moved = np.stack([found.theta, found.omega, found.reaction], axis=1).reshape(shape)
+    return moved, at, load.plant.bristle.copy(), np.abs(found.carried).max(axis=0)
 
 
 def assert_a_copy_is_itself_alone(name, integrator, friction, copies, **options):
@@ -114,6 +98,7 @@ def assert_a_copy_is_itself_alone(name, integrator, friction, copies, **options)
     return packed
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", list(LOADS))
 @pytest.mark.parametrize(("copies", "friction"), [(8, "stribeck"), (64, "lugre")])
@@ -122,6 +107,7 @@ def test_a_copy_is_bit_for_bit_the_load_alone(name, integrator, copies, friction
     assert_a_copy_is_itself_alone(name, integrator, friction, copies)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", END_STOPS)
 @pytest.mark.parametrize(("copies", "friction"), [(8, "lugre"), (64, "stribeck")])
@@ -149,6 +135,7 @@ def test_a_template_gives_the_same_model_and_shares_no_memory():
     assert np.array_equal(first.get("inertia"), values["inertia"])
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("friction", ["stribeck", "lugre"])
 @pytest.mark.parametrize("name", list(LOADS))
 def test_machines_packed_at_once_are_those_packed_one_by_one(name, friction, monkeypatch):
@@ -233,6 +220,7 @@ def running(num_machines=6, load="two_mass"):
     return drives
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("load", "torque"),
     [*((load, (-1e8, np.inf)[k % 2]) for k, load in enumerate(LOADS)), ("two_mass", 1e8), ("inertia", 1e12)],

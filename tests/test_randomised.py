@@ -51,6 +51,7 @@ def check(load, num_machines):
         assert stable.mean() >= 0.95, f"{load}: {stable.mean():.1%} stable, emergencies {dict(causes)}"
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("load", sorted(LOADS))
 def test_a_hundred_random_machines_are_sound(load):
     check(load, 100)

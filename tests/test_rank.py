@@ -206,7 +206,9 @@ def test_on_processes_it_is_the_same_comparison(tmp_path):
 
 # --- machines of several axes -------------------------------------------------------------------------------------
 @pytest.mark.parametrize("load", ["gantry", pytest.param("robot", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["factory", "baseline", "simc", "auto", "random", "tpe-safe"])
+@pytest.mark.parametrize(
+    "name", ["factory", "baseline", "simc", pytest.param("auto", marks=pytest.mark.slow), "random", "tpe-safe"]
+)
 def test_machines_of_several_axes_are_tuned_by_everybody(load, name):
     machines = [m for m in load_suite() if m.load == load][:1]
     (row,) = compare(machines, {name: find_tuner(name)}).rows

@@ -589,6 +589,7 @@ def run_script(text, calls, expected):
     return ""
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     "text", [pytest.param(text, id=name, marks=MARKS.get(name, ())) for name, text in SCRIPTS.items()]
 )

@@ -530,6 +530,7 @@ def long(config, tmp_path_factory):
     return path, contents(folder / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("more", [
     pytest.param((), id="threads"),

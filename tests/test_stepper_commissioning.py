@@ -232,6 +232,7 @@ def test_a_search_of_currents_finds_the_same_in_process_and_over_the_bus():
     assert on_bus("tmcm6212", act) == inside and len(inside) == 12
 
 
+@pytest.mark.slow
 def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
     """What is a number in both; only the machine in this process can be loaded, which the node's verdict says."""
 

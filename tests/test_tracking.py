@@ -443,6 +443,7 @@ def test_on_a_bus_what_needs_a_machine_is_refused():
 
 
 # --- long and with others ---------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_stable_baselines_trains_on_lanes_without_copies():
     import stable_baselines3 as sb3
 

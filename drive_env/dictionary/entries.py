@@ -8,6 +8,7 @@ import io
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
@@ -71,8 +72,12 @@ class EdsText:
 
 
 def read_eds(path: Path | EdsText, node_id: int = 1) -> canopen.ObjectDictionary:
-    """Return python-canopen's model of an EDS, put right first: real files are not as CiA 306 has them."""
-    return _model(eds_file(path, node_id), path.name if isinstance(path, EdsText) else str(path), node_id)
+    """Return python-canopen's model of an EDS, put right first: real files are not as CiA 306 has them.
+
+    It is read once: whoever changes it takes a copy.
+    """
+    text, name = _source(path)
+    return _model(text, name, node_id)
 
 
 def eds_file(path: Path | EdsText, node_id: int = 1) -> EdsFile:
@@ -81,11 +86,17 @@ def eds_file(path: Path | EdsText, node_id: int = 1) -> EdsFile:
     A file that is not UTF-8 is read as cp1252, which many vendors' are; bytes that cp1252 lacks stand in names and
     comments alone, where they are shown as unknown.
     """
-    return parse_eds(path.text if isinstance(path, EdsText) else _read_text(path), node_id)
+    return parse_eds(_source(path)[0], node_id)
 
 
-def _model(file: EdsFile, name: str, node_id: int) -> canopen.ObjectDictionary:
-    source = io.StringIO(file.text())
+def _source(path: Path | EdsText) -> tuple[str, str]:
+    """Return an EDS's text and where it is from."""
+    return (path.text, path.name) if isinstance(path, EdsText) else (_read_text(path), str(path))
+
+
+@lru_cache(maxsize=16)  # of 0.1 to 1 s, for every set of drives and every connection to one
+def _model(text: str, name: str, node_id: int) -> canopen.ObjectDictionary:
+    source = io.StringIO(parse_eds(text, node_id).text())
     source.name = name if name.lower().endswith((".eds", ".dcf")) else f"{name}.eds"
     return canopen.import_od(source, node_id)
 
@@ -106,6 +117,50 @@ def _content(variable: ODVariable) -> str:
         content = struct.pack("<f" if variable.data_type == datatypes.REAL32 else "<d", float(variable.default or 0.0))
         return content.decode("latin-1")
     return variable.default.decode("latin-1") if isinstance(variable.default, bytes) else str(variable.default or "")
+
+
+@lru_cache(maxsize=32)
+def _entries(text: str, name: str, node_id: int) -> tuple[dict[tuple[int, int], Entry], dict[str, tuple[int, int]]]:
+    """Return the entries of an EDS, and where each name is."""
+    entries, names = {}, {}
+    for item in _model(text, name, node_id).values():
+        members = [item] if isinstance(item, ODVariable) else item.values()
+        for variable in members:
+            alone = isinstance(item, ODVariable) or variable.subindex == 0
+            entry = _entry(variable, item.name if alone else f"{item.name}.{variable.name}")
+            entries[entry.index, entry.sub] = entry
+            names[entry.name.casefold()] = (entry.index, entry.sub)
+    return entries, names
+
+
+def _entry(variable: ODVariable, name: str) -> Entry:
+    kind = INTEGER_TYPES.get(variable.data_type or 0)
+    low: int | None
+    high: int | None
+    default: int | str
+    if kind is None:
+        bits = low = high = None
+        signed = False
+        default = _content(variable)
+    else:
+        bits, low, high = kind
+        signed = low < 0
+        low = low if variable.min is None else int(variable.min)
+        high = high if variable.max is None else int(variable.max)
+        default = int(variable.default or 0)
+    return Entry(
+        variable.index,
+        variable.subindex,
+        name,
+        bits,
+        variable.access_type,
+        low,
+        high,
+        default,
+        variable.unit,
+        bool(variable.pdo_mappable),
+        signed,
+    )
 
 
 def _as_key(name: str) -> tuple[int, int] | None:
@@ -129,14 +184,7 @@ class ObjectDictionary:
     ) -> None:
         self.path = path
         self.roles = dict(roles or {})
-        self._entries: dict[tuple[int, int], Entry] = {}
-        self._names: dict[str, tuple[int, int]] = {}
-        for item in read_eds(path, node_id).values():
-            if isinstance(item, ODVariable):
-                self._add(item, item.name)
-            else:
-                for member in item.values():
-                    self._add(member, item.name if member.subindex == 0 else f"{item.name}.{member.name}")
+        self._entries, self._names = _entries(*_source(path), node_id)
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries.values())
@@ -195,33 +243,3 @@ class ObjectDictionary:
         other._entries = {key: one for key, one in self._entries.items() if not one.name.startswith(prefix)}
         other._names = {name: key for name, key in self._names.items() if key in other._entries}
         return other
-
-    def _add(self, variable: ODVariable, name: str) -> None:
-        kind = INTEGER_TYPES.get(variable.data_type or 0)
-        low: int | None
-        high: int | None
-        default: int | str
-        if kind is None:
-            bits = low = high = None
-            signed = False
-            default = _content(variable)
-        else:
-            bits, low, high = kind
-            signed = low < 0
-            low = low if variable.min is None else int(variable.min)
-            high = high if variable.max is None else int(variable.max)
-            default = int(variable.default or 0)
-        key = (variable.index, variable.subindex)
-        self._entries[key] = Entry(
-            *key,
-            name,
-            bits,
-            variable.access_type,
-            low,
-            high,
-            default,
-            variable.unit,
-            bool(variable.pdo_mappable),
-            signed,
-        )
-        self._names[name.casefold()] = key
