@@ -15,6 +15,7 @@ from drive_env.ethercat.application import AlState
 from drive_env.master.link import ReceivedEmergency
 
 STATE, ERROR = 0x0F, 0x10  # of AL status
+READS = 5  # of a register, before its slave is taken to be silent: a frame may be lost
 
 
 class SlaveStatus(NamedTuple):

@@ -17,7 +17,7 @@ from drive_env.ethercat.application import AlState
 from drive_env.ethercat.datagrams import Datagram, DatagramCommand, at_station
 from drive_env.ethercat.state_machine import ACKNOWLEDGE
 from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.ethercat.ethercat_master import ERROR, STATE, ImageSizes, SlaveIdentity, SlaveStatus
+from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus
 from drive_env.master.ethercat.frame_ways import FrameWay
 from drive_env.master.ethercat.mailbox_client import MailboxClient
 from drive_env.master.ethercat.state_names import refusal
@@ -109,8 +109,11 @@ class FrameMaster:
 
     def register(self, position: int, address: int, size: int) -> bytes | None:
         """Return a slave's register; None where it does not answer."""
-        found = self._one(C.FPRD, FIRST_STATION + position, address, bytes(size))
-        return found.data if found is not None and found.counter else None
+        for _ in range(READS):
+            found = self._one(C.FPRD, FIRST_STATION + position, address, bytes(size))
+            if found is not None:
+                return found.data if found.counter else None
+        return None
 
     def write_register(self, position: int, address: int, data: bytes) -> None:
         """Write a slave's register; NoAnswerError if it does not take it."""
@@ -163,8 +166,8 @@ class FrameMaster:
 
     def status(self, position: int) -> SlaveStatus:
         """Return a slave's state, asked now."""
-        found = self._one(C.FPRD, FIRST_STATION + position, registers.AL_STATUS, bytes(6))
-        return _status(found.data) if found is not None and found.counter else SlaveStatus(0, False, 0)
+        data = self.register(position, registers.AL_STATUS, 6)
+        return SlaveStatus(0, False, 0) if data is None else _status(data)
 
     def _count(self) -> int:
         """Return how many slaves there are; NoAnswerError if none."""

@@ -12,14 +12,17 @@ from typing import Any
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState
 from drive_env.master.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.ethercat.ethercat_master import ERROR, STATE, ImageSizes, SlaveIdentity, SlaveStatus
+from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 from drive_env.master.ethercat.state_names import refusal
 from drive_env.master.link import ReceivedEmergency
 
 MICROSECONDS = 1e6
-REGISTER_TIMEOUT = 4000  # us
-NO_ROOM = 0.1  # s: SOEM gives up sooner (20 ms) only where a mailbox had no room, and the request was not sent
+REGISTER_TIMEOUT = 20_000  # us
+# us: SOEM's own for a frame and for room in a mailbox are 2 ms and 20 ms, of a chip on a computer that does nothing else.
+FRAME_TIMEOUT, ROOM_TIMEOUT = 20_000, 200_000
+NO_ROOM = 0.25  # s: SOEM gives up sooner only where a mailbox had no room, and the request was not sent
+LEAST_TIMEOUT = 0.3  # s for an answer, so that the two can be told apart
 POST_TIMEOUT = 1000  # us
 STATE_LOOK = 0.005  # s between two looks at the slaves' states while images are exchanged
 PATIENCE = 5.0  # s for a state
@@ -50,6 +53,7 @@ class SoemMaster:
         self.alive: Callable[[], None] = lambda: None
         self._soem = pysoem
         self._interface = interface
+        pysoem.settings.timeouts.ret, pysoem.settings.timeouts.tx_mailbox = FRAME_TIMEOUT, ROOM_TIMEOUT
         self._master = pysoem.Master()
         try:
             self._master.open(interface)
@@ -127,9 +131,12 @@ class SoemMaster:
     # --- registers --------------------------------------------------------------------------------------------------
     def register(self, position: int, address: int, size: int) -> bytes | None:
         """Return a slave's register; None where it does not answer."""
-        with self._turn:
-            found = self._quietly(lambda: self._slave(position)._fprd(address, size, REGISTER_TIMEOUT))
-        return None if found is None else bytes(found)
+        for _ in range(READS):
+            with self._turn:
+                found = self._quietly(lambda: self._slave(position)._fprd(address, size, REGISTER_TIMEOUT))
+            if found is not None:
+                return bytes(found)
+        return None
 
     def write_register(self, position: int, address: int, data: bytes) -> None:
         """Write a slave's register; NoAnswerError if it does not take it."""
@@ -233,7 +240,8 @@ class SoemMaster:
         while True:
             self.alive()
             with self._turns[position]:
-                self._master.sdo_read_timeout = self._master.sdo_write_timeout = round(timeout * MICROSECONDS)
+                longest = round(max(timeout, LEAST_TIMEOUT) * MICROSECONDS)
+                self._master.sdo_read_timeout = self._master.sdo_write_timeout = longest
                 begun = time.monotonic()
                 try:
                     return call()
