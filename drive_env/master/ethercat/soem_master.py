@@ -19,7 +19,7 @@ from drive_env.master.link import ReceivedEmergency
 
 MICROSECONDS = 1e6
 REGISTER_TIMEOUT = 20_000  # us
-# us: SOEM's own for a frame and for room in a mailbox are 2 ms and 20 ms, of a chip on a computer that does nothing else.
+# us. SOEM has 2 ms for a frame and 20 ms for room in a mailbox, for a chip and a computer that does nothing else.
 FRAME_TIMEOUT, ROOM_TIMEOUT = 20_000, 200_000
 NO_ROOM = 0.25  # s: SOEM gives up sooner only where a mailbox had no room, and the request was not sent
 LEAST_TIMEOUT = 0.3  # s for an answer, so that the two can be told apart
