@@ -11,9 +11,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_ethercat_ways import needs_namespaces
 
+from drive_env import EmulatedDrives, motion
 from drive_env.ethercat.namespaces import Namespaces
 
 HERE = Path(__file__).parent
@@ -43,19 +45,18 @@ def first_line(process):
     raise AssertionError(f"it did not begin: {process.poll()}")
 
 
-@pytest.fixture
-def seen(spaces):
-    """What the master saw."""
+def seen_by(spaces, pace, program_of_master, *arguments):
+    """Return what a master saw of a drive that is served."""
     pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
     program = "from drive_env.programs import drive_env; drive_env()"
-    serve = ("-c", program, "serve", "tmcm3313", "--load", "portal", "--lockstep")
+    serve = ("-c", program, "serve", "tmcm3313", "--load", "portal", pace)
     served = subprocess.Popen(
         inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface),
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
         assert "1 slave (tmcm3313" in first_line(served)
-        master = inside(spaces.master, HERE / "ethercat_drive_master.py", spaces.master_interface, CYCLES)
+        master = inside(spaces.master, HERE / program_of_master, spaces.master_interface, *arguments)
         done = subprocess.run(master, capture_output=True, text=True, timeout=PATIENCE)
     finally:
         served.terminate()
@@ -67,7 +68,8 @@ def seen(spaces):
 
 @pytest.mark.slow
 @needs_namespaces
-def test_soem_moves_all_three_axes_in_csp(seen):
+def test_soem_moves_all_three_axes_in_csp(spaces):
+    seen = seen_by(spaces, "--lockstep", "ethercat_drive_master.py", CYCLES)
     assert seen["slaves"] == 1 and seen["identity"] == [0x286, 3313, 0x10009] and seen["name"] == "TMCM-3313"
     mapping = struct.unpack("<H9I", bytes.fromhex(seen["mapping"]))
     assert mapping[:3] == (9, 0x60400010, 0x607A0020), "complete access"
@@ -79,3 +81,18 @@ def test_soem_moves_all_three_axes_in_csp(seen):
     assert seen["moved"] == pytest.approx([CYCLES * 4, CYCLES * 8, CYCLES * 12], abs=200)
     assert seen["stopped"] == [0x08] * 3, "who leaves Op has its motors stopped, by a fault"
     assert seen["error"] == 0x8100, "and is told"
+
+
+@pytest.mark.slow
+@needs_namespaces
+def test_ethercat_drives_on_soem_give_the_integers_of_emulated_ones(spaces):
+    seen = seen_by(spaces, "--lockstep", "ethercat_drives_master.py", CYCLES, "lockstep")
+    with EmulatedDrives("tmcm3313", load="portal", num_threads=1) as drives:
+        motion.enable(drives, mode="csp")
+        start = drives.read(0x6064)
+        targets = start + np.minimum(np.arange(CYCLES + 100), CYCLES)[:, None] * 4 * np.array([1, 2, 3])
+        trace = drives.record([0x6041, 0x6064], (CYCLES + 100) * 0.001, {0x607A: targets})
+        assert seen["moved"] == (drives.read(0x6064) - start).tolist()
+    np.testing.assert_array_equal(seen["rows"], trace[0x6064])
+    assert seen["name"].startswith("TMCM-3313") and seen["words"] == [0x27] * 3
+    assert seen["disabled"] == [0x40] * 3 and seen["emergencies"] == 0

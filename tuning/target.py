@@ -201,7 +201,7 @@ def on_bus(
     *,
     interface: str | None = None,
     channel: str | None = None,
-    nodes: Iterable[int] = (1,),
+    nodes: Iterable[int] | None = None,
     supply: ArrayLike | None = None,
     travel: Travel | Iterable[Travel],
     speed: float | None = None,
@@ -219,7 +219,7 @@ def on_bus(
         motor: Name of the motor that every node turns; the device's usual one by default.
         interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given.
         channel: The channel; from DRIVE_ENV_CHANNEL if not given.
-        nodes: Node-IDs.
+        nodes: Node-IDs, or positions on EtherCAT; the first one by default.
         supply: Supply voltage [V], one value or one per axis; the motor's by default.
         travel: How far the rotors may turn from where they stand [rad]: one (low, high), or one per axis.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
@@ -233,11 +233,11 @@ def on_bus(
     if axes not in AXES:
         raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
     from drive_env.devices import find_device
-    from drive_env.master.open_drives import open_drives
+    from drive_env.master.open_drives import default_nodes, open_drives
     from drive_env.motors import find_motor
 
     row = find_motor(find_device(device).default_motor if motor is None else motor)
-    numbers = tuple(nodes)
+    numbers = default_nodes(interface) if nodes is None else tuple(nodes)
     drives = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
     try:
         low, high = _ways(travel, drives.num_axes)

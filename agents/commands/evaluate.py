@@ -162,9 +162,9 @@ def evaluate(
         if on_bus:
             before = _way_back(out)
             if not lockstep:  # what waits for SYNC is emulated
-                ask_to_turn(node, yes)
+                ask_to_turn(node, yes, interface)
             found = _on_bus(run, sensor, before, device=device, interface=interface, channel=channel,
-                            nodes=node or (1,), lockstep=lockstep,
+                            nodes=node or None, lockstep=lockstep,
                             **({} if bitrate is None else {"bitrate": bitrate}))  # fmt: skip
         elif _typed(context, ELSEWHERE):
             found = _elsewhere(run, trust, workers, cluster)

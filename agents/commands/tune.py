@@ -97,7 +97,7 @@ def tune(
                     fail("a run would not start: see the lines with 'no'", REFUSED)
                 return
             if bus:
-                ask_to_turn(node, yes)
+                ask_to_turn(node, yes, interface)
             result = _run(target, policy, folder, agent, store, json)
         _report(result, folder, json, bus)
 

@@ -39,7 +39,7 @@ def target_for(
     device: str = "tmcm1636",
     interface: str | None = None,
     channel: str | None = None,
-    nodes: Sequence[int] = (1,),
+    nodes: Sequence[int] | None = None,
     lockstep: bool = False,
     **options: Any,
 ) -> Iterator[Target]:

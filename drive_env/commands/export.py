@@ -13,6 +13,7 @@ from drive_env.commands.options import (
     DeviceName,
     Eds,
     Interface,
+    Node,
     Timeout,
     check_free,
     connect,
@@ -29,7 +30,7 @@ def export(
     dcf: Annotated[bool, typer.Option("--dcf", help="Write the DCF beside the EDS, too.")] = False,
     interface: Interface = None,
     channel: Channel = None,
-    node: Annotated[int, typer.Option("--node", "-n", help="Node-ID.")] = 1,
+    node: Node = None,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     motor: Annotated[
@@ -55,7 +56,14 @@ def export(
             check_free(one)
         if names_a_bus(context):
             with connect(
-                interface, channel, [node], device, eds, bitrate=bitrate, timeout=timeout, safety=False
+                interface,
+                channel,
+                None if node is None else [node],
+                device,
+                eds,
+                bitrate=bitrate,
+                timeout=timeout,
+                safety=False,
             ) as drives:
                 values = commissioned_values(drives)
                 source = drives.description.dictionary.path
@@ -70,6 +78,6 @@ def export(
         for one in files:
             is_dcf = one.suffix.lower() == ".dcf"
             kbit = CAN_KBIT if bitrate is None else bitrate // KBIT
-            text = commissioned_eds(source, values, one.name, node_id=node if is_dcf else None, bit_rate=kbit)
+            text = commissioned_eds(source, values, one.name, node_id=(node or 1) if is_dcf else None, bit_rate=kbit)
             write_whole(one, text)
-            print(f"{one}: {len(values)} parameters of {'node ' + str(node) if is_dcf else device}")
+            print(f"{one}: {len(values)} parameters of {f'node {node or 1}' if is_dcf else device}")

@@ -104,7 +104,7 @@ def set_object(
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes(), ExitStack() as stack:
         if dry_run:
-            look_first(interface, channel, node or [1], bitrate, device, eds, timeout)
+            look_first(interface, channel, node, bitrate, device, eds, timeout)
         drives = stack.enter_context(connect(interface, channel, node, device, eds, **options))
         entry = drives.description.dictionary.find(object_name(name))
         chosen = axes_of(drives, entry, axis)
@@ -190,7 +190,8 @@ def _bring_to_rest(drives: BusDrives, chosen: list[int]) -> None:
     from drive_env.commands.replayed_motors import Stopped, name, stop_axes
     from drive_env.master.can_drives import CanDrives
 
-    assert isinstance(drives, CanDrives), "a command's drives are on CAN"
+    if not isinstance(drives, CanDrives):
+        return  # on EtherCAT motors run in Op alone, and who opens the drives has taken them to Pre-Op
     axes = [(drives.nodes[node], part) for node, part in (divmod(k, drives.description.num_axes) for k in chosen)]
     clients = {node: drives.sdo(k) for k, node in enumerate(drives.nodes)}
     for outcome in stop_axes(drives.port, clients, axes, drives.description.answer_timeout):

@@ -19,6 +19,7 @@ from drive_env.commands.options import (
     Eds,
     Interface,
     Json,
+    Node,
     Timeout,
     WouldDo,
     axis_name,
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from drive_env.master.description import Description
     from drive_env.master.quantities import Scale
 
-Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
 DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
 BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and besides the time that it should take
@@ -55,7 +55,7 @@ def jog(
     by: Annotated[str | None, typer.Option(help="Distance: '1 rev', '-90 deg', or increments.")] = None,
     interface: Interface = None,
     channel: Channel = None,
-    node: Node = 1,
+    node: Node = None,
     axis: AxisNumber = 0,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
@@ -96,8 +96,10 @@ def jog(
         files = None if out is None else new_files(out)
         options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "cycle": cycle_for(description)}
         if dry_run:
-            look_first(interface, channel, [node], bitrate, device, eds, timeout)
-        with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
+            look_first(interface, channel, None if node is None else [node], bitrate, device, eds, timeout)
+        with connect(
+            interface, channel, None if node is None else [node], device, eds, safety=Limits(current=current), **options
+        ) as drives:
             one = _OneAxis(drives, axis)
             scale = scales_of(drives)[axis]
             movement = _asked_for(one, known, scale, speed, by, duration)

@@ -27,7 +27,10 @@ AXIS_CYCLE = 0.001  # s of a bus of 1 Mbit/s for each axis of a node: seven fram
 Interface = Annotated[
     str | None,
     typer.Option(
-        "--interface", "-i", envvar="DRIVE_ENV_INTERFACE", help="python-can interface: socketcan, pcan, slcan, ..."
+        "--interface",
+        "-i",
+        envvar="DRIVE_ENV_INTERFACE",
+        help="python-can interface: socketcan, pcan, slcan, ...; or ethercat, ethercat-udp.",
     ),
 ]
 Channel = Annotated[
@@ -36,11 +39,23 @@ Channel = Annotated[
         "--channel",
         "-c",
         envvar="DRIVE_ENV_CHANNEL",
-        help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve` (its token, if any, in DRIVE_ENV_TOKEN).",
+        help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve` (its token, if any, in DRIVE_ENV_TOKEN); "
+        "eth1 or a UDP port on EtherCAT.",
     ),
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], if the interface sets it.")]
-Nodes = Annotated[list[int] | None, typer.Option("--node", "-n", help="Node-ID; may be repeated.", show_default="1")]
+FIRST_NODE = "1; position 0"
+Nodes = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--node", "-n", "--position", help="Node-ID, on EtherCAT the position; may be repeated.",
+        show_default=FIRST_NODE,
+    ),
+]  # fmt: skip
+Node = Annotated[
+    int | None,
+    typer.Option("--node", "-n", "--position", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE),
+]
 AxisOfNode = Annotated[
     int | None,
     typer.Option("--axis", help="Axis of nodes with several, from 0.", show_default="all that have the object"),
@@ -100,19 +115,30 @@ def connect(
     bitrate = others.pop("bitrate", None)
     if bitrate is not None:
         others["bitrate"] = bitrate
-    return open_drives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or (1,), **others)
+    return open_drives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or None, **others)
+
+
+def chosen_node(interface: str | None, node: int | None) -> int:
+    """Return the node that was asked for, or the first."""
+    from drive_env.master.open_drives import default_nodes
+
+    return default_nodes(interface)[0] if node is None else node
 
 
 def look_first(
     interface: str | None,
     channel: str | None,
-    nodes: Iterable[int],
+    nodes: Iterable[int] | None,
     bitrate: int | None,
     device: str,
     eds: Path | None = None,
     timeout: float | None = None,
 ) -> None:
-    """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
+    """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command."""
+    from drive_env.master.open_drives import default_nodes, is_ethercat
+
+    if is_ethercat(interface):
+        return
     from drive_env.master.can.port import Port, open_bus
     from drive_env.master.can.sdo import SdoClient
     from drive_env.master.description import describe
@@ -121,7 +147,7 @@ def look_first(
     patience = describe(device, eds).answer_timeout if timeout is None else timeout
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
     try:
-        for node in nodes:
+        for node in nodes or default_nodes(interface):
             SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
     except NoAnswerError as error:
         raise NoAnswerError(

@@ -19,11 +19,13 @@ from drive_env.commands.options import (
     Eds,
     Interface,
     Json,
+    Node,
     Timeout,
     WouldDo,
     Yes,
     ask,
     check_free,
+    chosen_node,
     connect,
     errors_as_exit_codes,
     fail,
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
     from drive_env.master.identity import Identity
     from drive_env.master.quantities import Scale
 
-Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
 Store = Annotated[
@@ -59,7 +60,7 @@ def backup(
     file: Annotated[Path, typer.Argument(help="New file (TOML); - prints it.")],
     interface: Interface = None,
     channel: Channel = None,
-    node: Node = 1,
+    node: Node = None,
     axis: Axis = 0,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
@@ -74,6 +75,7 @@ def backup(
     with errors_as_exit_codes():
         if str(file) != "-":
             check_free(file)
+        node = chosen_node(interface, node)
         with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
             _check_axis(drives, axis)
             values = read_parameters(drives, axis)
@@ -93,7 +95,7 @@ def diff(
     other: Annotated[Path | None, typer.Argument(help="Another file to compare with, instead of the drive.")] = None,
     interface: Interface = None,
     channel: Channel = None,
-    node: Node = 1,
+    node: Node = None,
     axis: Axis = 0,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
@@ -118,7 +120,7 @@ def diff(
             ]
             scale = None
         else:
-            with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
+            with _connected(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout) as drives:
                 _check_axis(drives, axis)
                 differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
                 _tell_of_changes(file)
@@ -132,7 +134,7 @@ def restore(
     file: File,
     interface: Interface = None,
     channel: Channel = None,
-    node: Node = 1,
+    node: Node = None,
     axis: Axis = 0,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
@@ -159,7 +161,7 @@ def restore(
         wanted = load_parameters(file, known.dictionary)
         written, axis_then = _check_file(file, unchecked=unchecked)
         check_no_commands(wanted, file, known.hints)
-        bus = _Bus(interface, channel, node, device, eds, bitrate, timeout)
+        bus = _Bus(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout)
 
         def check(drives: BusDrives) -> None:
             check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
@@ -176,7 +178,7 @@ def commission(
     motor: Annotated[str, typer.Argument(help="Motor whose preset is written; ? lists them.")],
     interface: Interface = None,
     channel: Channel = None,
-    node: Node = 1,
+    node: Node = None,
     axis: Axis = 0,
     device: DeviceName = "tmcm1636",
     bitrate: Bitrate = None,
@@ -201,7 +203,7 @@ def commission(
         preset = known.preset(find_motor(motor))
         dictionary = known.new_dictionary()
         wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
-        bus = _Bus(interface, channel, node, device, None, bitrate, timeout)
+        bus = _Bus(interface, channel, chosen_node(interface, node), device, None, bitrate, timeout)
         name = f"preset {motor}"
         _exchange(bus, wanted, axis, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
 

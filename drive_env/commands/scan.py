@@ -34,11 +34,18 @@ def scan(
     timeout: Annotated[float, typer.Option(help="Longest wait for an answer [s].")] = 0.3,
     json: Json = False,
 ) -> None:
-    """Find nodes and read their identification: 1000h, 1008h to 100Ah, 1018h. Nothing is written."""
+    """Find nodes and read their identification: 1000h, 1008h to 100Ah, 1018h. Nothing is written.
+
+    On EtherCAT: the slaves in their order, what their EEPROMs say, and their states; no state changes.
+    """
     with errors_as_exit_codes():
         from drive_env.master.can.port import Port, open_bus
+        from drive_env.master.open_drives import is_ethercat
 
         check_time("--timeout", timeout)
+        if is_ethercat(interface):
+            _scan_ethercat(interface, channel, json)
+            return
         if last < first:
             raise ValueError(f"--last {last} is below --first {first}")
         options = {"bitrate": bitrate} if bitrate else {}
@@ -57,6 +64,31 @@ def scan(
                 "the channel",
                 NOTHING_FOUND,
             )
+
+
+def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> None:
+    """Print the slaves of a segment."""
+    from drive_env.devices import device_of
+    from drive_env.master.ethercat.state_names import state_name
+    from drive_env.master.ethercat_drives import open_frames
+
+    master = open_frames(interface, channel)
+    try:
+        found = master.look()
+    finally:
+        master.close()
+    rows: list[dict[str, Any]] = []
+    for position, (status, identity) in enumerate(found):
+        device = device_of(0, identity.vendor, identity.product)
+        state = state_name(status.state) + (f", error {status.code:04X}h" if status.has_error else "")
+        rows.append({"position": position, "device": device, "state": state} | identity._asdict())
+    if json:
+        print_json(rows)
+        return
+    for row in rows:
+        numbers = "  ".join(f"{name} {row[name]:X}h" for name in ("vendor", "product", "revision", "serial"))
+        known = row["device"] or "unknown device; give its EDS with --eds"
+        print_lines([f"position {row['position']}  {known}  {numbers}  {row['state']}"])
 
 
 def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, str]]:

@@ -134,10 +134,13 @@ def _listen(interface: str | None, channel: str | None, nodes: list[int] | None,
     """Raise OtherMastersError where another master is at work; nothing is sent."""
     from drive_env.master.can.other_masters import OtherMasters
     from drive_env.master.can.port import Port, open_bus
+    from drive_env.master.open_drives import default_nodes, is_ethercat
 
+    if is_ethercat(interface):
+        return  # who opens a segment takes it over
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
     try:
-        OtherMasters(port, nodes or (1,)).listen(LISTENED)
+        OtherMasters(port, nodes or default_nodes(interface)).listen(LISTENED)
     finally:
         port.close()
 

@@ -15,6 +15,13 @@ HEADER = 2
 MAILBOX_HEADER = 6
 QUEUE = 8  # emergencies for each axis of the node
 
+# Client command specifiers (bits 7 to 5 of the first byte).
+DOWNLOAD_SEGMENT, INITIATE_DOWNLOAD, INITIATE_UPLOAD, UPLOAD_SEGMENT, ABORT = range(5)
+DOWNLOAD_CONFIRMED, SEGMENT_CONFIRMED, UPLOADED, ABORTED = 0x60, 0x20, 0x40, 0x80  # first bytes of responses
+HAS_SIZE, EXPEDITED, COMPLETE, TOGGLE, LAST = 0x01, 0x02, 0x10, 0x10, 0x01
+INITIATE = 8  # bytes of an SDO before data
+LEAST = 7  # bytes of data in a segment, in use or not
+
 
 class CoeService(IntEnum):
     """Services of CoE (ETG.1000.6, table 28)."""

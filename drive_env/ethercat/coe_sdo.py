@@ -21,17 +21,31 @@ from drive_env.dictionary.aborts import (
 )
 from drive_env.dictionary.access import check_readable, check_writable
 from drive_env.dictionary.entries import Entry
-from drive_env.ethercat.coe import HEADER, MAILBOX_HEADER, CoeService, message
+from drive_env.ethercat.coe import (
+    ABORT,
+    ABORTED,
+    COMPLETE,
+    DOWNLOAD_CONFIRMED,
+    DOWNLOAD_SEGMENT,
+    EXPEDITED,
+    HAS_SIZE,
+    HEADER,
+    INITIATE,
+    INITIATE_DOWNLOAD,
+    INITIATE_UPLOAD,
+    LAST,
+    LEAST,
+    MAILBOX_HEADER,
+    SEGMENT_CONFIRMED,
+    TOGGLE,
+    UPLOAD_SEGMENT,
+    UPLOADED,
+    CoeService,
+    message,
+)
 from drive_env.node.axis import ObjectPort
 from drive_env.node.process_image import ImageObjects
 from drive_env.node.sdo_server import check_length, encode, size_of, take
-
-# Client command specifiers (bits 7 to 5 of the first byte).
-DOWNLOAD_SEGMENT, INITIATE_DOWNLOAD, INITIATE_UPLOAD, UPLOAD_SEGMENT, ABORT = range(5)
-DOWNLOAD_CONFIRMED, SEGMENT_CONFIRMED, UPLOADED, ABORTED = 0x60, 0x20, 0x40, 0x80  # first bytes of responses
-HAS_SIZE, EXPEDITED, COMPLETE, TOGGLE, LAST = 0x01, 0x02, 0x10, 0x10, 0x01
-INITIATE = 8  # bytes of an SDO before data
-LEAST = 7  # bytes of data in a segment, in use or not
 
 
 @dataclass(slots=True)

@@ -75,9 +75,13 @@ class Mailbox:
         """Let the master read a message when its turn comes."""
         self._waiting.append((protocol, message, address))
 
-    def work(self, now: float) -> None:
-        """Do what is due: repeat an answer, take a message, put the next answer where the master reads."""
-        controller = self._controller
+    def work(self, now: float) -> bool:
+        """Do what is due: repeat an answer, take a message, put the next answer where the master reads.
+
+        Returns:
+            Whether a message was taken.
+        """
+        controller, has_taken = self._controller, False
         receive, send = controller.managers[RECEIVE], controller.managers[SEND]
         if send.was_read:
             send.was_read = False
@@ -93,9 +97,11 @@ class Mailbox:
             data = receive.take()
             if data is not None:
                 self._take(data, now)
+                has_taken = True
         if send.end and not send.is_full and (self._delayed or self._waiting):
             self._current, self._delayed = self._delayed or self._next(), b""
             send.put(self._current)
+        return has_taken
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _next(self) -> bytes:

@@ -67,8 +67,8 @@ class EtherCatSlave:
             control, controller.al_control = controller.al_control, None
             self._machine.request(control, now)
         state = self._machine.state
-        if state in WITH_MAILBOX or state is S.BOOTSTRAP:
-            self.mailbox.work(now)
+        if (state in WITH_MAILBOX or state is S.BOOTSTRAP) and self.mailbox.work(now) and state in WITH_INPUTS:
+            self._put_inputs(now)  # what a message has changed
         outputs = controller.managers[OUTPUTS].take()
         if outputs is not None and state is S.OP:
             self.application.outputs(outputs, now)

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import can
 
 from drive_env.dictionary.entries import ObjectName
-from drive_env.drives.arguments import whole_cycles
 from drive_env.master.bus_drives import BusDrives, checked_limits
 from drive_env.master.can.bus_time import BIT_RATE, BusTime
 from drive_env.master.can.can_link import CanLink
@@ -17,10 +16,8 @@ from drive_env.master.can.dry_run import DryPort
 from drive_env.master.can.network import check_nodes
 from drive_env.master.can.port import Port, open_bus
 from drive_env.master.description import check_timeout, describe
-from drive_env.master.pace import LockstepPace, Pace, RealTimePace
+from drive_env.master.pace import LockstepPace, Pace, RealTimePace, cycles_per_sync
 from drive_env.safety.limits import Limits
-
-LONGEST_CYCLE = 0.1  # s: slower, nobody watches
 
 
 class CanDrives(BusDrives):
@@ -83,7 +80,7 @@ class CanDrives(BusDrives):
             raise ValueError(f"pace is 'real-time' or 'lockstep', not {pace!r}")
         checked_limits(safety)
         if cycle is not None:
-            description.cycles_per_sync = _cycles_per_sync(cycle, description.cycle, pace)
+            description.cycles_per_sync = cycles_per_sync(cycle, description.cycle, pace)
             description.cycle *= description.cycles_per_sync
         # A dry run has nothing to wait for either.
         by_sync = pace == "lockstep" or bool(dry_run)
@@ -103,14 +100,3 @@ class CanDrives(BusDrives):
     def port(self) -> Port:
         """The bus."""
         return self._port
-
-
-def _cycles_per_sync(cycle: float, least: float, pace: str) -> int:
-    """Return how many communication cycles [s] pass from SYNC to SYNC [s]; ValueError for what cannot be."""
-    if pace == "lockstep":
-        raise ValueError(f"cycle={cycle:g} s is for real time: in lockstep each SYNC is a cycle of {least:g} s")
-    if not least <= cycle <= LONGEST_CYCLE:
-        raise ValueError(
-            f"cycle={cycle:g} s must be from {least:g} s, the drives' communication cycle, to {LONGEST_CYCLE:g} s"
-        )
-    return whole_cycles(cycle, least)

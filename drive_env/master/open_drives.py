@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 from drive_env.master.bus_drives import BusDrives
-from drive_env.master.can_drives import CanDrives
+
+ETHERCAT = ("ethercat", "ethercat-udp")  # interfaces; all others are python-can's
+INTERFACE_VARIABLE = "DRIVE_ENV_INTERFACE"
+
+
+def is_ethercat(interface: str | None) -> bool:
+    """Return whether an interface, or the one in DRIVE_ENV_INTERFACE, is EtherCAT's."""
+    return (interface or os.environ.get(INTERFACE_VARIABLE)) in ETHERCAT
+
+
+def default_nodes(interface: str | None) -> tuple[int, ...]:
+    """Return the nodes where nobody names one: node-ID 1 on CAN, the first position on EtherCAT."""
+    return (0,) if is_ethercat(interface) else (1,)
 
 
 def open_drives(device: str = "tmcm1636", **options: Any) -> BusDrives:
-    """Open drives on a bus; CAN is the one there is.
+    """Open drives on CAN or EtherCAT, as `interface` says.
 
     Args:
         device: Name of a known device.
-        options: What `CanDrives` takes besides.
+        options: What `CanDrives` or `EtherCatDrives` take besides; without `nodes`, the first node.
 
     Raises:
         BusError: If the bus cannot be opened, a node does not answer or is another device.
         ValueError: For what cannot be.
     """
+    interface = options.get("interface")
+    if options.get("nodes") is None:
+        options["nodes"] = default_nodes(interface)
+    if is_ethercat(interface):
+        from drive_env.master.ethercat_drives import EtherCatDrives
+
+        return EtherCatDrives(device, **options | {"interface": interface or os.environ[INTERFACE_VARIABLE]})
+    from drive_env.master.can_drives import CanDrives
+
     return CanDrives(device, **options)

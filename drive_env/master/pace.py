@@ -6,7 +6,10 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+from drive_env.drives.arguments import whole_cycles
+
 MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
+LONGEST_CYCLE = 0.1  # s: slower, nobody watches
 Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
 
 
@@ -112,3 +115,14 @@ class LockstepPace:
 
     def end(self, receive: Receive) -> None:
         """Do nothing: no time passes without SYNC."""
+
+
+def cycles_per_sync(cycle: float, least: float, pace: str) -> int:
+    """Return how many communication cycles [s] pass from SYNC to SYNC [s]; ValueError for what cannot be."""
+    if pace == "lockstep":
+        raise ValueError(f"cycle={cycle:g} s is for real time: in lockstep each SYNC is a cycle of {least:g} s")
+    if not least <= cycle <= LONGEST_CYCLE:
+        raise ValueError(
+            f"cycle={cycle:g} s must be from {least:g} s, the drives' communication cycle, to {LONGEST_CYCLE:g} s"
+        )
+    return whole_cycles(cycle, least)

@@ -157,7 +157,7 @@ class DriveOptions:
         """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
         self.check()  # before anybody is asked
         if self.bus and self.travel is not None:
-            ask_to_turn(self.nodes, self.yes)
+            ask_to_turn(self.nodes, self.yes, self.interface)
         return open_target(self)
 
 
@@ -267,9 +267,11 @@ def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, a
         )
 
 
-def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
+def ask_to_turn(nodes: list[int] | None, yes: bool, interface: str | None = None) -> None:
     """Continue if the user agrees that the motors on a bus turn; raises as `ask` does."""
-    ask(f"The motor of node {', '.join(map(str, nodes or [1]))} will turn. Is its way clear?", yes)
+    from drive_env.master.open_drives import default_nodes
+
+    ask(f"The motor of node {', '.join(map(str, nodes or default_nodes(interface)))} will turn. Is its way clear?", yes)
 
 
 def open_target(drive: DriveOptions) -> Target:
@@ -293,7 +295,7 @@ def open_target(drive: DriveOptions) -> Target:
         drive.motor_name,
         interface=drive.interface,
         channel=drive.channel,
-        nodes=drive.nodes or (1,),
+        nodes=drive.nodes or None,
         supply=drive.supply,
         travel=parse_travels(drive.travel),
         axes=drive.axes,

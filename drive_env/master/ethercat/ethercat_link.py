@@ -1,0 +1,221 @@
+"""The link over EtherCAT: objects by the mailbox, process data in images, states Pre-Op to Op (ETG.1000)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+
+from drive_env import cia402
+from drive_env.ethercat import registers
+from drive_env.ethercat.application import AlState
+from drive_env.master.description import Description, Key
+from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.master.ethercat.ethercat_master import EtherCatMaster
+from drive_env.master.ethercat.image_data import FRAME, EtherCatProcessData
+from drive_env.master.ethercat.process_watchdog import FACTORY, ProcessWatchdog
+from drive_env.master.ethercat.slave_objects import SlaveObjects
+from drive_env.master.ethercat.state_names import state_name
+from drive_env.master.link import ObjectClient, ReceivedEmergency, Wording
+
+TIME_LOOK = 0.012  # s for which a drive in lockstep must stand still
+BOOT = 10.0  # s for a slave that is reset to come back
+LOOK = 0.001  # s
+
+
+class OtherEtherCatMasters:
+    """Tells whether another master has taken the slaves: their states are not those that this one gave them."""
+
+    def __init__(self, link: EtherCatLink) -> None:
+        self._link = link
+        self._before = link.states()
+
+    def check(self) -> None:
+        """Raise BusError if a slave is in another state than at the beginning."""
+        for position, before, now in zip(self._link.nodes, self._before, self._link.states(), strict=True):
+            if before != now:
+                raise BusError(
+                    f"position {position} was in {state_name(before)} and is in {state_name(now)}, which this program "
+                    "has not asked for: another master uses the segment; end it"
+                )
+
+
+class EtherCatLink:
+    """Slaves of one device on a segment.
+
+    Args:
+        master: Of the segment; it is closed by `close`, and where this fails.
+        nodes: Positions of the slaves.
+        description: What device they are.
+        lockstep: Time passes by frames with process data alone.
+
+    Raises:
+        BusError: If there are no slaves, or fewer than named.
+    """
+
+    is_dry = False
+    wording = Wording("Op", "check cable and power, and whether another master uses the segment", "process data")
+
+    def __init__(self, master: EtherCatMaster, nodes: Sequence[int], description: Description, lockstep: bool) -> None:
+        self.nodes = tuple(nodes)
+        self._master = master
+        self._description = description
+        self._lockstep = lockstep
+        self._alive: Callable[[], None] = lambda: None
+        self._restarted: Callable[[int], None] = lambda node: None
+        self._frame = description.answer_timeout if lockstep else FRAME
+        master.alive = self._while_waiting
+        try:
+            count = master.begin()
+            beyond = [position for position in self.nodes if position >= count]
+            if beyond:
+                raise BusError(
+                    f"there is no position {beyond[0]}: {count} slave{'s' if count > 1 else ''} answer; count from 0, "
+                    "or look with `drive-env scan`"
+                )
+        except BaseException:
+            master.close()
+            raise
+        self.process = EtherCatProcessData(master, self.nodes, description, lockstep)
+        words = _controlwords(description)
+        self._clients: list[ObjectClient] = [
+            SlaveObjects(master, k, position, self.process, words, self.start, partial(self.wake, k), lockstep)
+            for k, position in enumerate(self.nodes)
+        ]
+        self.process.connect(self._clients)
+
+    @cached_property
+    def watch(self) -> ProcessWatchdog:
+        """The slaves' watchdogs."""
+        return ProcessWatchdog(self._master, self.nodes, self._clients, self.process, self._description)
+
+    def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
+        """Take whom to tell of waiting for an answer, and of a node that has booted though nobody here has reset it."""
+        self._alive, self._restarted = alive, restarted
+
+    # --- objects and states -----------------------------------------------------------------------------------------
+    def sdo(self, node: int) -> ObjectClient:
+        """Return the client for a node's objects."""
+        return self._clients[node]
+
+    def wake(self, node: int) -> None:
+        """Take a node to where its mailbox answers."""
+        status = self._master.status(self.nodes[node])
+        if status.state not in (AlState.PRE_OP, AlState.SAFE_OP, AlState.OP):
+            self._recover(node)
+
+    def welcome(self, node: int) -> None:
+        """Do nothing: all that the link must know of a node its EEPROM has said."""
+
+    def start(self) -> None:
+        """Take the nodes to Op; those that have lost their images get them anew.
+
+        Raises:
+            BusError: If one does not come; NoAnswerError if it does not answer.
+        """
+        with self.process.turn:
+            for k, position in enumerate(self.nodes):
+                status = self._master.status(position)
+                if k in self.process.missing:
+                    self._recover(k)
+                elif status.state not in (AlState.SAFE_OP, AlState.OP):
+                    self.process.forget([k])
+                    self._recover(k)
+            if self.process.missing:
+                self.process.prepare()
+        if not all(self._master.status(position).is_op for position in self.nodes):
+            self.process.operate()
+
+    def reset(self, nodes: Sequence[int]) -> None:
+        """Restart nodes by the reset sequence of their controllers (0040h), and wait until they are back.
+
+        Raises:
+            NoAnswerError: If one does not come back; BusError if it does not restart.
+        """
+        for k in nodes:
+            position = self.nodes[k]
+            for letter in b"RES":
+                self._master.write_register(position, registers.RESET, bytes((letter,)))
+            if self._master.status(position).state not in (0, AlState.INIT):
+                raise BusError(f"position {position} does not restart by its reset register; switch it off and on")
+            self.process.forget([k])
+            self._await_boot(k)
+
+    def states(self) -> list[int]:
+        """Return the states of the nodes, asked now."""
+        return [self._master.status(position).state for position in self.nodes]
+
+    def take_emergencies(self) -> list[ReceivedEmergency]:
+        """Return and forget the emergencies that came, in their order."""
+        return [one for one in self._master.take_emergencies() if one.node in self.nodes]
+
+    def time_passes(self) -> bool | None:
+        """Look whether the clock of the first slave goes while no process data are exchanged; None of one without."""
+        before = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
+        time.sleep(TIME_LOOK)
+        after = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
+        return None if before is None or after is None else before != after
+
+    def other_masters(self) -> OtherEtherCatMasters:
+        """Begin to look for other masters."""
+        return OtherEtherCatMasters(self)
+
+    # --- cycles -----------------------------------------------------------------------------------------------------
+    def sync(self) -> None:
+        """Exchange the images of a cycle, and before it those that did not come back."""
+        self.process.owed += 1
+        self.process.settle(self._frame)
+
+    def receive(self, timeout: float = 0.0) -> bool:
+        """Wait: images come back with the exchange."""
+        if timeout > 0.0:
+            time.sleep(timeout)
+        return False
+
+    def wait(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Exchange the images of a cycle once more where they did not come back, until `done()` or so long [s]."""
+        deadline = time.monotonic() + timeout
+        while not done():
+            if time.monotonic() > deadline:
+                return False
+            if not self.process.settle(self._frame):
+                time.sleep(LOOK)
+        return True
+
+    def drain(self) -> None:
+        """Do nothing: what comes back is taken with the exchange."""
+
+    def close(self) -> None:
+        """Take all slaves to Init and let go of the segment."""
+        self._master.close()
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _while_waiting(self) -> None:
+        """Say that the program waits, and keep the watchdogs quiet meanwhile."""
+        self._alive()
+        if not self._lockstep and time.monotonic() - self.process.exchanged_at > FACTORY / 3.0:
+            self.process.exchange(is_cycle=False)
+
+    def _recover(self, node: int) -> None:
+        """Take a node to Pre-Op; tell of one that has restarted by itself."""
+        if self._master.recover(self.nodes[node]):
+            self.process.forget([node])
+            self._restarted(node)
+
+    def _await_boot(self, node: int) -> None:
+        deadline = time.monotonic() + BOOT
+        while True:
+            try:
+                self._master.recover(self.nodes[node])
+                return
+            except NoAnswerError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(LOOK)
+
+
+def _controlwords(description: Description) -> set[Key]:
+    if not description.has((cia402.CONTROLWORD, 0)):
+        return set()
+    entry = description.dictionary.find((cia402.CONTROLWORD, 0))
+    return {description.key(entry, axis) for axis in range(description.num_axes)}

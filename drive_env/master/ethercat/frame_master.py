@@ -1,0 +1,377 @@
+"""A master of its own, over whatever carries frames as bytes: states, mailbox and images by datagrams (ETG.1000.4).
+
+It is small: slaves in a line, one image of each direction, no distributed clocks. SOEM (`soem_master.py`) has more, and
+wants a network interface.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from drive_env.ethercat import datagrams, registers
+from drive_env.ethercat.application import AlState
+from drive_env.ethercat.datagrams import Datagram, DatagramCommand, at_station
+from drive_env.ethercat.state_machine import ACKNOWLEDGE
+from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus
+from drive_env.master.ethercat.frame_ways import FrameWay
+from drive_env.master.ethercat.mailbox_client import MailboxClient
+from drive_env.master.ethercat.state_names import refusal
+from drive_env.master.link import ReceivedEmergency
+
+C = DatagramCommand
+FIRST_STATION, LOGICAL = 0x1001, 0x10000
+FRAME = 0.02  # s for a frame to come back
+PATIENCE = 5.0  # s for a state, and for the EEPROM
+TRIES = 50  # of a frame that does not come back
+LOOK = 0.001  # s between two looks at a state
+SII_BUSY = 0x8000
+IDENTITY_WORD, MAILBOX_WORD, FIRST_CATEGORY, SYNC_MANAGER_CATEGORY, END = 0x08, 0x18, 0x40, 41, 0xFFFF
+LONGEST_IMAGE = 1400  # bytes of all slaves in one frame
+
+
+class SlavePlaces(NamedTuple):
+    """What a slave's EEPROM says: who it is, (address, length) of its mailboxes, (address, control) of its images."""
+
+    identity: SlaveIdentity
+    receive: tuple[int, int]
+    send: tuple[int, int]
+    outputs: tuple[int, int]
+    inputs: tuple[int, int]
+
+
+class FrameMaster:
+    """A master over a way.
+
+    Args:
+        way: Carries its frames.
+        frame_timeout: Longest wait for one to come back [s].
+
+    Attributes:
+        alive: Called again and again while an answer is waited for.
+    """
+
+    def __init__(self, way: FrameWay, frame_timeout: float = FRAME) -> None:
+        self.alive: Callable[[], None] = lambda: None
+        self._way = way
+        self._timeout = frame_timeout
+        self._number = 0
+        self._turn = threading.RLock()  # a frame and its answer
+        self._places: list[SlavePlaces] = []
+        self._mailboxes: list[MailboxClient] = []
+        self._repeats: list[bool] = []
+        self._mapped: dict[int, tuple[int, ImageSizes]] = {}  # position -> logical address, sizes
+
+    # --- frames -----------------------------------------------------------------------------------------------------
+    def _transfer(self, asked: Sequence[Datagram], timeout: float) -> list[Datagram] | None:
+        """Return the datagrams of a frame as they come back, None if it does not."""
+        with self._turn:
+            self._number = (self._number + 1) & 0xFF
+            sent = [one._replace(number=self._number) for one in asked]
+            self._way.send(datagrams.build(sent))
+            deadline = time.monotonic() + timeout
+            while True:
+                left = deadline - time.monotonic()
+                payload = self._way.receive(max(left, 0.0))
+                if payload is None:
+                    return None
+                found = datagrams.read(payload, 0)
+                shape = [(one.command, one.number, len(one.data)) for one in found]
+                if shape == [(one.command, one.number, len(one.data)) for one in sent]:
+                    return found
+
+    def _one(self, command: int, station: int, address: int, data: bytes) -> Datagram | None:
+        found = self._transfer([at_station(command, station, address, data)], self._timeout)
+        return None if found is None else found[0]
+
+    def _surely(self, command: int, station: int, address: int, data: bytes, what: str) -> bytes:
+        """Do what may be done twice until a slave has had it.
+
+        Raises:
+            NoAnswerError: If none has.
+        """
+        for _ in range(TRIES):
+            found = self._one(command, station, address, data)
+            if found is not None and found.counter:
+                return found.data
+            self.alive()
+        raise NoAnswerError(f"{what}: no slave answers on {self._way.name}; check cable, power and channel")
+
+    def _write(self, position: int, address: int, data: bytes) -> None:
+        self._surely(C.FPWR, FIRST_STATION + position, address, data, f"position {position}")
+
+    def _read(self, position: int, address: int, size: int) -> bytes:
+        return self._surely(C.FPRD, FIRST_STATION + position, address, bytes(size), f"position {position}")
+
+    def register(self, position: int, address: int, size: int) -> bytes | None:
+        """Return a slave's register; None where it does not answer."""
+        for _ in range(READS):
+            found = self._one(C.FPRD, FIRST_STATION + position, address, bytes(size))
+            if found is not None:
+                return found.data if found.counter else None
+        return None
+
+    def write_register(self, position: int, address: int, data: bytes) -> None:
+        """Write a slave's register; NoAnswerError if it does not take it."""
+        self._write(position, address, data)
+
+    # --- slaves -----------------------------------------------------------------------------------------------------
+    def look(self) -> list[tuple[SlaveStatus, SlaveIdentity]]:
+        """Return state and identity of every slave, without a change to any: addresses are those of the line.
+
+        Raises:
+            NoAnswerError: If no slave answers.
+        """
+        found = []
+        for position in range(self._count()):
+            status = self._surely(C.APRD, -position, registers.AL_STATUS, bytes(6), f"position {position}")
+            found.append((_status(status), self._identity(C.APRD, C.APWR, -position)))
+        return found
+
+    def begin(self) -> int:
+        """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends."""
+        count = self._count()
+        self._mapped.clear()
+        self._places, self._mailboxes, self._repeats = [], [], []
+        for position in range(count):
+            self._address(position)
+            self._to(position, AlState.INIT)
+            places = self._read_places(position)
+            self._places.append(places)
+            self._repeats.append(False)
+            self._mailboxes.append(self._mailbox(position, places))
+            self._open_mailbox(position)
+        return count
+
+    def recover(self, position: int) -> bool:
+        """Take a slave to Pre-Op; return whether it had restarted, and had no address."""
+        status = self.status(position)
+        has_restarted = not status.state
+        if has_restarted:
+            self._address(position)
+        if has_restarted or status.state not in (AlState.PRE_OP, AlState.SAFE_OP, AlState.OP):
+            self._to(position, AlState.INIT)
+            self._open_mailbox(position)
+        else:
+            self._to(position, AlState.PRE_OP)
+        return has_restarted
+
+    def identity(self, position: int) -> SlaveIdentity:
+        """Return what a slave's EEPROM says."""
+        return self._places[position].identity
+
+    def status(self, position: int) -> SlaveStatus:
+        """Return a slave's state, asked now."""
+        data = self.register(position, registers.AL_STATUS, 6)
+        return SlaveStatus(0, False, 0) if data is None else _status(data)
+
+    def _count(self) -> int:
+        """Return how many slaves there are; NoAnswerError if none."""
+        for _ in range(TRIES):
+            found = self._one(C.BRD, 0, registers.AL_STATUS, bytes(2))
+            if found is not None and found.counter:
+                return found.counter
+        raise NoAnswerError(f"no slave answers on {self._way.name}; check cable, power and channel")
+
+    def _address(self, position: int) -> None:
+        station = struct.pack("<H", FIRST_STATION + position)
+        self._surely(C.APWR, -position, registers.STATION_ADDRESS, station, f"position {position}")
+
+    def _open_mailbox(self, position: int) -> None:
+        """Take a slave from Init to Pre-Op, its sync managers and FMMUs anew."""
+        places = self._places[position]
+        off = bytes(registers.SYNC_MANAGER_SIZE)
+        for k in range(4):
+            self._write(position, registers.SYNC_MANAGERS + k * registers.SYNC_MANAGER_SIZE, off)
+        for k, (place, control) in enumerate(((places.receive, 0x26), (places.send, 0x22))):
+            setting = struct.pack("<HHBBBB", *place, control, 0, 1, 0)
+            self._write(position, registers.SYNC_MANAGERS + k * registers.SYNC_MANAGER_SIZE, setting)
+        self._repeats[position] = False
+        self._to(position, AlState.PRE_OP)
+
+    def _to(self, position: int, state: AlState, timeout: float = PATIENCE) -> None:
+        """Take a slave to a state, with its last error acknowledged.
+
+        Raises:
+            BusError: If it refuses, with its AL status code; NoAnswerError if it does not answer.
+        """
+        self._write(position, registers.AL_CONTROL, struct.pack("<H", state | ACKNOWLEDGE))
+        deadline = time.monotonic() + timeout
+        while True:
+            status = _status(self._read(position, registers.AL_STATUS, 6))
+            if status.state == state and not status.has_error:
+                return
+            if status.has_error or time.monotonic() > deadline:
+                raise BusError(refusal(position, state, status))
+            self.alive()
+            time.sleep(LOOK)
+
+    # --- EEPROM -----------------------------------------------------------------------------------------------------
+    def _words(self, read: int, write: int, station: int, address: int) -> bytes:
+        """Return four bytes of the EEPROM from a word on."""
+        what = f"the EEPROM of the slave at {station & 0xFFFF:04X}h"
+        self._surely(write, station, registers.SII_CONTROL, struct.pack("<HI", 0x0100, address), what)
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            found = self._surely(read, station, registers.SII_CONTROL, bytes(10), what)
+            if not struct.unpack_from("<H", found)[0] & SII_BUSY:
+                return found[6:10]
+            if time.monotonic() > deadline:
+                raise NoAnswerError(f"{what} stays busy; check its power")
+            time.sleep(LOOK)
+
+    def _identity(self, read: int, write: int, station: int) -> SlaveIdentity:
+        words = [self._words(read, write, station, IDENTITY_WORD + 2 * k) for k in range(4)]
+        return SlaveIdentity(*(int.from_bytes(one, "little") for one in words))
+
+    def _read_places(self, position: int) -> SlavePlaces:
+        station = FIRST_STATION + position
+
+        def words(address: int) -> tuple[int, int]:
+            first, second = struct.unpack("<HH", self._words(C.FPRD, C.FPWR, station, address))
+            return first, second
+
+        self._write(position, registers.SII_ACCESS, bytes(1))
+        address, managers = FIRST_CATEGORY, []
+        while True:
+            kind, length = words(address)
+            if kind == END or address > 0x4000:
+                break
+            if kind == SYNC_MANAGER_CATEGORY:
+                managers = [(words(address + 2 + 4 * k)[0], words(address + 4 + 4 * k)[0]) for k in range(length // 4)]
+                break
+            address += 2 + length
+        if len(managers) < 4:
+            raise BusError(f"position {position}: its EEPROM names {len(managers)} sync managers; a drive has 4")
+        outputs, inputs = ((start, control & 0xFF) for start, control in managers[2:4])
+        identity = self._identity(C.FPRD, C.FPWR, station)
+        return SlavePlaces(identity, words(MAILBOX_WORD), words(MAILBOX_WORD + 2), outputs, inputs)
+
+    # --- images -----------------------------------------------------------------------------------------------------
+    def map(self, sizes: Mapping[int, ImageSizes]) -> None:
+        """Give the images of slaves their places, and take the slaves from Pre-Op to Safe-Op."""
+        self._mapped.clear()
+        total = sum(size.outputs + size.inputs for size in sizes.values())
+        if total > LONGEST_IMAGE:
+            raise BusError(
+                f"the images of {len(sizes)} slaves have {total} bytes, and a frame {LONGEST_IMAGE}; open fewer"
+            )
+        address = LOGICAL
+        for position, size in sizes.items():
+            self._mapped[position] = (address, size)
+            if self.status(position).state == AlState.PRE_OP:  # others have their places
+                self._place(position, address, size)
+            address += size.outputs + size.inputs
+
+    def _place(self, position: int, address: int, size: ImageSizes) -> None:
+        """Give the images of one slave their places in its memory and in the logical one; take it to Safe-Op."""
+        places = self._places[position]
+        rows = (
+            (2, places.outputs, size.outputs, address, 2),
+            (3, places.inputs, size.inputs, address + size.outputs, 1),
+        )
+        for number, (start, control), length, logical, kind in rows:
+            base = registers.SYNC_MANAGERS + number * registers.SYNC_MANAGER_SIZE
+            self._write(position, base, bytes(registers.SYNC_MANAGER_SIZE))
+            self._write(position, base, struct.pack("<HHBBBB", start, length, control, 0, bool(length), 0))
+            unit = struct.pack("<IHBBHBBBBBB", logical, length, 0, 7, start, 0, kind, bool(length), 0, 0, 0)
+            self._write(position, registers.FMMUS + (number - 2) * registers.FMMU_SIZE, unit)
+        self._to(position, AlState.SAFE_OP)
+
+    def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
+        """Take slaves to Op; `exchange` sends images meanwhile."""
+        for position in positions:
+            if self.status(position).has_error:
+                self._to(position, AlState.SAFE_OP)
+            self._write(position, registers.AL_CONTROL, struct.pack("<H", AlState.OP))
+        deadline = time.monotonic() + timeout
+        while waiting := [(k, now) for k, now in ((k, self.status(k)) for k in positions) if not now.is_op]:
+            refused = [(k, now) for k, now in waiting if now.has_error]
+            if refused or time.monotonic() > deadline:
+                position, status = (refused or waiting)[0]
+                raise BusError(refusal(position, AlState.OP, status))
+            if exchange is not None:
+                exchange()
+            self.alive()
+            time.sleep(LOOK)
+
+    def leave_op(self, position: int) -> None:
+        """Take a slave to Pre-Op."""
+        self._to(position, AlState.PRE_OP)
+
+    def exchange(self, outputs: Sequence[bytes], timeout: float) -> list[bytes | None]:
+        """Send the images of the slaves that are mapped and return theirs, in the order of `map`."""
+        image = b"".join(
+            data + bytes(size.inputs) for data, (_, size) in zip(outputs, self._mapped.values(), strict=True)
+        )
+        asked = [Datagram(C.LRW, LOGICAL, image)]
+        asked += [at_station(C.FPRD, FIRST_STATION + k, registers.AL_STATUS, bytes(6)) for k in self._mapped]
+        found = self._transfer(asked, timeout)
+        expected = sum(2 * bool(size.outputs) + bool(size.inputs) for _, size in self._mapped.values())
+        if found is None or found[0].counter != expected:
+            return [None] * len(self._mapped)
+        parts: list[bytes | None] = []
+        for (address, size), answer in zip(self._mapped.values(), found[1:], strict=True):
+            start = address - LOGICAL + size.outputs
+            is_op = answer.counter and _status(answer.data).is_op
+            parts.append(found[0].data[start : start + size.inputs] if is_op else None)
+        return parts
+
+    # --- objects ----------------------------------------------------------------------------------------------------
+    def upload(self, position: int, index: int, sub: int, timeout: float) -> bytes:
+        """Return the bytes of an object."""
+        return self._mailboxes[position].upload(index, sub, timeout)
+
+    def download(self, position: int, index: int, sub: int, data: bytes, timeout: float) -> None:
+        """Write the bytes of an object."""
+        self._mailboxes[position].download(index, sub, data, timeout)
+
+    def post(self, position: int, index: int, sub: int, data: bytes) -> None:
+        """Send a short write and wait for no answer."""
+        self._mailboxes[position].post(index, sub, data)
+
+    def take_emergencies(self) -> list[ReceivedEmergency]:
+        """Return and forget the emergencies that came."""
+        found = []
+        for position, mailbox in enumerate(self._mailboxes):
+            mailbox.look(0.0)
+            while mailbox.emergencies:
+                found.append(ReceivedEmergency(position, *mailbox.emergencies.popleft()))
+        return found
+
+    def close(self) -> None:
+        """Take all slaves to Init, as far as they answer, and let go of the way."""
+        for position in range(len(self._places)):
+            self._one(
+                C.FPWR, FIRST_STATION + position, registers.AL_CONTROL, struct.pack("<H", AlState.INIT | ACKNOWLEDGE)
+            )
+        self._way.close()
+
+    def _mailbox(self, position: int, places: SlavePlaces) -> MailboxClient:
+        station = FIRST_STATION + position
+
+        def send(data: bytes) -> bool | None:
+            found = self._one(C.FPWR, station, places.receive[0], data)
+            return None if found is None else bool(found.counter)
+
+        def fetch() -> bytes | None:
+            found = self._one(C.FPRD, station, places.send[0], bytes(places.send[1]))
+            if found is None:
+                return None
+            return found.data if found.counter else b""
+
+        def repeat() -> None:
+            self._repeats[position] = not self._repeats[position]
+            activate = 1 | self._repeats[position] << 1
+            self._one(C.FPWR, station, registers.SYNC_MANAGERS + registers.SYNC_MANAGER_SIZE + 6, bytes((activate,)))
+
+        return MailboxClient(send, fetch, repeat, (places.receive[1], places.send[1]), lambda: self.alive())
+
+
+def _status(data: bytes) -> SlaveStatus:
+    status, code = struct.unpack("<H2xH", data)
+    return SlaveStatus(status & STATE, bool(status & ERROR), code)

@@ -1,0 +1,341 @@
+"""Process data over EtherCAT: one image of each direction and slave, all of them in every frame.
+
+An image stays as it is from frame to frame: what is not played keeps its last value, and what is written to an object
+of an image by an SDO is put into the image, too. Images are changed in Pre-Op, where no motor runs; so they are not
+changed while an axis is enabled.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Description, Key
+from drive_env.master.errors import NoAnswerError
+from drive_env.master.ethercat.ethercat_master import EtherCatMaster, ImageSizes
+from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImageLayout, ImagePlanner
+from drive_env.master.ethercat.slave_images import SlaveImages
+from drive_env.master.link import ObjectClient
+from drive_env.master.packing import unpack_rows
+
+Integers = NDArray[np.int64]
+FRAME = 0.02  # s for a frame to come back in real time
+LONGEST_STATE = 5.0  # s
+
+
+class ImageSamples:
+    """Input images of a run of cycles."""
+
+    def __init__(self, data: EtherCatProcessData, layout: ImageLayout, description: Description) -> None:
+        self._data = data
+        self._layout = layout
+        self._description = description
+        self.rows: list[list[bytes]] = []  # of each cycle, the image of each slave
+        data.takers.append(self.rows)
+
+    def complete(self) -> int:
+        """Return how many rows are complete."""
+        return len(self.rows)
+
+    def decode(self, first: int, last: int) -> dict[Key, Integers]:
+        """Return rows `first` to `last` (excluded), each object of shape (rows, num_axes)."""
+        values: dict[Key, Integers] = {}
+        per_node, nodes = self._description.num_axes, len(self._data.images)
+        for k in range(nodes):
+            joined = b"".join(row[k] for row in self.rows[first:last])
+            data = np.frombuffer(joined, np.uint8).reshape(last - first, self._layout.size)
+            unpack_rows(values, data, self._layout.members, k * per_node, nodes * per_node)
+        return values
+
+    def missing(self, rows: int, timeout: float) -> NoAnswerError:
+        """Return the error for samples that stay out, of so many cycles and after so long a wait [s]."""
+        return NoAnswerError(
+            f"{len(self.rows)} input images came in {rows} cycles, and no more within {timeout:g} s; check cable and "
+            "power, and whether every drive is in Op"
+        )
+
+    def close(self) -> None:
+        """Take nothing more."""
+        self._data.takers = [taker for taker in self._data.takers if taker is not self.rows]
+
+
+class ImageRows:
+    """Rows of what is played, ready to be put into the output images."""
+
+    def __init__(self, data: EtherCatProcessData, layout: ImageLayout, played: Mapping[Entry, Integers]) -> None:
+        self._data = data
+        per_node = data.num_axes // len(data.images)
+        self._parts: list[list[tuple[int, int, NDArray[np.uint8]]]] = [[] for _ in data.images]
+        for k, parts in enumerate(self._parts):
+            for member in layout.members:
+                if member.entry in played:
+                    column = np.ascontiguousarray(played[member.entry][:, k * per_node + member.axis], "<i8")
+                    raw = column.view(np.uint8).reshape(-1, 8)[:, : member.size]
+                    parts.append((member.start, member.start + member.size, raw))
+
+    def send(self, row: int) -> None:
+        """Put a row into the images, which go out with the next cycle."""
+        with self._data.turn:
+            for image, parts in zip(self._data.images, self._parts, strict=True):
+                for start, end, raw in parts:
+                    image[start:end] = raw[row].tobytes()
+
+
+class EtherCatProcessData:
+    """What is mapped at present, and the exchange of images.
+
+    Args:
+        master: Of the segment.
+        nodes: Positions of the slaves.
+        description: What device they are.
+        lockstep: Time passes by frames alone.
+
+    Attributes:
+        mapping: Its number: it grows with every change.
+        turn: Held while images are written or exchanged.
+        images: What goes into each slave.
+        takers: Who collects what comes back: rows of the images of all slaves.
+        exchanged_at: When images last came back [s].
+        owed: Rows of a run of cycles that are not back.
+        is_silent: Nothing may go out any more, so that the drives stop by themselves.
+    """
+
+    def __init__(self, master: EtherCatMaster, nodes: Sequence[int], description: Description, lockstep: bool) -> None:
+        self.mapping = 0
+        self.turn = threading.RLock()
+        self.images = [bytearray() for _ in nodes]
+        self.takers: list[list[list[bytes]]] = []
+        self.exchanged_at = 0.0
+        self.owed = 0
+        self.is_silent = False
+        self.num_axes = len(nodes) * description.num_axes
+        self._master = master
+        self._nodes = tuple(nodes)
+        self._description = description
+        self._lockstep = lockstep
+        self._planner = ImagePlanner(description)
+        self._layouts: dict[int, ImageLayout] = {}
+        self._places: dict[Key, tuple[int, int]] = {}
+        self._ready: set[int] = set()  # slaves that have these images, by their number here
+        self._clients: list[ObjectClient] = []
+        self._slaves: list[SlaveImages] = []
+
+    def connect(self, clients: Sequence[ObjectClient]) -> None:
+        """Take the slaves' objects."""
+        self._clients = list(clients)
+        self._slaves = [SlaveImages(client, self._description) for client in clients]
+
+    # --- what is chosen ---------------------------------------------------------------------------------------------
+    def check_sampled(self, entries: Sequence[Entry]) -> None:
+        """Raise ObjectAccessError 06040041h for an object that cannot come with every cycle."""
+        self._check(entries, INPUTS, "wo", "recorded")
+
+    def check_played(self, entries: Sequence[Entry]) -> None:
+        """Raise ObjectAccessError 06040041h for an object that cannot be sent with every cycle."""
+        self._check(entries, OUTPUTS, "ro", "played")
+
+    def choose(
+        self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
+    ) -> tuple[Entry, ...]:
+        """Return what is wanted, and what of the welcome is in the same image.
+
+        Raises:
+            ObjectAccessError: 06040042h if not even what is wanted fits.
+        """
+        image = self._planner.plan(INPUTS, wanted, self._layout(INPUTS)).entries
+        return (*wanted, *(entry for entry in welcome if entry in image and entry not in wanted))
+
+    def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
+        """Return whether the images that are exchanged carry these already."""
+        has = len(self._ready) == len(self._nodes)
+        return has and self._carries(OUTPUTS, played) and self._carries(INPUTS, sampled)
+
+    def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
+        """Have images carry entries of every axis besides what is in them, as far as there is room.
+
+        Raises:
+            ObjectAccessError: 06040042h if they do not fit; 08000022h while an axis is enabled: images are changed in
+                Pre-Op, where no motor runs.
+        """
+        wanted = {
+            direction: self._planner.plan(direction, entries, self._layout(direction))
+            for direction, entries in ((OUTPUTS, played), (INPUTS, sampled))
+        }
+        self.mapping += 1
+        if wanted == self._layouts and len(self._ready) == len(self._nodes):
+            return
+        self._check_none_is_enabled((*played, *sampled))
+        with self.turn:
+            self.leave()
+            self._layouts = wanted
+            self.prepare()
+        self.operate()
+
+    def sampled_entries(self) -> tuple[Entry, ...]:
+        """Return what comes with every cycle."""
+        return self._layouts[INPUTS].entries if self._ready else ()
+
+    def outputs(self, played: Mapping[Entry, Integers]) -> ImageRows | None:
+        """Return rows to send; None of nothing."""
+        return ImageRows(self, self._layouts[OUTPUTS], played) if played else None
+
+    def samples(self) -> ImageSamples | None:
+        """Begin to collect input images; None while there are none."""
+        self.owed = 0
+        return ImageSamples(self, self._layouts[INPUTS], self._description) if self._ready else None
+
+    def forget(self, nodes: Sequence[int]) -> None:
+        """Forget what nodes have: they have restarted."""
+        self.mapping += 1
+        with self.turn:
+            self._ready -= set(nodes)
+        for k in nodes:
+            self._slaves[k].forget()
+
+    def restore(self, node: int) -> None:
+        """Take a node out of Op and put its mapping back as it was found; BusError if not all of it could be."""
+        with self.turn:
+            self._ready.discard(node)
+        self._master.leave_op(self._nodes[node])
+        self._slaves[node].restore()
+
+    # --- what the link asks -----------------------------------------------------------------------------------------
+    @property
+    def missing(self) -> list[int]:
+        """Slaves that do not have these images, by their number."""
+        return [k for k in range(len(self._nodes)) if k not in self._ready]
+
+    def prepare(self) -> None:
+        """Give the slaves that are in Pre-Op their images, filled with what their objects have, and go to Safe-Op."""
+        layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
+        for k in self.missing:
+            for direction, layout in layouts.items():
+                self._slaves[k].change(direction, layout)
+            self.images[k] = self._as_it_is(k, layouts[OUTPUTS])
+        self._layouts = layouts
+        self._places = layouts[OUTPUTS].places(self._description)
+        sizes = ImageSizes(layouts[OUTPUTS].size, layouts[INPUTS].size)
+        self._master.map(dict.fromkeys(self._nodes, sizes))
+        self._ready = set(range(len(self._nodes)))
+
+    def operate(self) -> None:
+        """Take the slaves to Op."""
+        exchange = None if self._lockstep else lambda: self.exchange(is_cycle=False)
+        self._master.operate(self._nodes, exchange and (lambda: _nothing(exchange())), LONGEST_STATE)
+        self.exchanged_at = time.monotonic()
+
+    def leave(self) -> None:
+        """Take the slaves to Pre-Op."""
+        with self.turn:
+            self._ready.clear()
+            for position in self._nodes:
+                self._master.leave_op(position)
+
+    def put(self, node: int, key: Key, data: bytes) -> bytes | None:
+        """Put what an object gets into the output image; return what was there, None of an object not in it."""
+        if node not in self._ready or key not in self._places:
+            return None
+        start, size = self._places[key]
+        with self.turn:
+            before = bytes(self.images[node][start : start + size])
+            self.images[node][start : start + size] = data[:size].ljust(size, b"\xff" if _is_below_0(data) else b"\0")
+        return before
+
+    def has(self, key: Key) -> bool:
+        """Return whether the output image carries an object of a node."""
+        return bool(self._ready) and key in self._places
+
+    def exchange(self, is_cycle: bool, timeout: float = FRAME) -> bool:
+        """Exchange images with all slaves; what comes back outside a cycle is nobody's sample.
+
+        Returns:
+            Whether the images of all of them came back.
+        """
+        with self.turn:
+            if self.is_silent or len(self._ready) < len(self._nodes):
+                return False
+            found = self._master.exchange([bytes(image) for image in self.images], timeout)
+            row = [image for image in found if image is not None]
+            if len(row) < len(self._nodes):
+                return False
+            self.exchanged_at = time.monotonic()
+            if is_cycle:
+                for taker in self.takers:
+                    taker.append(row)
+            return True
+
+    def settle(self, timeout: float) -> bool:
+        """Exchange images for the cycles whose rows are not back; return whether all are.
+
+        The row of a frame that was lost is taken by the next one, so that rows are as many as cycles.
+        """
+        with self.turn:
+            while self.owed:
+                if not self.exchange(is_cycle=True, timeout=timeout):
+                    return False
+                self.owed -= 1
+            return True
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _layout(self, direction: int) -> ImageLayout:
+        """Return the image that is mapped, or will be where nobody asks for more: the slave's, and what is needed."""
+        if direction not in self._layouts:
+            found = self._slaves[0].found(direction, self._planner)
+            self._layouts[direction] = self._planner.completed(direction, found)
+        return self._layouts[direction]
+
+    def _carries(self, direction: int, entries: tuple[Entry, ...]) -> bool:
+        return set(entries) <= set(self._layouts[direction].entries)
+
+    def _check(self, entries: Sequence[Entry], direction: int, wrong_way: str, verb: str) -> None:
+        ready_made = self._layout(direction).entries
+        for entry in entries:
+            can = entry.pdo_mappable and entry.access not in (wrong_way, "const")
+            if not can and entry not in ready_made:
+                raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot be {verb}: it is no process data")
+
+    def _check_none_is_enabled(self, entries: Sequence[Entry]) -> None:
+        if not self._ready:
+            return
+        status = self._description.dictionary.find((cia402.STATUSWORD, 0))
+        for k, client in enumerate(self._clients):
+            for axis in range(self._description.num_axes):
+                label = self._description.label(status, axis)
+                data = client.read(*self._description.key(status, axis), label, self._description.answer_timeout)
+                if cia402.is_live(int.from_bytes(data, "little")):
+                    names = ", ".join(entry.label for entry in entries if not self._is_in_an_image(entry))
+                    raise ObjectAccessError(
+                        WRONG_STATE,
+                        f"{names} is not in the process image, which cannot be changed while axis "
+                        f"{k * self._description.num_axes + axis} is enabled; record or play it once before enabling",
+                    )
+
+    def _is_in_an_image(self, entry: Entry) -> bool:
+        return any(entry in layout.entries for layout in self._layouts.values())
+
+    def _as_it_is(self, node: int, layout: ImageLayout) -> bytearray:
+        """Return an output image of what the slave's objects have now; 0 of those that cannot be read."""
+        image = bytearray(layout.size)
+        for member in layout.members:
+            if member.entry.access != "wo":
+                label = self._description.label(member.entry, member.axis)
+                key, timeout = self._description.key(member.entry, member.axis), self._description.answer_timeout
+                data = self._clients[node].read(*key, label, timeout)
+                fill = b"\xff" if member.entry.signed and _is_below_0(data) else b"\0"
+                image[member.start : member.start + member.size] = data[: member.size].ljust(member.size, fill)
+        return image
+
+
+def _is_below_0(data: bytes) -> bool:
+    return bool(data) and bool(data[-1] & 0x80)
+
+
+def _nothing(_: object) -> None:
+    """Take what nobody asks for."""

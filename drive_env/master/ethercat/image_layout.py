@@ -1,0 +1,132 @@
+"""Which objects lie where in the images of a slave, and which images a device can have (ETG.1000.6, 5.6.7.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from drive_env import cia402
+from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Description, Key
+from drive_env.master.packing import Member
+
+OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+FIRST_PDO = {OUTPUTS: 0x1600, INPUTS: 0x1A00}  # of a device that names none
+# What a drive is commanded and watched by, wherever there is room for it.
+ESSENTIAL = {
+    OUTPUTS: (cia402.CONTROLWORD,),
+    INPUTS: (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL),
+}
+USUAL_ENTRIES = 8  # that a mapping object takes where the EDS does not list them
+
+
+class ImageLayout(NamedTuple):
+    """One image.
+
+    Attributes:
+        pdo: Object that the sync manager is assigned.
+        members: Objects of the axes and their places; one of the whole node stands for each axis.
+        size: Length [bytes].
+        mapped: Mapping entries to be written; None of a ready-made image.
+    """
+
+    pdo: int
+    members: tuple[Member, ...]
+    size: int
+    mapped: tuple[int, ...] | None
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Return the entries that each axis has in it."""
+        return tuple(dict.fromkeys(member.entry for member in self.members))
+
+    def places(self, description: Description) -> dict[Key, tuple[int, int]]:
+        """Return first byte and length of each object of the node."""
+        return {description.key(m.entry, m.axis): (m.start, m.size) for m in self.members}
+
+
+class ImagePlanner:
+    """Finds images of a device that carry what is wanted.
+
+    Args:
+        description: The device.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self._description = description
+        known = description.dictionary
+        # Of a further axis' object, which the EDS may list, too, that of the first axis counts.
+        self._by_key = {(entry.index, entry.sub): (entry, 0) for entry in known} | {
+            key: (entry, axis) for key, (entry, axis) in description.of_further_axes().items()
+        }
+
+    def parsed(self, direction: int, pdo: int, mapped: Sequence[int]) -> ImageLayout | None:
+        """Return the image that a mapping object of a slave makes; None where it is not the same for every axis."""
+        entries = []
+        for raw in mapped:
+            found = self._by_key.get((raw >> 16, raw >> 8 & 0xFF))
+            if found is None or found[0].bits != raw & 0xFF:
+                return None
+            entries.append(found[0])
+        layout = self.free(pdo, tuple(dict.fromkeys(entries)))
+        return layout if layout.mapped == tuple(mapped) else None
+
+    def plan(self, direction: int, wanted: Sequence[Entry], current: ImageLayout) -> ImageLayout:
+        """Return an image with what is wanted of every axis; the current one if that has it.
+
+        Raises:
+            ObjectAccessError: 06040042h if it is too much for one image.
+        """
+        if set(wanted) <= set(current.entries):
+            return current
+        if current.mapped is None:
+            raise ObjectAccessError(CANNOT_BE_MAPPED, f"{wanted[0].label} is in no image of this drive")
+        room = self._room(current.pdo)
+        layout = self.free(current.pdo, wanted)
+        if len(layout.mapped or ()) > room:
+            raise ObjectAccessError(
+                PDO_LENGTH_EXCEEDED,
+                f"{len(wanted)} objects of {self._description.num_axes} axes are more than the {room} that the process "
+                f"image {current.pdo:04X}h takes; record or play fewer at a time",
+            )
+        return self._filled(direction, layout, current.entries)
+
+    def completed(self, direction: int, current: ImageLayout) -> ImageLayout:
+        """Return an image with what commands and shows a drive besides, as far as there is room."""
+        return current if current.mapped is None else self._filled(direction, current, ())
+
+    def free(self, pdo: int, entries: Iterable[Entry]) -> ImageLayout:
+        """Return the image that carries entries of every axis, axis by axis."""
+        known = self._description
+        places: dict[Key, int] = {}
+        members, mapped, start = [], [], 0
+        for axis in range(known.num_axes):
+            for entry in entries:
+                key, bits = known.key(entry, axis), entry.bits or 0
+                if key not in places:
+                    places[key] = start
+                    mapped.append(key[0] << 16 | key[1] << 8 | bits)
+                    start += bits // 8
+                members.append(Member(entry, axis, places[key], bits // 8))
+        return ImageLayout(pdo, tuple(members), start, tuple(mapped))
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _room(self, pdo: int) -> int:
+        """Return how many entries a mapping object takes."""
+        known = self._description.dictionary
+        return sum(known.has((pdo, sub)) for sub in range(1, 255)) or USUAL_ENTRIES
+
+    def _filled(self, direction: int, layout: ImageLayout, others: Sequence[Entry]) -> ImageLayout:
+        known, room = self._description.dictionary, self._room(layout.pdo)
+        essential = [known.find((index, 0)) for index in ESSENTIAL[direction] if known.has((index, 0))]
+        for entry in (*essential, *others):
+            if entry not in layout.entries:
+                longer = self.free(layout.pdo, (*layout.entries, entry))
+                layout = longer if len(longer.mapped or ()) <= room else layout
+        return layout
+
+
+def changed(found: Mapping[int, ImageLayout], wanted: Mapping[int, ImageLayout]) -> list[int]:
+    """Return the directions in which two images differ."""
+    return [direction for direction, layout in wanted.items() if found.get(direction) != layout]

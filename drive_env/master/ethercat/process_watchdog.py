@@ -1,0 +1,140 @@
+"""How slaves notice that their master is dead: the watchdog of sync manager 2, which process data keep quiet."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from collections.abc import Sequence
+
+from drive_env.ethercat import registers
+from drive_env.master.changed_objects import REMEDY, ChangedObjects
+from drive_env.master.description import Description, Key
+from drive_env.master.ethercat.ethercat_master import EtherCatMaster
+from drive_env.master.ethercat.image_data import EtherCatProcessData
+from drive_env.master.link import NoWatchdogError, ObjectClient
+
+TICK = 40e-9  # s
+LONGEST = 0xFFFF  # ticks of the divider
+TRIGGERS = 0x40  # of a sync manager's control: process data keep the watchdog quiet
+OUTPUTS_CONTROL = registers.SYNC_MANAGERS + 2 * registers.SYNC_MANAGER_SIZE + 4
+FACTORY = 0.1  # s, of a controller after reset
+
+
+class ProcessWatchdog:
+    """The watch over this master by each slave's watchdog.
+
+    A slave that gets no outputs for so long leaves Op, and its axes stop by their fault reaction. It watches in Op
+    alone, where alone motors run. After power-on it is set to 100 ms.
+
+    Args:
+        master: Of the segment.
+        nodes: Positions of the slaves.
+        clients: Their objects.
+        data: Their process data.
+        description: What device they are.
+    """
+
+    def __init__(
+        self,
+        master: EtherCatMaster,
+        nodes: Sequence[int],
+        clients: Sequence[ObjectClient],
+        data: EtherCatProcessData,
+        description: Description,
+    ) -> None:
+        self._master, self._nodes, self._data = master, tuple(nodes), data
+        self._objects = [ChangedObjects(*one, description) for one in zip(nodes, clients, strict=True)]
+        self._before: dict[int, bytes] = {}
+        self._counts: dict[int, bytes] = {}
+        self._time = math.inf
+
+    @property
+    def detection_time(self) -> float:
+        """The silence after which every node has noticed [s]; infinite while they do not watch."""
+        return self._time
+
+    def begin(self, silence: float) -> None:
+        """Have every node act when its master falls silent for `silence` [s], or less.
+
+        Raises:
+            NoWatchdogError: If a slave has no watchdog on its outputs, or does not take the time.
+            BusError: If a node does not answer.
+        """
+        times = []
+        for k, position in enumerate(self._nodes):
+            control = self._master.register(position, OUTPUTS_CONTROL, 1)
+            if control is None or not control[0] & TRIGGERS:
+                raise NoWatchdogError(
+                    f"position {position} does not watch its outputs: its EEPROM has sync manager 2 without the "
+                    f"watchdog (0814h, bit 6); {REMEDY}"
+                )
+            (divider,) = struct.unpack("<H", self._register(position, registers.WATCHDOG_DIVIDER))
+            tick = (divider + 2) * TICK
+            count = struct.pack("<H", min(max(math.floor(silence / tick + 1e-6), 1), LONGEST))
+            found = self._register(position, registers.SM_WATCHDOG)
+            self._master.write_register(position, registers.SM_WATCHDOG, count)
+            now = self._register(position, registers.SM_WATCHDOG)
+            if now != count:
+                raise NoWatchdogError(f"position {position} took {count.hex()} for 0420h and has {now.hex()}; {REMEDY}")
+            self._before.setdefault(k, found)
+            self._counts[k] = count
+            self._objects[k].quick_stop_on_lost_connection()
+            times.append(int.from_bytes(count, "little") * tick)
+        self._time = max(times)
+        self._data.is_silent = False
+        self.keep()
+
+    def keep(self) -> None:
+        """Exchange images, where none were for a third of the watchdog's time."""
+        if time.monotonic() - self._data.exchanged_at > min(self._time, FACTORY) / 3.0:
+            self._data.exchange(is_cycle=False)
+
+    def cease(self) -> None:
+        """Exchange images a last time, and never again, so that the drives stop by themselves."""
+        self._data.exchange(is_cycle=False)
+        self._data.is_silent = True
+
+    def end(self) -> None:
+        """Take note that the watchdogs are given up; images may go on."""
+        self._time = math.inf
+
+    def is_set(self, node: int) -> bool:
+        """Return whether a node's watchdog was set and not put back."""
+        return node in self._counts
+
+    def is_in_force(self, node: int) -> bool:
+        """Return whether a node, asked, has the time that was set and is in Op, where it watches."""
+        position = self._nodes[node]
+        has = self._register(position, registers.SM_WATCHDOG) == self._counts.get(node)
+        return has and self._master.status(position).is_op and self._objects[node].are_in_force()
+
+    def holds(self, key: Key) -> bool:
+        """Return whether the watchdogs that are set depend on an object."""
+        return any(k in self._counts and one.holds(key) for k, one in enumerate(self._objects))
+
+    def restore(self, node: int) -> None:
+        """Put a node's watchdog back as it was found; BusError if it did not take all of it."""
+        self._counts.pop(node, None)
+        before = self._before.pop(node, None)
+        try:
+            self._objects[node].restore()
+        finally:
+            if before is not None:
+                self._master.write_register(self._nodes[node], registers.SM_WATCHDOG, before)
+
+    def forget(self, node: int) -> None:
+        """Forget what was found: the node was reset."""
+        self._objects[node].forget()
+        self._before.pop(node, None)
+        self._counts.pop(node, None)
+
+    def take_rival(self) -> str:
+        """Return "": another master on the segment would take the slaves' addresses and states, and so their Op."""
+        return ""
+
+    def _register(self, position: int, address: int) -> bytes:
+        found = self._master.register(position, address, 2)
+        if found is None:
+            raise NoWatchdogError(f"position {position} does not answer; check cable and power")
+        return found

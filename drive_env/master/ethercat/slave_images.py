@@ -1,0 +1,85 @@
+"""What a slave has mapped: read as it was found, changed in Pre-Op from the outside in, put back."""
+
+from __future__ import annotations
+
+import struct
+from functools import partial
+
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.description import Description
+from drive_env.master.ethercat.image_layout import FIRST_PDO, ImageLayout, ImagePlanner
+from drive_env.master.link import ObjectClient
+from drive_env.master.tidying import Tidying
+
+
+class SlaveImages:
+    """The assignments and mappings of one slave.
+
+    Args:
+        sdo: Its objects.
+        description: What device it is.
+    """
+
+    def __init__(self, sdo: ObjectClient, description: Description) -> None:
+        self._sdo = sdo
+        self._timeout = description.answer_timeout
+        # Direction -> (assigned objects, mapping object -> its entries), as they were found.
+        self._before: dict[int, tuple[list[int], dict[int, list[int]]]] = {}
+
+    def found(self, direction: int, planner: ImagePlanner) -> ImageLayout:
+        """Return the image that the slave has now; an empty one where a program could not name what is in it."""
+        assigned = self._read_list(direction, 2)
+        pdo = assigned[0] if assigned else FIRST_PDO[direction]
+        mapped = self._read_list(pdo, 4)
+        layout = planner.parsed(direction, pdo, mapped) if len(assigned) == 1 else None
+        return planner.free(pdo, ()) if layout is None else layout
+
+    def change(self, direction: int, layout: ImageLayout) -> None:
+        """Give the slave an image: no assignment, no entries, entries, their number, the assignment."""
+        assigned = self._read_list(direction, 2)
+        mapped = None if layout.mapped is None else self._read_list(layout.pdo, 4)
+        if assigned == [layout.pdo] and (layout.mapped is None or mapped == list(layout.mapped)):
+            return
+        kept = {} if mapped is None else {layout.pdo: mapped}
+        self._before.setdefault(direction, (assigned, kept))
+        self._write(direction, 0, 1, 0)
+        if layout.mapped is not None and mapped != list(layout.mapped):
+            self._write_list(layout.pdo, layout.mapped, 4)
+        self._write_list(direction, [layout.pdo], 2)
+
+    def restore(self) -> None:
+        """Put assignments and mappings back as they were found; BusError if not all of it could be."""
+        before, self._before = self._before, {}
+        tidying = Tidying()
+        for direction, (assigned, mappings) in before.items():
+            tidying.step(partial(self._write, direction, 0, 1, 0))
+            for pdo, mapped in mappings.items():
+                tidying.step(partial(self._write_list, pdo, mapped, 4))
+            tidying.step(partial(self._write_list, direction, assigned, 2))
+        tidying.end()
+
+    def forget(self) -> None:
+        """Forget what was found: the slave has restarted."""
+        self._before.clear()
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _read(self, index: int, sub: int) -> int:
+        return int.from_bytes(self._sdo.read(index, sub, f"{index:04X}h:{sub:02X}", self._timeout), "little")
+
+    def _read_list(self, index: int, size: int) -> list[int]:
+        """Return the entries of an object; none of one that is not there."""
+        try:
+            count = self._read(index, 0)
+        except ObjectAccessError:
+            return []
+        return [self._read(index, sub) & ((1 << 8 * size) - 1) for sub in range(1, count + 1)]
+
+    def _write(self, index: int, sub: int, size: int, value: int) -> None:
+        data = struct.pack("<Q", value)[:size]
+        self._sdo.write(index, sub, data, f"{value:X}h to {index:04X}h:{sub:02X}", self._timeout)
+
+    def _write_list(self, index: int, values: list[int] | tuple[int, ...], size: int) -> None:
+        self._write(index, 0, 1, 0)
+        for sub, value in enumerate(values, 1):
+            self._write(index, sub, size, value)
+        self._write(index, 0, 1, len(values))

@@ -1,0 +1,285 @@
+"""A master on a network interface: SOEM, by pysoem (extra `ethercat`), finds slaves, maps images, transfers objects."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from drive_env.ethercat import registers
+from drive_env.ethercat.application import AlState
+from drive_env.master.errors import BusError, NoAnswerError, OpenError
+from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus
+from drive_env.master.ethercat.mailbox_client import SdoAbortError
+from drive_env.master.ethercat.state_names import refusal
+from drive_env.master.link import ReceivedEmergency
+
+MICROSECONDS = 1e6
+REGISTER_TIMEOUT = 20_000  # us
+# us. SOEM has 2 ms for a frame and 20 ms for room in a mailbox, for a chip and a computer that does nothing else.
+FRAME_TIMEOUT, ROOM_TIMEOUT = 20_000, 200_000
+NO_ROOM = 0.25  # s: SOEM gives up sooner only where a mailbox had no room, and the request was not sent
+LEAST_TIMEOUT = 0.3  # s for an answer, so that the two can be told apart
+POST_TIMEOUT = 1000  # us
+STATE_LOOK = 0.005  # s between two looks at the slaves' states while images are exchanged
+PATIENCE = 5.0  # s for a state
+LARGEST_OBJECT = 4096  # bytes
+
+
+class SoemMaster:
+    """SOEM on a network interface.
+
+    Args:
+        interface: Its name, as eth0.
+
+    Raises:
+        OpenError: If pysoem is not installed, or the interface cannot be opened.
+
+    Attributes:
+        alive: Called while an answer is waited for; here before each transfer, which SOEM does in one call.
+    """
+
+    def __init__(self, interface: str) -> None:
+        try:
+            import pysoem
+        except ImportError:
+            raise OpenError(
+                "a master on EtherCAT needs pysoem: pip install 'drive-env[ethercat]'; --interface ethercat-udp goes "
+                "without"
+            ) from None
+        self.alive: Callable[[], None] = lambda: None
+        self._soem = pysoem
+        self._interface = interface
+        pysoem.settings.timeouts.ret, pysoem.settings.timeouts.tx_mailbox = FRAME_TIMEOUT, ROOM_TIMEOUT
+        self._master = pysoem.Master()
+        try:
+            self._master.open(interface)
+        except ConnectionError:
+            raise OpenError(
+                f"{interface} cannot be opened: it is no network interface here, or the right CAP_NET_RAW is missing: "
+                "run as root, or see the page on EtherCAT for how to give it to Python"
+            ) from None
+        self._turn = threading.RLock()  # process data and registers; a transfer of objects has its slave's
+        self._turns: list[threading.RLock] = []
+        self._emergencies: deque[ReceivedEmergency] = deque()
+        self._mapped: dict[int, ImageSizes] = {}
+        self._looked, self._states = 0.0, dict[int, SlaveStatus]()
+
+    # --- slaves -----------------------------------------------------------------------------------------------------
+    def begin(self) -> int:
+        """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends."""
+        with self._turn:
+            self._mapped.clear()
+            count = int(self._master.config_init())
+            if count <= 0:
+                raise NoAnswerError(f"no slave answers on {self._interface}; check cable, power and channel")
+            self._turns = [threading.RLock() for _ in range(count)]
+            for position, slave in enumerate(self._master.slaves):
+                slave.add_emergency_callback(lambda one, position=position: self._take_emergency(position, one))
+            for position in range(count):
+                self._await(position, AlState.PRE_OP)
+            return count
+
+    def recover(self, position: int) -> bool:
+        """Take a slave to Pre-Op; return whether it had restarted, and had no address."""
+        status = self.status(position)
+        if status.state in (AlState.PRE_OP, AlState.SAFE_OP, AlState.OP):
+            self._request(position, AlState.PRE_OP)
+            return False
+        self.begin()  # SOEM gives addresses to all slaves alike
+        return not status.state
+
+    def identity(self, position: int) -> SlaveIdentity:
+        """Return what a slave's EEPROM says."""
+        slave = self._slave(position)
+        serial = self._quietly(lambda: slave.eeprom_read(0x0E))
+        return SlaveIdentity(slave.man, slave.id, slave.rev, int.from_bytes(serial or b"", "little"))
+
+    def status(self, position: int) -> SlaveStatus:
+        """Return a slave's state, asked now."""
+        data = self.register(position, registers.AL_STATUS, 6)
+        if data is None:
+            return SlaveStatus(0, False, 0)
+        status, code = struct.unpack("<H2xH", data)
+        return SlaveStatus(status & STATE, bool(status & ERROR), code)
+
+    def _slave(self, position: int) -> Any:
+        return self._master.slaves[position]
+
+    def _request(self, position: int, state: AlState) -> None:
+        with self._turn:
+            slave = self._slave(position)
+            slave.state = int(state) | self._soem.STATE_ACK
+            slave.write_state()
+        self._await(position, state)
+
+    def _await(self, position: int, state: AlState, timeout: float = PATIENCE) -> None:
+        """Wait until a slave is in a state; BusError if it refuses or does not come."""
+        deadline = time.monotonic() + timeout
+        while True:
+            status = self.status(position)
+            if status.state == state and not status.has_error:
+                return
+            if status.has_error or time.monotonic() > deadline:
+                raise BusError(refusal(position, state, status))
+            self.alive()
+            time.sleep(0.001)
+
+    # --- registers --------------------------------------------------------------------------------------------------
+    def register(self, position: int, address: int, size: int) -> bytes | None:
+        """Return a slave's register; None where it does not answer."""
+        for _ in range(READS):
+            with self._turn:
+                found = self._quietly(lambda: self._slave(position)._fprd(address, size, REGISTER_TIMEOUT))
+            if found is not None:
+                return bytes(found)
+        return None
+
+    def write_register(self, position: int, address: int, data: bytes) -> None:
+        """Write a slave's register; NoAnswerError if it does not take it."""
+        with self._turn:
+            try:
+                self._slave(position)._fpwr(address, data, REGISTER_TIMEOUT)
+            except self._soem.WkcError:
+                raise NoAnswerError(f"position {position} does not answer; check cable and power") from None
+
+    def _quietly(self, call: Callable[[], Any]) -> Any:
+        try:
+            return call()
+        except (self._soem.WkcError, self._soem.EepromError, self._soem.PacketError, self._soem.SdoError):
+            return None
+
+    # --- images -----------------------------------------------------------------------------------------------------
+    def map(self, sizes: Mapping[int, ImageSizes]) -> None:
+        """Give the images of all slaves their places, and take them from Pre-Op to Safe-Op."""
+        with self._turn:
+            try:
+                self._master.config_map()
+            except self._soem.ConfigMapError as error:
+                raise BusError(f"SOEM cannot map the images: {error}; see the drive's manual") from None
+            for position, size in sizes.items():
+                slave = self._slave(position)
+                found = (len(slave.output), len(slave.input))
+                if found != size:
+                    raise BusError(
+                        f"position {position} has images of {found[0]} and {found[1]} bytes, not of {size.outputs} and "
+                        f"{size.inputs}; compare the EDS with the drive's firmware"
+                    )
+                self._await(position, AlState.SAFE_OP)
+            self._mapped = dict(sizes)
+
+    def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
+        """Take slaves to Op; `exchange` sends images meanwhile."""
+        deadline = time.monotonic() + timeout
+        with self._turn:
+            for position in positions:
+                if self.status(position).has_error:
+                    self._request(position, AlState.SAFE_OP)
+                slave = self._slave(position)
+                slave.state = int(AlState.OP)
+                slave.write_state()
+        while waiting := [(k, now) for k, now in ((k, self.status(k)) for k in positions) if not now.is_op]:
+            refused = [(k, now) for k, now in waiting if now.has_error]
+            if refused or time.monotonic() > deadline:
+                position, status = (refused or waiting)[0]
+                raise BusError(refusal(position, AlState.OP, status))
+            if exchange is not None:
+                exchange()
+            self.alive()
+            time.sleep(0.001)
+        self._states = {}
+
+    def leave_op(self, position: int) -> None:
+        """Take a slave to Pre-Op."""
+        self._request(position, AlState.PRE_OP)
+
+    def exchange(self, outputs: Sequence[bytes], timeout: float) -> list[bytes | None]:
+        """Send the images of the slaves that are mapped and return theirs, in the order of `map`."""
+        with self._turn:
+            for position, data in zip(self._mapped, outputs, strict=True):
+                self._slave(position).output = data
+            self._master.send_processdata(release_gil=True)
+            counter = self._master.receive_processdata(round(timeout * MICROSECONDS), release_gil=True)
+            if counter != self._master.expected_wkc:
+                return [None] * len(self._mapped)
+            now = time.monotonic()
+            if now - self._looked > STATE_LOOK or not self._states:
+                # A slave that has left Op still answers process data; only its state tells.
+                self._looked, self._states = now, {position: self.status(position) for position in self._mapped}
+            return [bytes(self._slave(k).input) if self._states[k].is_op else None for k in self._mapped]
+
+    # --- objects ----------------------------------------------------------------------------------------------------
+    def upload(self, position: int, index: int, sub: int, timeout: float) -> bytes:
+        """Return the bytes of an object."""
+        slave = self._slave(position)
+        found = self._transact(
+            position, timeout, lambda: slave.sdo_read(index, sub, LARGEST_OBJECT, release_gil=True), is_repeatable=True
+        )
+        return bytes(found)
+
+    def download(self, position: int, index: int, sub: int, data: bytes, timeout: float) -> None:
+        """Write the bytes of an object."""
+        slave = self._slave(position)
+        self._transact(position, timeout, lambda: slave.sdo_write(index, sub, data, release_gil=True), False)
+
+    def post(self, position: int, index: int, sub: int, data: bytes) -> None:
+        """Send a short write, unless a transfer is under way."""
+        if not self._turns[position].acquire(blocking=False):
+            return
+        try:
+            self._master.sdo_write_timeout = POST_TIMEOUT
+            self._quietly(lambda: self._slave(position).sdo_write(index, sub, data, release_gil=True))
+        finally:
+            self._turns[position].release()
+
+    def _transact(self, position: int, timeout: float, call: Callable[[], Any], is_repeatable: bool) -> Any:
+        soem, deadline = self._soem, time.monotonic() + timeout
+        while True:
+            self.alive()
+            with self._turns[position]:
+                longest = round(max(timeout, LEAST_TIMEOUT) * MICROSECONDS)
+                self._master.sdo_read_timeout = self._master.sdo_write_timeout = longest
+                begun = time.monotonic()
+                try:
+                    return call()
+                except soem.SdoError as error:
+                    raise SdoAbortError(error.abort_code & 0xFFFFFFFF, f"abort {error.abort_code:08X}h") from None
+                except soem.MailboxError as error:
+                    raise BusError(f"a mailbox error of the slave, detail {error.error_code}") from None
+                except (soem.WkcError, soem.PacketError):
+                    was_sent = time.monotonic() - begun > NO_ROOM
+            if time.monotonic() > deadline or (was_sent and not is_repeatable):
+                raise NoAnswerError("no answer came in time")
+
+    def take_emergencies(self) -> list[ReceivedEmergency]:
+        """Return and forget the emergencies that came."""
+        for position, turn in enumerate(self._turns):
+            if not turn.acquire(blocking=False):
+                continue
+            try:
+                self._slave(position).mbx_receive()
+            except self._soem.Emergency as error:
+                self._take_emergency(position, error)
+            except (self._soem.MailboxError, self._soem.SdoError, self._soem.PacketError, self._soem.WkcError):
+                pass  # of a transfer that nobody waits for any more
+            finally:
+                turn.release()
+        found = list(self._emergencies)
+        for _ in found:
+            self._emergencies.popleft()
+        return found
+
+    def _take_emergency(self, position: int, one: Any) -> None:
+        extra = (one.b1, one.w1 & 0xFF, one.w1 >> 8, one.w2 & 0xFF, one.w2 >> 8)
+        self._emergencies.append(ReceivedEmergency(position, one.error_code, one.error_reg, extra))
+
+    def close(self) -> None:
+        """Take all slaves to Init, as far as they answer, and let go of the interface."""
+        with self._turn:
+            if self._turns:
+                self._master.state = int(AlState.INIT)
+                self._master.write_state()
+            self._master.close()

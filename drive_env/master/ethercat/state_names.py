@@ -1,0 +1,35 @@
+"""What a refused or missing state is called in messages (ETG.1000.6, table 11; ETG.1020)."""
+
+from __future__ import annotations
+
+from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.master.ethercat.ethercat_master import SlaveStatus
+
+NAMES = {
+    AlState.INIT: "Init", AlState.PRE_OP: "Pre-Op", AlState.BOOTSTRAP: "Bootstrap", AlState.SAFE_OP: "Safe-Op",
+    AlState.OP: "Op",
+}  # fmt: skip
+MEANINGS = {
+    AlStatusCode.MAILBOX: "its mailbox is not set as its EEPROM says",
+    AlStatusCode.SM_WATCHDOG: "no process data came within its watchdog",
+    AlStatusCode.OUTPUT_CONFIGURATION: "its outputs are not mapped as long as the master says",
+    AlStatusCode.INPUT_CONFIGURATION: "its inputs are not mapped as long as the master says",
+    AlStatusCode.NO_FREE_RUN: "it wants distributed clocks",
+    AlStatusCode.NO_SYNC: "it has no SYNC0",
+    AlStatusCode.DC_CYCLE_TIME: "SYNC0 comes too often for it",
+}
+
+
+def state_name(state: int) -> str:
+    """Return the name of a state; of one that there is not, its number."""
+    return NAMES[AlState(state)] if state in AlState.__members__.values() else f"state {state}"
+
+
+def refusal(position: int, wanted: AlState, status: SlaveStatus) -> str:
+    """Return what to tell of a slave that does not come to a state."""
+    if not status.state:
+        return f"position {position} does not answer; check cable and power"
+    code = status.code
+    why = MEANINGS[AlStatusCode(code)] if code in {int(one) for one in MEANINGS} else "see the drive's manual"
+    said = f"AL status code {code:04X}h: {why}" if code else "it gives no reason"
+    return f"position {position} stays in {state_name(status.state)} and does not come to {state_name(wanted)}; {said}"
