@@ -481,7 +481,7 @@ def test_on_a_bus_it_tunes_inside_the_envelope_and_the_drive_keeps_it(tmp_path, 
         result = auto(target, tmp_path / "before.toml")
         assert result.accepted.all(), result.axes[0].reason
         assert result.kept
-        assert result.drive_seconds[0] < BUDGET
+        assert result.drive_seconds[0] < BUDGET + choice.OVERTIME
         after = gains(drives)
         assert not np.array_equal(after, before)
         drives.reset_node()

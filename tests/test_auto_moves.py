@@ -279,11 +279,8 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
     failed = [any(note.startswith(FAILED) for note in axis.notes) for axis in result.axes]
     assert failed == [False, False, False, True, False, False]
     # Who is through holds its place with what it keeps, not with what its last trial ended with.
-    (idle, having) = holding[-1]
-    assert 0 < idle.sum() < 6
-    assert [tuple(row) for row in having[idle]] == [
-        axis.after for axis, one in zip(result.axes, idle, strict=True) if one
-    ]
+    held = [tuple(having[3]) for idle, having in holding if idle[3]]
+    assert held == [result.axes[3].after] * len(held) and len(held) >= 2
     assert all(axis.after[VELOCITY_P] >= 0.9 * wanted[k, VELOCITY_P] for k, axis in enumerate(result.axes) if k != 3)
 
 
