@@ -304,7 +304,7 @@ def run(*words):
 def test_commands_over_udp(over_udp, tmp_path):
     said = run("scan", *over_udp)
     assert said.split()[:3] == ["position", "0", "tmcm3313"] and "vendor 286h" in said and "Init" in said
-    device = ["--device", "tmcm3313", "--position", "0", *over_udp]
+    device = ["--device", "tmcm3313", "--node", "0", *over_udp]
     run("set", "6081", "5000", *device)
     assert run("get", "6081", "--raw", *device).splitlines()[2].endswith("= 5000")
     file = tmp_path / "drive.toml"

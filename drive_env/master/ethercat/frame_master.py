@@ -31,6 +31,7 @@ TRIES = 50  # of a frame that does not come back
 LOOK = 0.001  # s between two looks at a state
 SII_BUSY = 0x8000
 IDENTITY_WORD, MAILBOX_WORD, FIRST_CATEGORY, SYNC_MANAGER_CATEGORY, END = 0x08, 0x18, 0x40, 41, 0xFFFF
+LAST_WORD = 16_384  # of an EEPROM, where a list without an end is given up
 LONGEST_IMAGE = 1400  # bytes of all slaves in one frame
 
 
@@ -239,7 +240,7 @@ class FrameMaster:
         address, managers = FIRST_CATEGORY, []
         while True:
             kind, length = words(address)
-            if kind == END or address > 0x4000:
+            if kind == END or address > LAST_WORD:
                 break
             if kind == SYNC_MANAGER_CATEGORY:
                 managers = [(words(address + 2 + 4 * k)[0], words(address + 4 + 4 * k)[0]) for k in range(length // 4)]
