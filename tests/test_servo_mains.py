@@ -375,7 +375,18 @@ def test_a_current_without_a_stage_is_one_of_the_measurement(drives):
     drives.advance(0.002)
     drives.write(cia402.CONTROLWORD, 0x06)
     drives.write(cia402.CONTROLWORD, 0x07)
-    assert cause_of(drives, 0.01) == 0x2300
+    assert cause_of(drives, 0.05) == 0x2300
+
+
+def test_a_current_that_dies_away_after_the_stage_was_switched_off_is_none(drives):
+    motion.enable(drives, mode="cst")
+    drives.machine.brake = "closed"
+    drives.write(cia402.TARGET_TORQUE, 32767)
+    drives.advance(0.05)
+    drives.write(cia402.CONTROLWORD, 0)
+    drives.advance(0.1)
+    assert shows(drives, DISABLED)
+    assert drives.emergencies() == []
 
 
 def test_a_motor_that_runs_away_from_its_current_has_a_wrong_commutation(drives):

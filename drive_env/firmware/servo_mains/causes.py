@@ -32,6 +32,7 @@ from mechanics.compiled import inlined, stage
 
 REVERSE_TIME = 0.01  # s of speeding up against the current, after which the commutation is wrong
 REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for
+OFF_TIME = 0.02  # s after which a stage that is off has no current: several times a winding's L/R
 STUCK_TIME = 0.1  # s of standing still under a brake that should be open
 # Bits of 1001h (TGZ manual): current, voltage, temperature, communication.
 CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
@@ -39,7 +40,8 @@ CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
 
 @stage
 def watch_motion(drive, lane, dt):
-    """Measure for how long an axis is outside its window, runs away against its current, or stands under its brake."""
+    """Measure for how long an axis is off, outside its window, runs away, or stands under its brake."""
+    drive.off_time[lane] = 0.0 if drive.stage_on[lane] > 0.0 else drive.off_time[lane] + dt
     window = drive.following_error_window[lane]
     error = abs(drive.position_demand[lane] - drive.theta_meas[lane])
     follows = drive.drive_function[lane] > 0.0 and window > 0.0 and drive.loop_level[lane] > 0.0
@@ -85,9 +87,9 @@ def holding_brake(drive, lane, told):
 
 @stage
 def current_measurement(drive, lane, told):
-    """Return whether a current is measured although the stage is off."""
+    """Return whether a current is measured although the stage is off, and what flowed before has ended."""
     peak = max(drive.peak_a[lane], drive.peak_b[lane])
-    return drive.stage_on[lane] == 0.0 and peak > drive.offset_limit[lane]
+    return drive.off_time[lane] > OFF_TIME and peak > drive.offset_limit[lane]
 
 
 @stage
