@@ -146,7 +146,7 @@ def test_ctrl_c_in_a_recording_whose_rows_enable(emulated):
             bus.meets = meets
             drives.record([0x606C], 0.5, play=rows)
 
-        error = run(bus, script)
+        error = run(bus, script, timeout=20.0)  # on a busy computer an answer takes its time
         ended_well(world)
         if not isinstance(error, SafetyError):
             turned(world, 10 * TURN)
