@@ -16,7 +16,7 @@ KERNELS = "mechanics.kernel_files"  # who logs what is compiled
 # Functions that Numba compiles for a kernel, its stages included, if those above were compiled before. Whatever runs
 # drives takes the first three.
 FUNCTIONS = {
-    "cycle.power_on": 19, "cycle.write_events": 45, "cycle.run": 83, "prepared_record.from_od": 2,
+    "cycle.power_on": 24, "cycle.write_events": 54, "cycle.run": 107, "prepared_record.from_od": 2,
     "prepared_record.to_od": 2, "tracking_cycle.describe_lanes": 3, "tracking_cycle.act": 5,
     "tracking_cycle.observe": 1, "cyclic_control.convert_in": 1, "cyclic_control.convert_out": 1,
 }  # fmt: skip
