@@ -256,16 +256,16 @@ def test_variants_are_parallel_machines_with_their_parameters(two_mass):
 def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
     """E_0 is the mean of all runs, too: no run is measured by a scale of its own."""
     repeated, alone, gains = bench("two_mass", 2, repeats=3), bench("two_mass", 2), times(1.4, 2)
-    seeds = repeated._drives._noise_seeds.reshape(2, 3, len(VARIANTS) - 1)
+    seeds = repeated._drives.inside.noise_seeds.reshape(2, 3, len(VARIANTS) - 1)
     assert (seeds == seeds[:1, :, :1]).all(), "variants are compared under the same noise, and machines are"
-    assert seeds[0, 0, 0] == alone._drives._noise_seeds[0], "the first run is that of a score without repeats"
+    assert seeds[0, 0, 0] == alone._drives.inside.noise_seeds[0], "the first run is that of a score without repeats"
     nominal, found = [], []
     for seed in seeds[0, :, 0]:
-        alone._drives._noise_seeds[:] = seed
+        alone._drives.inside.noise_seeds[:] = seed
         alone.set_reference(times(1.0, 2))
         nominal.append(alone._reference)
     for seed in seeds[0, :, 0]:
-        alone._drives._noise_seeds[:], alone._reference = seed, np.mean(nominal, axis=0)
+        alone._drives.inside.noise_seeds[:], alone._reference = seed, np.mean(nominal, axis=0)
         found.append(alone.score(gains))
     repeated.set_reference(times(1.0, 2))
     scores = repeated.score(gains)
