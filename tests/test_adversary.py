@@ -38,7 +38,7 @@ from drive_env import Limits
 from drive_env.cia402 import State
 from drive_env.cores import usable_cores
 
-SAMPLE, MANY = 40, 600
+SAMPLE, MANY = 40, 300
 PATIENCE = 60.0  # s
 ON, OFF = 4, 1  # of the automaton
 

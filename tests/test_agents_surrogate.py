@@ -110,6 +110,7 @@ def test_the_networks_are_torchs(bundle, policy):
         assert ln_scale == pytest.approx(np.clip(expected[..., 1], -3.5, 1.0), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_neither_the_order_of_trials_matters_nor_what_is_not_known(policy):
     rng = np.random.default_rng(3)
     context, gains, shown = (rng.normal(size=s).astype(np.float32) for s in ((2, CONTEXT), (2, 4, G), (2, 4, SHOWN)))

@@ -457,6 +457,7 @@ class Elsewhere:
             yield k, pickle.loads(pickle.dumps(task[0](task[1])))
 
 
+@pytest.mark.slow
 def test_trials_elsewhere_are_those_of_one_process(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "ROUND", 2)
     run, found, told = tiny(timesteps=32), {}, {}

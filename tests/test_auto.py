@@ -78,6 +78,7 @@ def five(tmp_path_factory):
 TUNED = [NORMAL, EMPTY, WILD]
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("axis", TUNED)
 def test_a_drive_is_tuned_whatever_gains_it_had(five, axis):
     target, result, _, (after, _), _ = five
@@ -385,6 +386,7 @@ def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick
     np.testing.assert_array_equal(after[0], axis.after)
 
 
+@pytest.mark.slow
 def test_a_response_that_the_time_does_not_allow_is_said(quick, tmp_path):
     with emulated(load="inertia", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in, budget=2.5)

@@ -158,6 +158,7 @@ def test_a_real_signal_over_a_served_bus(tmp_path, how):
             assert is_off(drives)
 
 
+@pytest.mark.slow
 def test_a_fault_before_the_gains_are_written_rejects_its_axis_alone(monkeypatch, tmp_path):
     """The drive is enabled, and its shutdown switch opens once all is verified: the other machine keeps its gains."""
 

@@ -390,6 +390,7 @@ def test_gains_that_are_too_slow_to_arrive_do_not_pass():
     assert proof.passed.tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_gains_that_shake_at_rest_are_eased_until_they_do_not(monkeypatch, tmp_path):
     finds(monkeypatch, np.array(RINGING))
     with emulated(load="belt", num_threads=1) as target:

@@ -9,7 +9,7 @@ presets were made for, and what gravity and dry friction take below half the tor
 
 What a drive lacks is left out, by its data: modes that 6060h does not take, a current that no object tells.
 
-Each run has every second of these rows: all loads with the default motor (of a variant three), and every motor with one
+Each run has every third of these rows: all loads with the default motor (of a variant three), and every motor with one
 load; the others are slow.
 """
 
@@ -369,7 +369,7 @@ class Life:
         return np.concatenate(self.seen, axis=1)
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("device", "load", "motor"),
     [pytest.param(*row, id="-".join(row), marks=[] if is_quick(*row) else [pytest.mark.slow]) for row in ROWS],

@@ -84,6 +84,7 @@ def test_moves_are_those_that_an_engineer_counts(under_audit):
     assert audit.seconds[0] <= began < audit.seconds[1]  # an axis that rests meanwhile is not in use
 
 
+@pytest.mark.slow
 def test_an_identification_is_a_dozen_moves_or_two(target):
     drives, audit = audited(target)
     identify(replace(target, drives=drives))

@@ -547,6 +547,7 @@ def test_scope_is_refused_where_another_master_commands_the_drive(run, shared, t
     assert mappings(shared[0]) == before
 
 
+@pytest.mark.slow
 def test_scope_ends_where_another_master_begins_and_no_sample_is_wrong(run, shared, tmp_path):
     channel, (drives, _) = shared
     drives.write("Target velocity", 78)

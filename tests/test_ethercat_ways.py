@@ -86,6 +86,7 @@ def test_a_port_that_is_taken_is_told():
     way.close()
 
 
+@pytest.mark.slow
 def test_real_time_goes_on_without_frames():
     world = EtherCatWorld(lockstep=False)
     world.add(EtherCatSlave(EchoDevice()))
@@ -167,6 +168,7 @@ def inside(space, *arguments):
     return ["ip", "netns", "exec", space, sys.executable, *map(str, arguments)]
 
 
+@pytest.mark.slow
 @needs_namespaces
 def test_soem_brings_four_slaves_to_op(spaces, tmp_path):
     pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")

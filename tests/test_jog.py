@@ -36,6 +36,7 @@ def is_off(drives):
     return drives.read(0x6041)[0] & 0x4F == 0x40
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("words", [("2000 rpm", "--by", "-50 rev"), ("-2000 rpm", "--for", "2")])
 def test_a_limit_switch_ends_it_and_is_named(jog, words):
     run, drives = jog
@@ -52,6 +53,7 @@ def test_a_limit_switch_ends_it_and_is_named(jog, words):
     assert is_off(drives)
 
 
+@pytest.mark.slow
 def test_an_axis_that_does_not_move_is_told(jog):
     run, drives = jog
     slow = CliRunner().invoke(
@@ -65,6 +67,7 @@ def test_an_axis_that_does_not_move_is_told(jog):
     assert "Limits(" not in found.output and is_off(drives)
 
 
+@pytest.mark.slow
 def test_a_speed_without_a_unit_is_told_in_rpm_where_the_axis_hardly_moved(jog):
     run, drives = jog
     before = drives.read(0x6064)[0]

@@ -23,6 +23,7 @@ def test_of_the_loads_only_the_gantry_has_axes_that_pull_at_one_thing():
     assert [name for name in LOADS if are_linked(one(find_load(name)))] == ["gantry"]
 
 
+@pytest.mark.slow
 def test_axes_under_gravity_hold_their_places_while_another_one_is_shaken():
     with emulated(load="robot") as target:
         assert not target.linked

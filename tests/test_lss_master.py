@@ -77,6 +77,7 @@ def serve(drives, tmp_path):
         server.__exit__(None, None, None)
 
 
+@pytest.mark.slow
 def test_two_nodes_without_a_node_id_are_found_and_get_theirs(serve):
     served = serve(255, 255)
     code, said = served.run("scan", "--json")
@@ -124,6 +125,7 @@ def test_a_node_named_by_its_identity_has_a_new_node_id_no_sooner_than_one_named
     assert served.restart() == [8, 6]
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("node", "new", "arguments", "said"),
     [

@@ -32,6 +32,7 @@ def truth(target, axis, gains):
     return {loop: (180.0 if math.isnan(one.phase_deg) else one.phase_deg, one.gain_db) for loop, one in found.items()}
 
 
+@pytest.mark.every(6)
 @pytest.mark.parametrize("load", ["inertia", "fan", "winder", "two_mass", "belt", "vertical_screw"])
 def test_a_bound_by_the_identified_model_is_below_the_truth(load):
     """Four machines as drawn, gains of 45 and of 60 degrees; intervals of 95 % are missed now and then, by little."""

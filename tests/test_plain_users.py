@@ -31,6 +31,7 @@ SHORT = {"num_threads": 1, "duration": 0.1}
 
 
 # --- Stable-Baselines3 ------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_one_line_gives_what_stable_baselines_trains_on():
     env = make_vec_env(TRACKING, 4, load="inertia", **SHORT)
     assert isinstance(env, VecEnv) and env.num_envs == 4
@@ -46,6 +47,7 @@ def test_a_name_that_is_none_is_told_with_the_nearest():
         make_vec_env("ServoDrive/Traking-v0")
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", [PPO, A2C, SAC])
 def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path, caplog):
     env = make_vec_env(TRACKING, 1, load="inertia", **SHORT)
@@ -169,6 +171,7 @@ def test_a_first_picture_after_60_steps_shows_them_and_what_was_followed(scope, 
     env.close()
 
 
+@pytest.mark.slow
 @needs_gl
 def test_gymnasiums_recorder_films_an_episode(tmp_path):
     from gymnasium.wrappers import RecordVideo

@@ -98,6 +98,7 @@ def test_a_kind_of_names_that_there_is_not_is_answered_with_those_that_there_are
     assert "there are devices, motors, loads, not 'motor'; did you mean 'motors'?" in result.stderr
 
 
+@pytest.mark.slow
 def test_quiet_shows_errors_and_no_progress_bar():
     loud, quiet = (
         run("drive-tune", *more, "response", "--load", "inertia", "--out", "/dev/null/nowhere")

@@ -26,6 +26,7 @@ def test_it_prints_margins_plant_and_drive_time(run):
     assert "s of drive time; written to out" in done.stdout
 
 
+@pytest.mark.slow
 def test_it_writes_a_picture_and_a_table(run):
     folder, _ = run
     assert (folder / "out/velocity_axis0.png").stat().st_size > 20_000

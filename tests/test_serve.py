@@ -67,6 +67,7 @@ def served(*arguments, cwd):
 
 
 # --- serving --------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_it_prints_two_lines_that_join_the_bus(tmp_path):
     with served("tmcm1636", "--load", "belt", "--node", 5, "--lockstep", "--stats", cwd=tmp_path) as (process, channel):
         lines = f'import can\nbus = can.Bus(interface="slcan", channel="{channel}", sleep_after_open=0)'
@@ -102,6 +103,7 @@ def test_a_token_is_made_printed_and_asked_for(tmp_path, monkeypatch):
             assert bus.recv(20.0).arbitration_id == 0x701
 
 
+@pytest.mark.slow
 def test_what_is_open_to_the_network_is_said(monkeypatch):
     monkeypatch.setattr(Hub, "is_public", True)  # without opening anything to it
     app = typer.Typer()
@@ -125,6 +127,7 @@ def test_a_signal_ends_it_with_code_0_and_one_line(tmp_path, number):
     assert (process.returncode, output, errors) == (0, "drive-env: stopped\n", "")
 
 
+@pytest.mark.slow
 def test_a_duration_ends_it_and_stats_say_how_late_and_how_full(tmp_path):
     done = run_serve("--port", 0, "--duration", "0.3", "--stats", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -136,6 +139,7 @@ def test_a_duration_ends_it_and_stats_say_how_late_and_how_full(tmp_path):
     assert re.search(r"bus load \d+\.\d %", done.stdout)
 
 
+@pytest.mark.slow
 def test_the_example_bus_is_served(tmp_path):
     done = run_serve("--config", EXAMPLE, "--port", 0, "--duration", "0.1", "--lockstep", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -175,6 +179,7 @@ def test_drives_with_factory_values_turn_the_motor_that_was_named(tmp_path):
     world.close()
 
 
+@pytest.mark.slow
 def test_any_interface_serves(tmp_path):
     done = run_serve("--interface", "virtual", "--channel", "test", "--duration", "0.1", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

@@ -235,6 +235,7 @@ def test_a_dry_run_shows_whom_it_would_ask(module):
     assert [f"60{node}" for node in range(2, 7)] == [who for who in asked if who != "601"]
 
 
+@pytest.mark.slow
 def test_a_drive_that_tells_no_current_is_stopped_like_any_other(tmp_path):
     """Steppers have no 6077h: what looks at the drives while they stop goes without it."""
     folder = build(tmp_path / "silent")

@@ -288,6 +288,7 @@ def bus_soak(seconds, seed):
     return given
 
 
+@pytest.mark.slow
 def test_a_bus_for_a_few_seconds_under_faults():
     assert sum(bus_soak(4.0, 1).values()) > 20
 

@@ -186,6 +186,7 @@ def test_a_travel_too_short_for_the_working_speed_is_told(stepper, tmp_path):
         assert "the travel is too short: 0.36 rad" in result.axes[0].reason
 
 
+@pytest.mark.slow
 def test_a_motor_that_is_too_weak_for_its_load_is_rejected_with_the_reason(stepper, tmp_path):
     """A constant load of 90 % of the holding torque."""
     with target(stepper) as found:
@@ -221,6 +222,7 @@ def six_axes(drives):
     )
 
 
+@pytest.mark.slow
 def test_a_search_of_currents_finds_the_same_in_process_and_over_the_bus():
     def act(drives):
         return [

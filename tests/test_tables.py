@@ -106,6 +106,7 @@ SLOW = [
 ]
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("command", [*EMULATED, *(pytest.param(row, marks=pytest.mark.slow) for row in SLOW)],
                          ids=lambda row: " ".join(row[:3]))  # fmt: skip
 def test_what_a_command_prints_is_whole_at_80_columns(given, tmp_path, monkeypatch, command):

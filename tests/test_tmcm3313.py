@@ -104,6 +104,7 @@ def test_how_to_move_a_motor_in_pv_mode(recipe, wire):
     assert abs(recipe.read(0x606C)) < 1000 and not recipe.read(0x6041) & 0x4000
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("axis", range(AXES))
 def test_how_to_start_a_homing_in_hm_mode(axis):
     """Section 8.3, whose home switch is pressed by the portal in place of a hand."""

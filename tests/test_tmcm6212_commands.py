@@ -37,6 +37,7 @@ def bus(monkeypatch):
     world.close()
 
 
+@pytest.mark.slow
 def test_objects_of_an_axis(bus):
     run, drives = bus
     assert run("set", "2003", "100", "--axis", 4).stdout == "node 1 axis 4  2003h:00 Maximum current = 100 (64h)\n"
@@ -57,6 +58,7 @@ def test_objects_of_an_axis(bus):
         assert found.exit_code == 2 and says in found.stderr
 
 
+@pytest.mark.slow
 def test_one_axis_is_jogged_and_the_others_stand(bus, tmp_path):
     run, drives = bus
     before = drives.read(0x6064)
@@ -69,6 +71,7 @@ def test_one_axis_is_jogged_and_the_others_stand(bus, tmp_path):
     assert "6064" in head and "6077" not in head and len(rows) > 50
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_jogged_to_its_limit_switch_stops_there(bus):
     run, drives = bus
     found = run("jog", "--axis", 5, "--for", 3, "--json", "--", "-4 rev/s")
@@ -81,6 +84,7 @@ def test_an_axis_that_is_jogged_to_its_limit_switch_stops_there(bus):
     assert (drives.read(0x6064)[:5] == 0).all()
 
 
+@pytest.mark.slow
 def test_one_axis_is_watched(bus, tmp_path):
     run, _ = bus
     assert run("set", "2004", "3", "--axis", 3).exit_code == 0
@@ -110,6 +114,7 @@ def test_it_is_found_backed_up_and_watched(bus, tmp_path):
     assert (tmp_path / "seen.csv").read_text(encoding="utf-8").count("\n") == 51
 
 
+@pytest.mark.slow
 def test_a_node_of_another_device_is_named(bus):
     found = CliRunner().invoke(drive_env.commands.cli.app, ["get", "6041"])
     assert found.exit_code == 1

@@ -71,6 +71,7 @@ def test_a_sweep_prints_the_best_ten_and_how_fast_it_was(run):
     assert done.stderr == ""
 
 
+@pytest.mark.slow
 def test_a_sweep_leaves_four_files_and_nothing_else(run):
     folder, _ = run
     assert sorted(path.name for path in (folder / "out/run").iterdir()) == [
@@ -160,6 +161,7 @@ def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_
     assert tomllib.loads(changed.stdout) == expected
 
 
+@pytest.mark.every(12)
 @pytest.mark.parametrize(("arguments", "message"), [
     (["swep"], "No such command"),
     (["sweep", "--grid", "3"], "No such option"),

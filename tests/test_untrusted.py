@@ -42,6 +42,7 @@ DEEP_JSON = "[" * DEEP + "]" * DEEP
 DIGITS = "a = " + "9" * 5000  # more than Python turns into a number
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("text", [DEEP_TOML, DEEP_KEYS, DIGITS, "a = [" + "0," * 1_100_000 + "]"])
 def test_toml_within_limits(text):
     with pytest.raises(tomllib.TOMLDecodeError) as told:
