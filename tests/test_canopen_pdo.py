@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import time
+import sys
 import tomllib
 
 import pytest
@@ -687,14 +687,23 @@ def test_every_mappable_object_travels(wire, raw):
         assert wire.value(index, sub) == 3
 
 
-def test_a_cycle_costs_little(wire):
-    """2 RPDO and 2 TPDO with SYNC cost tens of microseconds; the bound lets a busy machine pass."""
+def test_a_cycle_costs_few_calls(wire):
+    """2 RPDO and 2 TPDO with SYNC; what they cost in time is for the benchmarks."""
     wire.enable()
     frames = [Frame(0x405, bytes(6)), Frame(0x505, bytes(6)), Frame(0x80)]
-    start = time.process_time()  # a computer that does something else meanwhile does not count
-    for k in range(2000):
-        for frame in frames:
-            wire.node.receive(frame, wire.now)
-        wire.node.before_cycle(wire.now + k * 0.001)
-        wire.node.after_cycle(wire.now + k * 0.001)
-    assert (time.process_time() - start) / 2000 < 300e-6
+    calls = 0
+
+    def count(frame, event, argument):
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    sys.setprofile(count)
+    try:
+        for k in range(100):
+            for frame in frames:
+                wire.node.receive(frame, wire.now)
+            wire.node.before_cycle(wire.now + k * 0.001)
+            wire.node.after_cycle(wire.now + k * 0.001)
+    finally:
+        sys.setprofile(None)
+    assert 100 * 50 < calls < 100 * 300  # 181 a cycle when this was written
