@@ -8,7 +8,6 @@ and 6077h, which is the torque current once the encoder commutates.
 
 from __future__ import annotations
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -23,18 +22,15 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.gains import write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting
-from drive_env.trials.gain_trial import PHASES, Identified, Mask, clear
+from drive_env.trials.gain_trial import PHASES, Identified, Mask, Trials
 from drive_env.trials.open_loop import NO_WINDOW, OPEN, TOOTH, OpenLoopTrials, with_run_current
-from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
     CYCLE,
     PROFILE,
     TRAVEL_SHARE,
     TRIAL,
-    WATCH,
     Move,
     move_terms,
-    start,
     wrapped,
     write_profile,
 )
@@ -161,10 +157,11 @@ class ClosedLoopTrials(OpenLoopTrials):
 
     def go(self, target: Integers, where: Mask) -> None:
         """Set off for a position of the encoder, which is the axis' own in a closed loop."""
-        if np.any(where & self._closes):
-            start(self._drives, wrapped(target).astype(np.int64), where)
-        else:
-            super().go(target, where)
+        closed = where & self._closes
+        if closed.any():
+            Trials.go(self, target, closed)
+        if np.any(where & ~closed):
+            super().go(target, where & ~closed)
 
     def run(  # type: ignore[override]
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
@@ -183,7 +180,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         for phase, (target, share) in enumerate(((away, 1.0), (origin, 1.0), (away, PROBE))):
             used = np.where(stopped[:, None], incumbent, with_run_current(device, gains, share * move.share))
             write_gains(drives, used, where)
-            position, demand, current, stopped, new = self._overload(target, incumbent, stopped, where)
+            position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)
             culprit |= new
             aborted[phase] = stopped
             sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
@@ -197,34 +194,6 @@ class ClosedLoopTrials(OpenLoopTrials):
         write_gains(drives, np.where(stopped[:, None], incumbent, gains), where)
         terms = Terms(settling, 1.0 + following / self._t_0, noise, overshoot, aborted)
         return ClosedLoopTrial(terms, np.maximum(following, 0.5 * CYCLE), aborted, first_error, culprit)
-
-    def _overload(
-        self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
-    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
-        """Move; return position, demand, current, the machines stopped so far, and the axes that caused it now."""
-        drives, to = self._drives, wrapped(target).astype(np.int64)
-        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
-        traces = []
-        culprit = np.zeros(len(stopped), bool)
-        self._prepare(objects)
-        start(drives, to, where)
-        for _ in range(TRIAL // WATCH):
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
-                trace = self._record(objects, WATCH)
-            traces.append(trace)
-            down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
-            shaking = shakes(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives), self._motor.rated_current)
-            new = self._whole_lanes(down | shaking) & where & ~stopped
-            if new.any():
-                write_gains(drives, incumbent, new)
-                stopped = stopped | new
-                culprit |= new & (down | shaking)
-            if down.any():
-                clear(drives, down)
-                start(drives, to, down)
-        position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
-        return position, demand, current, stopped, culprit
 
     def _watch_no_window(self) -> None:
         """Take 6065h away, which drives have again that were switched on: an axis that is overloaded falls behind."""
