@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import logging
+import re
 import time
 
 import numpy as np
@@ -275,6 +276,18 @@ def test_lost_and_damaged_frames_change_nothing_but_time():
     assert count > 200
 
 
+def test_a_slave_that_is_not_where_this_program_took_it_is_told():
+    with linked(safety=False) as (drives, segment):
+        others = drives.link.other_masters()
+        others.check()
+        drives.record([0x6041], 0.005)  # Op
+        others.check()
+        drives.link.other_masters().check()
+        segment.master().begin()  # another master, which takes all slaves
+        with pytest.raises(BusError, match="is in Pre-Op, and this program took it to Op: another master uses"):
+            others.check()
+
+
 # --- programs ---------------------------------------------------------------------------------------------------------
 def test_programs_choose_the_link_by_the_interface(monkeypatch):
     monkeypatch.delenv("DRIVE_ENV_INTERFACE", raising=False)
@@ -312,3 +325,20 @@ def test_commands_over_udp(over_udp, tmp_path):
     run("set", "6081", "6000", *device)
     run("restore", file, "--yes", *device)
     assert run("get", "6081", "--raw", *device).splitlines()[0].endswith("= 5000")
+
+
+def test_programs_that_sample_and_move_in_real_time_over_udp(tmp_path):
+    with EmulatedSegment(load="inertia", num_machines=3) as segment:
+        segment.world.lockstep = False
+        way = UdpSocket(0)
+        with EtherCatServer(segment.world, way):
+            device = ["--device", "tmcm3313", "--interface", "ethercat-udp", "--channel", way.port]
+            run("scope", "6041", "6064", "--duration", "0.05", "--out", tmp_path / "trace", *device)
+            assert len((tmp_path / "trace.csv").read_text(encoding="utf-8").splitlines()) == 51
+            assert "6064h" in run("monitor", "6064", "--duration", "0.05", *device)
+            before = float(segment.drives.machine.rotor_angle[1])
+            said = run("jog", "30 rpm", "--for", "0.3", "--axis", "1", *device)
+            moved = (float(segment.drives.machine.rotor_angle[1]) - before) / (2 * np.pi)
+            assert float(re.search(r"\((\S+) rev\)", said)[1]) == pytest.approx(moved, abs=0.01) and moved > 0.1
+            assert not cia402.is_live(segment.drives.read(0x6041)).any()
+        segment.world.lockstep = True

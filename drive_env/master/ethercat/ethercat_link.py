@@ -28,15 +28,17 @@ class OtherEtherCatMasters:
 
     def __init__(self, link: EtherCatLink) -> None:
         self._link = link
-        self._before = link.states()
 
     def check(self) -> None:
-        """Raise BusError if a slave is in another state than at the beginning."""
-        for position, before, now in zip(self._link.nodes, self._before, self._link.states(), strict=True):
-            if before != now:
+        """Raise BusError if a slave is in another state than this program took it to."""
+        link = self._link
+        given = AlState.PRE_OP if link.process.missing else AlState.OP
+        for position, now in zip(link.nodes, link.states(), strict=True):
+            if now != given:
                 raise BusError(
-                    f"position {position} was in {state_name(before)} and is in {state_name(now)}, which this program "
-                    "has not asked for: another master uses the segment; end it"
+                    f"position {position} is in {state_name(now)}, and this program took it to {state_name(given)}: "
+                    "another master uses the segment, or the slave has left Op by itself; end the other master, or "
+                    "see the slave's AL status code with `drive-env scan`"
                 )
 
 
