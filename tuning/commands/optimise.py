@@ -368,8 +368,8 @@ def _what_counts(device: str, gains: tuple[str, ...] | None) -> list[str]:
         return [
             "The PID regulated the position in trials, at the motor's rated current. J has no load step and no ripple "
             "of the current here: a PID does not commutate, 6077h is the size of the current that is set. E_d/E_0 "
-            "follows from the gains, and has 1 + b/t_0 beside it, b the integral of |demand - encoder|; in place of the "
-            "ripple it is the vibration of the encoder."
+            "follows from the gains, and has 1 + b/t_0 beside it, b the integral of |demand - encoder|; in place of "
+            "the ripple stands the vibration of the encoder."
         ]
     if not is_tried_open(device, gains) and find_device(device).gains.is_open_loop:
         return [
