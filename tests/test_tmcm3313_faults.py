@@ -30,7 +30,7 @@ AXES = 3
 TURN = 200 * 256  # microsteps
 LIMITS = Limits(position=(-3 * TURN, 3 * TURN), velocity=6 * TURN)
 TRAVEL = tuple(3 * sign * 2.0 * np.pi / RADIANS for sign in (-1, 1))  # as `problems` counts
-LOAD_ANGLE, PID = 1, 2
+LOAD_ANGLE, PID, PID_ALONE = 1, 2, 3
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +53,11 @@ def close_loop(drives, mode, loop):
     drives.advance(0.5)
 
 
-def to_and_fro(drives):
+def to_and_fro(drives, fastest=AXES * TURN):
     """Every axis at a speed of its own, then the other way, and a stop by ramp."""
     for name in ("Profile acceleration", "Profile deceleration"):
         drives.write(name, 60 * TURN)
-    each = np.arange(1, AXES + 1) * TURN
+    each = np.arange(1, AXES + 1) * fastest // AXES
     drives.write(cia402.TARGET_VELOCITY, each)
     drives.advance(0.03)
     drives.write(cia402.TARGET_VELOCITY, -each)
@@ -80,6 +80,21 @@ def position_pid(drives):
     to_and_fro(drives)
 
 
+def position_pid_alone(drives):
+    """All of the motion is the PID's, at a speed at which it is a few full steps behind, and loses none."""
+    gains = {
+        "Correction position P": 10_000,
+        "Correction velocity P": 8000,
+        "Correction velocity I": 1,
+        "Correction velocity DV clock": 2,
+        "Maximum correction tolerance": 8,
+    }
+    for name, value in gains.items():
+        drives.write(name, value)
+    close_loop(drives, "pv", PID_ALONE)
+    to_and_fro(drives, fastest=TURN // 2)
+
+
 def closed_loop_paths(drives):
     """Three paths, played in one call, and the stop left to the end of the program."""
     close_loop(drives, "csp", LOAD_ANGLE)
@@ -97,7 +112,10 @@ def torque(drives):
         drives.record([cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], 0.001, play={cia402.TARGET_TORQUE: rows})
 
 
-SESSIONS = {session.__name__: session for session in (open_loop, closed_loop, position_pid, closed_loop_paths, torque)}
+SESSIONS = {
+    session.__name__: session
+    for session in (open_loop, closed_loop, position_pid, position_pid_alone, closed_loop_paths, torque)
+}
 
 
 @pytest.mark.parametrize("name", SESSIONS)
@@ -107,7 +125,8 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert problems(truth, travel=TRAVEL) == []
     assert frames > 100
     moved = np.ptp(truth.theta(), axis=0) / (2.0 * np.pi)
-    assert moved[moved > 0.01].size >= (2 if name in ("torque", "closed_loop_paths") else AXES), moved
+    least = 0.002 if name == "position_pid_alone" else 0.01
+    assert moved[moved > least].size >= (2 if name in ("torque", "closed_loop_paths") else AXES), moved
     closed = emulated.read(Role.LOOP_INITIALISED)
     assert (closed == (1 if name in ("closed_loop", "closed_loop_paths", "torque") else 0)).all()
 
