@@ -16,7 +16,7 @@ from drive_env.dictionary.aborts import SUB_INDEX_ZERO_IN_USE, VALUE_RANGE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.speeds import per_increment
-from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.record import get_lanes
 from drive_env.node.process_image import ProcessImage
 
 ROOT = Path(__file__).parents[1]
@@ -279,10 +279,9 @@ def wire():
 def set_errors(wire, *bits):
     """Set errors of each axis on the machine, by number; none where it is None. Both axes are enabled before."""
     motion.enable(wire.drives, mode="pp")
-    word = [0 if bit is None else 1 << bit for bit in bits]
-    set_lanes(wire.drives.inside.records, "error_bits", np.array(word))
+    wire.drives.machine.error_bits = [0 if bit is None else 1 << bit for bit in bits]
     wire.wait(10)
-    set_lanes(wire.drives.inside.records, "error_bits", np.zeros(2, int))
+    wire.drives.machine.error_bits = 0
     wire.take()
 
 
