@@ -243,8 +243,9 @@ def test_modes_and_homing_are_what_both_have(folders, name, modes, methods):
             assert told["homing method -4"].startswith("60E3h has it, and the emulator does not: negative numbers are")
 
 
-@pytest.mark.parametrize(("method", "edge"), [(4, None), (24, -0.06), (28, -0.02)])
-def test_methods_of_the_standard_home_it_at_real_switches(folders, method, edge):
+# By the index to the right of the left edge, where a turn of the motor begins; to the edges, where they become active.
+@pytest.mark.parametrize(("method", "home"), [(4, -0.04), (24, -0.06), (28, -0.02)])
+def test_methods_of_the_standard_home_it_at_real_switches(folders, method, home):
     """A carriage on a belt, by a drive whose EDS lists no methods: the home switch is from -0.06 to -0.02 m."""
     with EmulatedDrives(str(folders["everest_ed1"].folder), "belt", MOTOR, num_threads=1, ideal=True) as drives:
         assert set(drives.device.allowed_values[0x6098, 0]) == {0, *range(1, 15), *range(17, 31), 33, 34, 35, 37}
@@ -255,11 +256,8 @@ def test_methods_of_the_standard_home_it_at_real_switches(folders, method, edge)
         drives.write(0x6098, method)
         motion.home(drives, timeout=12.0)
         carriage = float(drives.inside.records["load_position"][0][0])
-        assert abs(int(drives.read(0x6064)[0])) < 20
-        if edge is None:  # by the index to the right of the left edge, which is where a turn of the motor begins
-            assert carriage == pytest.approx(-0.04, abs=2e-4)
-        else:
-            assert carriage == pytest.approx(edge, abs=2e-4)
+        assert carriage - int(drives.read(0x6064)[0]) / metre == pytest.approx(home, abs=1e-4)
+        assert carriage == pytest.approx(home, abs=1e-3)
 
 
 def test_an_object_that_is_lacking_is_no_role_and_is_not_made(folders):
