@@ -130,7 +130,7 @@ def test_json_for_programs(tmp_path):
     (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),
     (["--interface", "virtual", "--channel", "none"], "--travel is missing: give how far the motor may turn"),
     (["--trials", "0"], "--trials 0 must be 1 or more"),
-    (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes one axis"),
+    (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes axes one by one"),
     (["--load", "nothing"], "no load is named 'nothing'"),
 ])  # fmt: skip
 def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, arguments, message):
