@@ -295,7 +295,7 @@ class EtherCatProcessData:
         return set(entries) <= set(self._layouts[direction].entries)
 
     def _check(self, entries: Sequence[Entry], direction: int, wrong_way: str, verb: str) -> None:
-        ready_made = self._layout(direction).entries
+        ready_made = {*self._layout(direction).entries, *self._planner.carried(direction)}
         for entry in entries:
             can = entry.pdo_mappable and entry.access not in (wrong_way, "const")
             if not can and entry not in ready_made:
