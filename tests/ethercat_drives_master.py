@@ -1,6 +1,6 @@
 """`EtherCatDrives` on a network interface, by pysoem, moves all axes of a drive in csp; says what it saw as JSON.
 
-python tests/ethercat_drives_master.py INTERFACE CYCLES PACE DEVICE
+python tests/ethercat_drives_master.py INTERFACE CYCLES PACE DEVICE SYNC0
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.master.identity import read_identity
 
 
-def main(channel: str, cycles: int, pace: str, device: str) -> None:
+def main(channel: str, cycles: int, pace: str, device: str, sync0: bool) -> None:
     """Move axis k by (k + 1) * 4 steps in each cycle."""
-    with EtherCatDrives(device, channel=channel, pace=pace, timeout=20.0) as drives:
+    with EtherCatDrives(device, channel=channel, pace=pace, timeout=20.0, sync0=sync0) as drives:
         identity = read_identity(drives)
         motion.enable(drives, mode="csp")
         start = drives.read(0x6064)
@@ -37,4 +37,4 @@ def main(channel: str, cycles: int, pace: str, device: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4])
+    main(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4], sys.argv[5] == "sync0")

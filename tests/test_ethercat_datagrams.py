@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 
 import numpy as np
@@ -376,6 +377,8 @@ def test_frames_of_chance():
 
 
 @pytest.mark.slow
-def test_a_million_frames_of_chance():
-    refused, answered = fuzz(1_000_000, 2)
-    assert refused + answered == 1_000_000
+def test_many_frames_of_chance():
+    """FUZZED_FRAMES=1000000 takes a million, some five minutes of one core."""
+    number = int(os.environ.get("FUZZED_FRAMES", "20000"))
+    refused, answered = fuzz(number, 2)
+    assert refused + answered == number
