@@ -75,7 +75,6 @@ class EtherCatLink:
         self._alive: Callable[[], None] = lambda: None
         self._restarted: Callable[[int], None] = lambda node: None
         self._frame = description.answer_timeout if lockstep else FRAME
-        master.alive = self._while_waiting
         master.clock = Sync0(description.cycle, lockstep) if sync0 else None
         try:
             count = master.begin()
@@ -91,6 +90,7 @@ class EtherCatLink:
             master.close()
             raise
         self.process = EtherCatProcessData(master, self.nodes, description, lockstep)
+        master.alive = self._while_waiting
         self.process.phase = FramePhase(description.cycle) if sync0 else None
         words = _controlwords(description)
         self._clients: list[ObjectClient] = [
