@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ethercat_segment import EmulatedSegment
 
-from drive_env import EmulatedDrives, motion
+from drive_env import EmulatedDrives, Limits, motion
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.segment import HOP
@@ -158,7 +158,8 @@ def test_a_pace_begins_with_the_pulses_and_stays_with_them(monkeypatch, fast):
 
 
 # --- real time --------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("cycle", [pytest.param(0.001, marks=pytest.mark.slow), 0.004])
+@pytest.mark.slow
+@pytest.mark.parametrize("cycle", [0.001, 0.004])
 def test_in_real_time_over_udp_all_axes_follow_by_sync0(cycle):
     with EmulatedSegment() as segment:
         segment.world.lockstep = False
@@ -167,7 +168,12 @@ def test_in_real_time_over_udp_all_axes_follow_by_sync0(cycle):
             with (
                 EtherCatServer(segment.world, way),
                 EtherCatDrives(
-                    interface="ethercat-udp", channel=str(way.port), sync0=True, cycle=cycle, timeout=5.0
+                    interface="ethercat-udp",
+                    channel=str(way.port),
+                    sync0=True,
+                    cycle=cycle,
+                    timeout=5.0,
+                    safety=Limits(silence=3.0),
                 ) as drives,
             ):
                 motion.enable(drives, mode="csp")
