@@ -458,7 +458,7 @@ def test_the_picture_shows_the_trials_of_every_search():
     rows = [row(search, number, cost) for search, cost in ((0, 2.0), (1, 1.0)) for number in range(3)]
     found = Optimised(np.ones((2, 5), int), np.ones((2, 5), int), np.array([2.0, 1.0]), tuple(rows), 0.0,
                       np.zeros(2, int), np.zeros(2, int), ("", ""), 0.01)  # fmt: skip
-    axes = trials_figure(found, Settings()).axes[0]
+    axes = trials_figure(found, Settings(), "tmcm1636").axes[0]
     assert len(axes.collections[0].get_offsets()) == 6
     assert [line.get_ydata().tolist() for line in axes.lines] == pytest.approx(np.exp([[2.0] * 3, [1.0] * 3]))
 
@@ -472,7 +472,7 @@ def test_the_best_so_far_is_of_accepted_trials_alone():
         row(0, 3, 1.0),
         row(0, 4, -2.0, aborted=True),
     )
-    (line,) = trials_figure(searched(rows), Settings()).axes[0].lines
+    (line,) = trials_figure(searched(rows), Settings(), "tmcm1636").axes[0].lines
     np.testing.assert_allclose(line.get_ydata(), [np.nan, *np.exp([2.0, 2.0, 1.0, 1.0])])
 
 
@@ -483,7 +483,7 @@ def test_the_front_is_of_accepted_trials_and_its_axes_have_units():
         row(0, 1, 0.0, objectives=(0.0, np.log(5.0), 4.0)),
         row(0, 2, -1.0, objectives=(-1.0, 0.0, 1.0), aborted=True),
     )
-    axes = trials_figure(searched(rows), Settings(objectives=("speed", "robustness"))).axes[0]
+    axes = trials_figure(searched(rows), Settings(objectives=("speed", "robustness")), "tmcm1636").axes[0]
     (front,) = axes.lines
     np.testing.assert_allclose(sorted(front.get_xydata().tolist()), [[10.0, 5.0], [20.0, 3.0]])  # t_0 is 10 ms
     assert axes.get_xlabel() == "settling time, the slower of move and reversal [ms]"

@@ -176,15 +176,15 @@ class RobustScore:
         from mechanics.shaft import one, way
 
         found = find_load(load)
-        is_open_loop = find_device(device).gains.is_open_loop
+        by_current = self._tries_current(find_device(device).gains.is_open_loop)
         fields = {parameter.field for parameter in found.parameters}
         self.variants = tuple(
             variant
             for variant in VARIANTS
             if (variant.inertia == 1.0 or fields & set(_INERTIA))
             and (variant.stiffness == 1.0 or fields & set(_STIFFNESS))
-            and (variant.velocity_p == 1.0 or not is_open_loop)
-            and (variant.run_current == 1.0 or is_open_loop)
+            and (variant.velocity_p == 1.0 or not by_current)
+            and (variant.run_current == 1.0 or by_current)
         )
         self.num_machines, self.repeats = num_machines, repeats
         self._runs = repeats * len(self.variants)  # of a machine
@@ -263,6 +263,11 @@ class RobustScore:
     def close(self) -> None:
         """Close the drives."""
         self._drives.close()
+
+    @staticmethod
+    def _tries_current(is_open_loop: bool) -> bool:
+        """Return whether a variant has less run current, in place of more gain."""
+        return is_open_loop
 
     def _settling_scale(self, filters: Floats) -> Floats:
         """Return t_0 of the machines with these velocity filters [s]."""
