@@ -60,6 +60,7 @@ def axes():
         yield target, np.array(propose("margin_55", target.device, target.motor, plant).gains)
 
 
+@pytest.mark.slow
 def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkeypatch, tmp_path):
     target, good = axes
     slow = faster(target.device.gains, good, 0.6)

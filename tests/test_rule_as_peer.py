@@ -238,6 +238,7 @@ LOOSE = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_response_within_the_play_of_a_gear_is_no_identification_of_the_axis():
     """It gave 0.42 of the inertia; the two moves, which drive through the play, give 0.8."""
     with emulated(load="geared_joint", motor="ec_45_flat", parameters=LOOSE, num_threads=1) as target:

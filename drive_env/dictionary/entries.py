@@ -206,6 +206,8 @@ class ObjectDictionary:
         Raises:
             ObjectAccessError: 06020000h if there is no such object, 06090011h if it has no such sub-index.
         """
+        if type(name) is tuple and name in self._entries:
+            return self._entries[name]
         if isinstance(name, Role):
             if name not in self.roles:
                 raise ObjectAccessError(NO_SUCH_OBJECT, f"this drive has no {name.value}")
