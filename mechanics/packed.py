@@ -19,7 +19,7 @@ from mechanics.load import Load
 from mechanics.load_values import FRICTION_COLUMNS, LoadValues
 from mechanics.modal import Corrections, corrections
 from mechanics.plant import PackedPlant
-from mechanics.template import Template
+from mechanics.template import Template, template_of
 
 Floats = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ class PackedLoad:
             raise ValueError(f"no integrator is named {integrator!r}; there are {', '.join(_INTEGRATORS)}")
         self.staggered = integrator == "leapfrog"
         self._model_of_friction: FrictionModel = find_friction(friction)
-        self.template = Template(load, self.copies) if template is None else template
+        self.template = template_of(load, self.copies) if template is None else template
         self.model = copy.copy(self.template.model)
         self.num_dofs = self.template.num_dofs
         self.joints = self.template.joints
@@ -428,7 +428,7 @@ def pack(
         machines = slice(first, first + copies)
         count = len(armature[machines])
         if count not in templates:
-            templates[count] = Template(load, count)
+            templates[count] = template_of(load, count)
         packed.append(
             PackedLoad(
                 load, armature[machines], motor_friction[machines],

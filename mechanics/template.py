@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import threading
+from collections import OrderedDict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,6 +19,7 @@ from mechanics.model import compile_packed, is_constant, is_constrained, is_vary
 
 Floats = NDArray[np.float64]
 _INDICES = NDArray[np.int64]
+_MOST_TEMPLATES = 32  # one of 64 copies takes about 6 MB
 
 
 class Rows(NamedTuple):
@@ -50,7 +54,7 @@ class Template:
 
     Attributes:
         model: MuJoCo's, to be copied and never changed.
-        scratch: Data of it, at rest, in which poses of any copy of the model are looked at.
+        scratch: Data of it, each thread's own, in which poses of any copy of the model are looked at.
         joints: Names of a copy's joints, in the order of its degrees of freedom.
         turning: Rotor angle of each axis from joints.
         position: What presses each axis's switches, from joints.
@@ -67,7 +71,7 @@ class Template:
         self._load = load
         self._rows: dict[bool, Rows] = {}
         self.model: mujoco.MjModel = compile_packed(load, copies)
-        self.scratch = mujoco.MjData(self.model)
+        self._scratch = threading.local()
         single = read_model(load)
         self.constrained = is_constrained(self.model)
         self.varying = is_varying(single)
@@ -89,6 +93,13 @@ class Template:
             if name not in self.joints
         }
         self._row, self._column, self._entry = self._places_of_inertia()
+
+    @property
+    def scratch(self) -> mujoco.MjData:
+        """Data of the model, each thread's own."""
+        if not hasattr(self._scratch, "data"):
+            self._scratch.data = mujoco.MjData(self.model)
+        return self._scratch.data
 
     def inertia(self, data: mujoco.MjData) -> Floats:
         """Return each copy's inertia matrix, shape (copies, D, D), of data of a copy of the model."""
@@ -198,6 +209,32 @@ class Template:
         ]
         row, column, entry = np.array(places, np.int64).T
         return row, column, entry
+
+
+def template_of(load: Load, copies: int) -> Template:
+    """Return a load's template, one of the last that were made where the row and its file are as they were then.
+
+    A model that takes in other files is read anew each time.
+
+    Raises:
+        ValueError: As `Template`.
+    """
+    content = load.mjcf.read_bytes() if load.mjcf.is_file() else b""
+    if not content or re.search(rb"<include|<replicate|file\s*=", content):
+        return Template(load, copies)
+    key = (repr(load), content, copies)
+    with _lock:
+        kept = _templates.pop(key, None)
+    kept = Template(load, copies) if kept is None else kept
+    with _lock:
+        _templates[key] = kept
+        while len(_templates) > _MOST_TEMPLATES:
+            _templates.popitem(last=False)
+    return kept
+
+
+_templates: OrderedDict[tuple[str, bytes, int], Template] = OrderedDict()
+_lock = threading.Lock()
 
 
 def _proportional(turning: Sequence[Combination], frictions: Sequence[Friction]) -> dict[int, tuple[int, float]]:

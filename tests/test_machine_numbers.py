@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drive_env.emulator import machine_numbers as of_many
 from drive_env.emulator.machine_numbers import machine_numbers
 
 
+@pytest.mark.parametrize("few", [0, of_many._FEW])
 @pytest.mark.parametrize("seed", [0, 1, 2**32 - 1, 2**32, 2**40 + 5, 2**96, 2**130 + 17])
 @pytest.mark.parametrize(
     "machines",
@@ -19,7 +21,8 @@ from drive_env.emulator.machine_numbers import machine_numbers
         [2**32 - 1, 2**32, 2**70],  # a number of two or three words is stirred in other turns
     ],
 )
-def test_every_machine_has_the_numbers_of_a_generator_of_its_own(seed, machines):
+def test_every_machine_has_the_numbers_of_a_generator_of_its_own(seed, machines, few, monkeypatch):
+    monkeypatch.setattr(of_many, "_FEW", few)
     integers, shares = machine_numbers(seed, machines, 9)
     for k, machine in enumerate(machines):
         generator = np.random.default_rng((seed, machine))

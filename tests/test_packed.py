@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+import os
+import re
 import warnings
 from functools import cache
 
@@ -14,7 +16,7 @@ from drive_env import EmulatedDrives, motion
 from mechanics.loads import LOADS
 from mechanics.model import COPIES_OF_MANY, compile_packed, copies_per_model
 from mechanics.packed import PackedLoad, pack
-from mechanics.template import Template
+from mechanics.template import Template, template_of
 
 STEPS = 400
 H = 200e-6
@@ -307,7 +309,40 @@ def test_files_are_read_and_models_compiled_as_often_for_many_machines_as_for_fe
     counts = []
     for num_machines in (64, 640):
         seen.clear()
+        template._templates.clear()
         EmulatedDrives(num_machines=num_machines).close()
         counts.append({name: seen.count(name) for name in seen})
     assert counts[0] == counts[1]
     assert counts[0]["compile_packed"] == 2  # of the machine from which defaults are read, and of 64
+    seen.clear()
+    EmulatedDrives(num_machines=64).close()
+    assert "compile_packed" not in seen  # the row and its file are as they were
+
+
+@pytest.mark.parametrize("change", ["its file", "the row"])
+def test_a_model_is_compiled_anew_where_the_load_has_changed(change, tmp_path):
+    file = tmp_path / "arm.xml"
+    file.write_text(LOADS["inertia"].mjcf.read_text())
+    row = dataclasses.replace(LOADS["inertia"], mjcf=file)
+    first = template_of(row, 2)
+    assert template_of(row, 2) is first is not template_of(row, 3)
+    if change == "its file":
+        before = file.stat()
+        file.write_text(re.sub(r'diaginertia="[^"]*"', 'diaginertia="7 7 7"', file.read_text()))
+        os.utime(file, (before.st_atime, before.st_mtime))
+    else:
+        row = dataclasses.replace(row, gear=3.0)
+    second = template_of(row, 2)
+    assert second is not first
+    if change == "its file":
+        assert second.model.body_inertia[-1].tolist() == [7.0, 7.0, 7.0]
+    else:
+        assert list(second.turning[0].values()) == [3.0]
+
+
+def test_a_model_that_takes_in_other_files_is_always_read(tmp_path):
+    (tmp_path / "body.xml").write_text(LOADS["inertia"].mjcf.read_text())
+    file = tmp_path / "whole.xml"
+    file.write_text('<mujoco><include file="body.xml"/></mujoco>')
+    row = dataclasses.replace(LOADS["inertia"], mjcf=file)
+    assert template_of(row, 2) is not template_of(row, 2)

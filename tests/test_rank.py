@@ -240,6 +240,7 @@ def test_the_factory_leaves_and_the_baseline_rule_computes():
     assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("baseline"))
 
 
+@pytest.mark.slow
 def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
     names = {"tpe": False, "tpe-safe": True}
     found = compare(RIGID, {name: find_tuner(name) for name in names})
@@ -248,6 +249,7 @@ def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
     assert by_name["tpe-safe"].aborts < by_name["tpe"].aborts
 
 
+@pytest.mark.slow
 def test_a_rule_identifies_once_for_all_rules(monkeypatch):
     calls = []
     real = compare_module.identify_all
@@ -437,6 +439,7 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
     assert told["gains"][0][2:] == [int(best[name]) for name in ("velocity_p", "velocity_i", "position_p")]
 
 
+@pytest.mark.slow
 def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their_place(tmp_path):
     first, again, other = tmp_path / "first", tmp_path / "again", tmp_path / "other"
     options = ("--searches", 2, "--copies", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",

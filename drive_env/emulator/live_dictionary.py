@@ -254,12 +254,21 @@ class LiveDictionary:
     # --- inside ---------------------------------------------------------------------------------------------------
     def _commission(self, preset: Mapping[ObjectName, int]) -> dict[tuple[int, int], Integers]:
         """Return the raw values that a restart restores, factory values and then the preset; one of all axes each."""
-        stored: dict[tuple[int, int], Integers] = {}
+        numbers: list[Entry] = []
         for entry in self.entries:
             if isinstance(entry.default, str):
                 self._values[entry.index, entry.sub] = entry.default
             else:
-                stored[entry.index, entry.sub] = self._defaults(entry)
+                numbers.append(entry)
+        # Some hundreds of objects in one array: one by one they would take most of a set's construction.
+        factory = np.array([entry.default for entry in numbers], np.int64)
+        stored: dict[tuple[int, int], Integers] = {
+            (entry.index, entry.sub): factory[k : k + 1] for k, entry in enumerate(numbers)
+        }
+        for entry in numbers:
+            for offset in self.device.axis_offsets:
+                if offset.first <= entry.index <= offset.last:
+                    stored[entry.index, entry.sub] = self._defaults(entry, offset.step)
         taken = allowed_values(self.device, self.entries.find(MODE_OF_OPERATION)) or ()
         modes = sum(
             1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None and mode.number in taken
@@ -271,15 +280,16 @@ class LiveDictionary:
             raw = checked_values(entry, value, 1)
             self._check_value(entry, raw)
             stored[entry.index, entry.sub] = raw.copy()
-        for key, raw in stored.items():
-            if not self._is_bound(self.entries.find(key)):
-                self._values[key] = np.array(np.broadcast_to(raw, self.num_axes))
+        unbound = [key for key in stored if key not in self.codes]
+        values = np.zeros((len(unbound), self.num_axes), np.int64)
+        for row, key in zip(values, unbound, strict=True):
+            row[:] = stored[key]
+        self._values |= zip(unbound, values, strict=True)
         return stored
 
-    def _defaults(self, entry: Entry) -> Integers:
-        """Return an object's factory value, one of all axes, or one per axis where those of a node differ."""
-        step = next((one.step for one in self.device.axis_offsets if one.first <= entry.index <= one.last), 0)
-        keys = [(entry.index + k * step, entry.sub) for k in range(self.device.num_axes if step else 1)]
+    def _defaults(self, entry: Entry, step: int) -> Integers:
+        """Return an axis object's factory value, one of all axes, or one per axis where those of a node differ."""
+        keys = [(entry.index + k * step, entry.sub) for k in range(self.device.num_axes)]
         found = [self.entries.find(key).default if self.entries.has(key) else entry.default for key in keys]
         if len(set(found)) == 1:
             return np.array(found[:1], np.int64)

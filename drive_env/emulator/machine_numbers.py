@@ -1,7 +1,8 @@
 """What is drawn for each machine, of thousands at once: the numbers that NumPy's generator of each would give.
 
 Machine k of a seed has a generator of its own, `numpy.random.default_rng((seed, k))`, so that it is the same machine in
-every set. To make one takes some 30 us; the same arithmetic on arrays, one element for each machine, takes 2.
+every set. To make one takes some 30 us; the same arithmetic on arrays, one element for each machine, takes 2, and 3 ms
+whatever their number.
 `SeedSequence` (M. E. O'Neill, "Developing a seed_seq alternative", 2015) and PCG64 (XSL RR 128/64, "PCG: a family of
 simple fast space-efficient statistically good algorithms for random number generation", 2014) are as NumPy has them.
 """
@@ -18,6 +19,7 @@ _Halves = NDArray[np.uint32]
 _Words = NDArray[np.uint64]
 _Wide = tuple[_Words, _Words]  # 128 bits: upper and lower half
 
+_FEW = 100  # machines that NumPy's generators serve faster
 _POOL = 4  # halves of a word that SeedSequence stirs
 _FIRST_IN, _FACTOR_IN = 0x43B0D7E5, 0x931E8875
 _FIRST_OUT, _FACTOR_OUT = 0x8B51F9DD, 0x58F38DED
@@ -45,7 +47,7 @@ def machine_numbers(seed: int, machines: Sequence[int], count: int) -> tuple[Flo
         return integers[place], shares[place]
     integers, shares = np.empty(len(machines)), np.empty((len(machines), count))
     # Of two words a number is for a set of its own; `default_rng` also refuses what is negative.
-    short = np.array([seed >= 0 and 0 <= number < 2**32 for number in machines], bool)
+    short = np.array([len(machines) >= _FEW and seed >= 0 and 0 <= number < 2**32 for number in machines], bool)
     if np.any(short):
         words = [np.full(int(short.sum()), word, np.uint32) for word in _halves(seed)]
         numbers = np.array([number for number, plain in zip(machines, short, strict=True) if plain], np.uint32)

@@ -29,11 +29,10 @@ from drive_env.trials.positioning import (
     move_terms,
     power_up,
     start,
-    swing,
     wrapped,
     write_profile,
 )
-from drive_env.trials.score import LOAD_SHARE, RobustScore, Terms
+from drive_env.trials.score import LOAD_SHARE, CurrentSwings, RobustScore, Terms, swings
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -84,8 +83,8 @@ class ClosedLoopScore(RobustScore):
         drives.advance(CLOSING)
         return np.asarray(drives.read(Role.LOOP_INITIALISED) != 0)
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, variants, axes) each."""
+    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
+        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swings, (machines, variants, axes) each."""
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -120,5 +119,5 @@ class ClosedLoopScore(RobustScore):
         return (
             terms.each(lambda value: value.reshape(self._axes)),
             np.maximum(error, least).reshape(self._axes),
-            swing(np.asarray(current, float), drives.motor.rated_current).reshape(self._axes),
+            swings(np.asarray(current, float), drives.motor.rated_current, self._axes),
         )
