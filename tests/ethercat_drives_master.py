@@ -1,6 +1,6 @@
-"""`EtherCatDrives` on a network interface, by pysoem, moves a drive of three axes in csp; says what it saw as JSON.
+"""`EtherCatDrives` on a network interface, by pysoem, moves all axes of a drive in csp; says what it saw as JSON.
 
-python tests/ethercat_drives_master.py INTERFACE CYCLES PACE
+python tests/ethercat_drives_master.py INTERFACE CYCLES PACE DEVICE SYNC0
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.master.identity import read_identity
 
 
-def main(channel: str, cycles: int, pace: str) -> None:
+def main(channel: str, cycles: int, pace: str, device: str, sync0: bool) -> None:
     """Move axis k by (k + 1) * 4 steps in each cycle."""
-    with EtherCatDrives("tmcm3313", channel=channel, pace=pace, timeout=20.0) as drives:
+    with EtherCatDrives(device, channel=channel, pace=pace, timeout=20.0, sync0=sync0) as drives:
         identity = read_identity(drives)
         motion.enable(drives, mode="csp")
         start = drives.read(0x6064)
-        targets = start + np.minimum(np.arange(cycles + 100), cycles)[:, None] * 4 * np.array([1, 2, 3])
+        targets = start + np.minimum(np.arange(cycles + 100), cycles)[:, None] * 4 * np.arange(1, drives.num_axes + 1)
         trace = drives.record([0x6041, 0x6064], (cycles + 100) * 0.001, {0x607A: targets})
         seen = {
             "name": identity.name,
@@ -37,4 +37,4 @@ def main(channel: str, cycles: int, pace: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), sys.argv[3])
+    main(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4], sys.argv[5] == "sync0")

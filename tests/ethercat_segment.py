@@ -7,6 +7,7 @@ import time
 from contextlib import contextmanager
 
 from drive_env import EmulatedDrives
+from drive_env.devices import find_device
 from drive_env.ethercat.coe_node import CoeNode
 from drive_env.ethercat.slave import EtherCatSlave
 from drive_env.ethercat.world import EtherCatWorld
@@ -28,11 +29,12 @@ class EmulatedSegment:
 
     def __init__(self, device="tmcm3313", number=1, lockstep=True, **machine):
         machine = {"load": "portal", "num_threads": 1} | machine
-        self.world = EtherCatWorld(lockstep=lockstep)
-        for _ in range(number):
+        cycle = 1.0 / find_device(device).communication_rate
+        self.world = EtherCatWorld(lockstep=lockstep, cycle_time=cycle)
+        for k in range(number):
             drives = EmulatedDrives(device, **machine)
-            self.world.add(EtherCatSlave(CoeNode(drives)), drives)
-        self.world.drives[0].advance(0.002)  # compiled before time counts
+            self.world.add(EtherCatSlave(CoeNode(drives), epoch=1000 * k), drives)
+        self.world.drives[0].advance(max(0.002, cycle))  # compiled before time counts
         self.world.power_on()
         self.is_connected = True
         self.damage = lambda frame: frame

@@ -63,6 +63,7 @@ class Broken:
         return self._policy.act(observation) if self._good >= 0 else np.full(3, np.nan)
 
 
+@pytest.mark.slow
 def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     code, out, error = command("--trials", 2, "--out", tmp_path / "run")
     assert (code, error) == (0, "")

@@ -198,24 +198,6 @@ def test_outputs_that_an_object_does_not_take_change_nothing(pre_op):
     assert [one[:2] for one in pre_op.emergencies] == [b"\x20\x63"]
 
 
-def test_with_sync0_outputs_take_effect_at_its_pulse(pre_op):
-    node = pre_op.node
-    pre_op.bring_to(AlState.OP)
-    before = pre_op.drives.read(0x60FF).copy()
-    node._has_sync0 = True
-    node.outputs(command(0, speeds=(77, 78, 79)), 0.0)
-    assert list(pre_op.drives.read(0x60FF)) == list(before)
-    node.sync0(0.0)
-    assert list(pre_op.drives.read(0x60FF)) == [77, 78, 79]
-
-
-def test_a_cycle_of_sync0_that_is_too_short_is_refused(pre_op):
-    pre_op.configure(30, 30)
-    pre_op.write(0x09A0, struct.pack("<I", 100_000))  # ns
-    pre_op.write(0x0981, b"\x03")
-    assert pre_op.request(4) == (0x12, AlStatusCode.DC_CYCLE_TIME)
-
-
 # --- SDO information --------------------------------------------------------------------------------------------------
 def information(rig, operation, content):
     """Return the content of the fragments of an answer, put together, and how many there were."""

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 from ethercat_rig import STATION, Rig
+from thinning import part
 
 from drive_env.ethercat import datagrams, fmmu
 from drive_env.ethercat.application import AlState
@@ -377,5 +378,6 @@ def test_frames_of_chance():
 
 @pytest.mark.slow
 def test_a_million_frames_of_chance():
-    refused, answered = fuzz(1_000_000, 2)
-    assert refused + answered == 1_000_000
+    frames = part(1_000_000, 50_000)
+    refused, answered = fuzz(frames, 2)
+    assert refused + answered == frames

@@ -45,17 +45,17 @@ def first_line(process):
     raise AssertionError(f"it did not begin: {process.poll()}")
 
 
-def seen_by(spaces, pace, program_of_master, *arguments):
+def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal"):
     """Return what a master saw of a drive that is served."""
     pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
     program = "from drive_env.programs import drive_env; drive_env()"
-    serve = ("-c", program, "serve", "tmcm3313", "--load", "portal", pace)
+    serve = ("-c", program, "serve", device, "--load", load, pace)
     served = subprocess.Popen(
         inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface),
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
-        assert "1 slave (tmcm3313" in first_line(served)
+        assert f"1 slave ({device}" in first_line(served)
         master = inside(spaces.master, HERE / program_of_master, spaces.master_interface, *arguments)
         done = subprocess.run(master, capture_output=True, text=True, timeout=PATIENCE)
     finally:
@@ -74,7 +74,7 @@ def test_soem_moves_all_three_axes_in_csp(spaces):
     mapping = struct.unpack("<H9I", bytes.fromhex(seen["mapping"]))
     assert mapping[:3] == (9, 0x60400010, 0x607A0020), "complete access"
     assert seen["refused"] == 0x06010002, "1018h is read only"
-    assert seen["objects"] == 329 and seen["described"] == ["Statusword", 6, 16] and seen["entries"] == 4
+    assert seen["objects"] == 331 and seen["described"] == ["Statusword", 6, 16] and seen["entries"] == 4
     assert seen["sizes"] == [30, 30] and seen["safe_op"] and seen["op"]
     assert seen["words"] == [0x27] * 3, "operation enabled"
     assert seen["wrong"] <= 50  # of 700, on a machine that others use, too
@@ -85,14 +85,25 @@ def test_soem_moves_all_three_axes_in_csp(spaces):
 
 @pytest.mark.slow
 @needs_namespaces
-def test_ethercat_drives_on_soem_give_the_integers_of_emulated_ones(spaces):
-    seen = seen_by(spaces, "--lockstep", "ethercat_drives_master.py", CYCLES, "lockstep")
-    with EmulatedDrives("tmcm3313", load="portal", num_threads=1) as drives:
+@pytest.mark.parametrize(
+    ("device", "load", "clock"),
+    [("tmcm3313", "portal", "free"), ("tgz_d", "gantry", "free"), ("tmcm3313", "portal", "sync0")],
+)
+def test_ethercat_drives_on_soem_give_the_integers_of_emulated_ones(spaces, device, load, clock):
+    seen = seen_by(
+        spaces, "--lockstep", "ethercat_drives_master.py", CYCLES, "lockstep", device, clock, device=device, load=load
+    )
+    with EmulatedDrives(device, load=load, num_threads=1) as drives:
         motion.enable(drives, mode="csp")
         start = drives.read(0x6064)
-        targets = start + np.minimum(np.arange(CYCLES + 100), CYCLES)[:, None] * 4 * np.array([1, 2, 3])
+        targets = start + np.minimum(np.arange(CYCLES + 100), CYCLES)[:, None] * 4 * np.arange(1, drives.num_axes + 1)
         trace = drives.record([0x6041, 0x6064], (CYCLES + 100) * 0.001, {0x607A: targets})
-        assert seen["moved"] == (drives.read(0x6064) - start).tolist()
-    np.testing.assert_array_equal(seen["rows"], trace[0x6064])
-    assert seen["name"].startswith("TMCM-3313") and seen["words"] == [0x27] * 3
-    assert seen["disabled"] == [0x40] * 3 and seen["emergencies"] == 0
+        expected = trace[0x6064]
+        if clock == "free":
+            assert seen["moved"] == (drives.read(0x6064) - start).tolist()
+    rows = np.array(seen["rows"])
+    if clock == "sync0":  # what is played acts at the next pulse, a cycle later
+        rows, expected = rows[1:], expected[:-1]
+    np.testing.assert_array_equal(rows, expected)
+    assert seen["words"] == [0x27] * drives.num_axes
+    assert seen["disabled"] == [0x40] * drives.num_axes and seen["emergencies"] == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import re
+import struct
 import time
 
 import numpy as np
@@ -14,7 +15,9 @@ from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, Limits, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.commands.cli import app
+from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.ethercat.controller import LOGICAL, WRITING
 from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.ways import UdpSocket
 from drive_env.master import link
@@ -85,6 +88,7 @@ def as_integers(traces):
     return [np.stack([trace[index] for index in SAMPLED]) for trace in traces]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("safety", [True, False], ids=["enveloped", "bare"])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_same_script_gives_the_same_integers(name, safety):
@@ -325,6 +329,51 @@ def test_commands_over_udp(over_udp, tmp_path):
     run("set", "6081", "6000", *device)
     run("restore", file, "--yes", *device)
     assert run("get", "6081", "--raw", *device).splitlines()[0].endswith("= 5000")
+
+
+def frames_of(segment):
+    """Return the datagrams that were sent to a segment from now on."""
+    sent = []
+    segment.world.segment.listeners.append(
+        lambda now, frame, is_back: None if is_back else sent.extend(datagrams.read(frame, datagrams.ETHERNET))
+    )
+    return sent
+
+
+def writes_an_object(datagram):
+    """Whether it carries the initiation of an SDO download to a mailbox."""
+    if datagram.command != datagrams.DatagramCommand.FPWR or len(datagram.data) != 256:
+        return False
+    is_sdo = datagram.data[5] & 0x0F == 3 and datagram.data[7] >> 4 == 2
+    return is_sdo and datagram.data[8] >> 5 in (0, 1)
+
+
+def control_of(datagram):
+    """The state that it asks for by AL control; 0: it asks for none."""
+    _, register = struct.unpack("<HH", struct.pack("<I", datagram.address))
+    return datagram.data[0] & 0x0F if register == 0x0120 and datagram.command in WRITING else 0
+
+
+def test_a_dry_run_writes_no_object_sends_no_image_and_goes_to_pre_op_at_most(tmp_path):
+    file = tmp_path / "drive.toml"
+    with EmulatedSegment() as segment:
+        way = UdpSocket(0)
+        with EtherCatServer(segment.world, way):
+            device = ["--device", "tmcm3313", "--interface", "ethercat-udp", "--channel", str(way.port)]
+            run("set", "6081", "5000", "--yes", *device)
+            run("backup", file, *device)
+            run("set", "6081", "6000", "--yes", *device)
+            sent = frames_of(segment)
+            run("set", "6081", "7000", "--dry-run", *device)
+            run("restore", file, "--dry-run", *device)
+            run("jog", "30 rpm", "--for", "0.2", "--axis", "1", "--dry-run", *device)
+            assert any(len(one.data) == 256 for one in sent), "it has read"
+            assert not [one for one in sent if writes_an_object(one)]
+            assert not [one for one in sent if one.command in LOGICAL]
+            assert {control_of(one) for one in sent} <= {0, AlState.INIT, AlState.PRE_OP}
+            sent.clear()
+            run("set", "6081", "7000", "--yes", *device)
+            assert [one for one in sent if writes_an_object(one)], "a run that is not dry is seen so"
 
 
 def test_programs_that_sample_and_move_in_real_time_over_udp(tmp_path):

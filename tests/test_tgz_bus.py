@@ -279,6 +279,7 @@ def disable_voltage(drives):
 ENDS = {end.__name__: end for end in (close, interrupt, fail, disable, quick_stop, reset_fault, disable_voltage)}
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("gate", GATES)
 @pytest.mark.parametrize("end", ENDS)
 def test_every_end_finds_an_axis_that_takes_no_commands(inside, end, gate):

@@ -84,7 +84,8 @@ def _way(interface: str, channel: str | None, fail: Callable[[str], NoReturn]) -
 def _announce(server: EtherCatServer, bus: Bus) -> None:
     names = ", ".join(f"{row.device}, {row.motor_name}, {row.load}" for row in bus.machines)
     number = len(server.world.segment.slaves)
-    pace = "in lockstep: each frame with process data is 1 ms" if server.world.lockstep else "in real time"
+    cycle = f"in lockstep: each frame with process data is {1e3 * server.world.cycle_time:g} ms"
+    pace = cycle if server.world.lockstep else "in real time"
     print(
         f"drive-env: {number} slave{'s' if number > 1 else ''} ({names}) on {server.way.name}, {pace}; stop with Ctrl-C"
     )

@@ -12,6 +12,7 @@ from mechanics.near_names import did_you_mean
 
 MEMORY = (0x1000, 0x3000)  # where a controller has memory for sync managers: 8 KiB
 LEAST_MAILBOX = 32  # bytes
+PLACES = ("receive", "send", "bootstrap_receive", "bootstrap_send")
 
 
 class Place(NamedTuple):
@@ -32,6 +33,7 @@ class EtherCatBehaviour(NamedTuple):
         outputs: Address of sync manager 2.
         inputs: Address of sync manager 3.
         only_on_can: Objects whose names begin so are not there on EtherCAT; "": all are.
+        can_indices: Ranges of indices, first and last, that are not there on EtherCAT either.
         shortest_cycle: Of SYNC0 [s].
         eeprom: Size [bytes].
     """
@@ -45,6 +47,12 @@ class EtherCatBehaviour(NamedTuple):
     only_on_can: str
     shortest_cycle: float
     eeprom: int
+    can_indices: tuple[tuple[int, int], ...] = ()
+
+    def has(self, index: int, name: str) -> bool:
+        """Return whether an object is there on EtherCAT."""
+        hidden = bool(self.only_on_can) and name.startswith(self.only_on_can)
+        return not hidden and not any(first <= index <= last for first, last in self.can_indices)
 
 
 def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
@@ -55,12 +63,13 @@ def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
     for key in data:
         if key not in fields:
             raise ValueError(f"ethercat has no {key!r}{did_you_mean(key, fields)}")
-    missing = [field for field in fields if field not in data]
+    missing = [field for field in fields if field not in data and field not in EtherCatBehaviour._field_defaults]
     if missing:
         raise ValueError(f"ethercat lacks {', '.join(missing)}")
-    row: dict[str, Any] = {key: Place(*value) if isinstance(value, list) else value for key, value in data.items()}
+    row: dict[str, Any] = {key: Place(*value) if key in PLACES else value for key, value in data.items()}
+    row["can_indices"] = tuple((first, last) for first, last in data.get("can_indices", ()))
     found = EtherCatBehaviour(**row)
-    for name in ("receive", "send", "bootstrap_receive", "bootstrap_send"):
+    for name in PLACES:
         start, length = getattr(found, name)
         if length < LEAST_MAILBOX or not MEMORY[0] <= start <= MEMORY[1] - length:
             raise ValueError(

@@ -6,7 +6,7 @@ import copy
 import difflib
 import io
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import canopen
 import numpy as np
-from canopen.objectdictionary import ODVariable, datatypes
+from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
 from drive_env.dictionary.eds_file import EdsFile, parse_eds
@@ -122,15 +122,16 @@ def _content(variable: ODVariable) -> str:
 @lru_cache(maxsize=32)
 def _entries(text: str, name: str, node_id: int) -> tuple[dict[tuple[int, int], Entry], dict[str, tuple[int, int]]]:
     """Return the entries of an EDS, and where each name is."""
-    entries, names = {}, {}
-    for item in _model(text, name, node_id).values():
-        members = [item] if isinstance(item, ODVariable) else item.values()
-        for variable in members:
-            alone = isinstance(item, ODVariable) or variable.subindex == 0
-            entry = _entry(variable, item.name if alone else f"{item.name}.{variable.name}")
-            entries[entry.index, entry.sub] = entry
-            names[entry.name.casefold()] = (entry.index, entry.sub)
-    return entries, names
+    found = [entry for item in _model(text, name, node_id).values() for entry in _entries_of(item)]
+    entries = {(entry.index, entry.sub): entry for entry in found}
+    return entries, {entry.name.casefold(): (entry.index, entry.sub) for entry in found}
+
+
+def _entries_of(item: ODVariable | ODArray | ODRecord) -> list[Entry]:
+    """Return the entries of an object of python-canopen's model."""
+    if isinstance(item, ODVariable):
+        return [_entry(item, item.name)]
+    return [_entry(one, f"{item.name}.{one.name}" if one.subindex else item.name) for one in item.values()]
 
 
 def _entry(variable: ODVariable, name: str) -> Entry:
@@ -237,11 +238,18 @@ class ObjectDictionary:
             )
         raise ObjectAccessError(NO_SUCH_OBJECT, f"object {index:04X}h does not exist in {self.path.name}")
 
-    def without(self, prefix: str) -> ObjectDictionary:
-        """Return the dictionary less the objects whose names begin with `prefix`; with "", all of it."""
-        if not prefix:
-            return self
+    def only(self, has: Callable[[int, str], bool]) -> ObjectDictionary:
+        """Return the dictionary of the objects for whose index and name `has` is true."""
+        return self._with({key: one for key, one in self._entries.items() if has(one.index, one.name)})
+
+    def including(self, items: Iterable[ODArray | ODRecord]) -> ObjectDictionary:
+        """Return the dictionary with objects of python-canopen's model, which replace those of the same index."""
+        more = {(one.index, one.sub): one for item in items for one in _entries_of(item)}
+        replaced = {index for index, _ in more}
+        return self._with({key: one for key, one in self._entries.items() if key[0] not in replaced} | more)
+
+    def _with(self, entries: dict[tuple[int, int], Entry]) -> ObjectDictionary:
         other = copy.copy(self)
-        other._entries = {key: one for key, one in self._entries.items() if not one.name.startswith(prefix)}
-        other._names = {name: key for name, key in self._names.items() if key in other._entries}
+        other._entries = entries
+        other._names = {one.name.casefold(): key for key, one in entries.items()}
         return other

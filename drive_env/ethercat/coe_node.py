@@ -24,8 +24,10 @@ from drive_env.ethercat.application import (
 from drive_env.ethercat.coe import CoeService, MailboxEmergencies, split
 from drive_env.ethercat.coe_information import SdoInformation
 from drive_env.ethercat.coe_sdo import CoeSdoServer
+from drive_env.ethercat.ethercat_objects import entries_on_ethercat
 from drive_env.ethercat.object_descriptions import describe
 from drive_env.ethercat.sii_content import sii_content
+from drive_env.ethercat.synchronisation import Synchronisation
 from drive_env.node.axis import ObjectPort
 from drive_env.node.node_axes import NodeAxes
 from drive_env.node.node_dictionary import NodeDictionary
@@ -41,12 +43,15 @@ NODE_ID = 1  # of the factory's values; EtherCAT has no COB-IDs that follow it
 
 
 class CoeObjects(NodeObjects):
-    """The node's own objects, those of the process image among them."""
+    """The node's own objects, those of the process image and of its synchronisation among them."""
 
     image: ImageObjects
+    synchronisation: Synchronisation
 
     def port(self, entry: Entry) -> ObjectPort:
         """Return the way to one of these objects."""
+        if self.synchronisation.owns(entry):
+            return self.synchronisation.port(entry)
         return self.image.port(entry) if self.image.owns(entry) else super().port(entry)
 
 
@@ -90,12 +95,13 @@ class CoeNode:
             MailboxPlace(*behaviour.bootstrap_receive), MailboxPlace(*behaviour.bootstrap_send),
         )  # fmt: skip
         self._device = device
-        self._shortest_cycle = behaviour.shortest_cycle
         self._axes = NodeAxes(drives, first_axis, spare)
-        entries = drives.inside.objects.entries.without(behaviour.only_on_can)
-        self._objects = CoeObjects(device, entries, lambda index: None)
-        self._image = ImageObjects(device, entries, lambda: self.state is AlState.PRE_OP)
-        self._objects.image = self._image
+        of_eds = drives.inside.objects.entries
+        entries = entries_on_ethercat(device, of_eds)
+        self._objects = CoeObjects(device, of_eds.only(behaviour.has), lambda index: None)
+        self._image = ImageObjects(device, entries, self._is_pre_op)
+        self._synchronisation = Synchronisation(device, self._is_pre_op)
+        self._objects.image, self._objects.synchronisation = self._image, self._synchronisation
         self.dictionary = NodeDictionary(device, entries, self._objects, self._axes)
         self._image.connect(self.dictionary.port)
         self._emergencies = MailboxEmergencies(device.num_axes)
@@ -113,7 +119,6 @@ class CoeNode:
         self._sdo = CoeSdoServer(self._port, self._entries_of, self._image, behaviour.send.length)
         self._information = SdoInformation(describe(device), behaviour.send.length)
         self._sii = sii_content(device, serial)
-        self._has_sync0 = False
         self._waiting: bytes | None = None  # outputs that take effect with SYNC0
 
     # --- process data -------------------------------------------------------------------------------------------------
@@ -129,7 +134,8 @@ class CoeNode:
 
     def outputs(self, data: bytes, now: float) -> None:
         """Let outputs take effect at once or, with SYNC0, at its next pulse."""
-        if self._has_sync0:
+        self._synchronisation.outputs_came(now)
+        if self._synchronisation.has_sync0:
             self._waiting = data
         else:
             self._apply(data, now)
@@ -141,8 +147,10 @@ class CoeNode:
     def sync0(self, now: float) -> None:
         """Let the outputs that came since the last pulse take effect."""
         data, self._waiting = self._waiting, None
-        if data is not None and self.state is AlState.OP:
-            self._apply(data, now)
+        if self.state is AlState.OP:
+            self._synchronisation.pulse()
+            if data is not None:
+                self._apply(data, now)
 
     def _apply(self, data: bytes, now: float) -> None:
         if self._image.write_outputs(data):
@@ -155,7 +163,7 @@ class CoeNode:
         """Boot: stored values, the factory's image, no error to be told."""
         self.state = AlState.INIT
         self._waiting = None
-        self._has_sync0 = False
+        self._synchronisation.restart()
         self._axes.restart()
         self._objects.restore(NODE_ID, self._store.sections.get("communication", {}))
         self._image.restart()
@@ -165,11 +173,9 @@ class CoeNode:
     def request_state(
         self, old: AlState, new: AlState, sync_managers: Sequence[SyncManagerSetting], clock: ClockSetting, now: float
     ) -> AlStatusCode:
-        """Refuse a cycle of SYNC0 that the device cannot keep up with; 0, a single pulse, is none."""
+        """Refuse clocks that the device cannot be synchronised by."""
         if new is AlState.SAFE_OP and old is AlState.PRE_OP:
-            if clock.has_sync0 and clock.sync0_cycle < self._shortest_cycle:
-                return AlStatusCode.DC_CYCLE_TIME
-            self._has_sync0 = clock.has_sync0
+            return self._synchronisation.begin(clock)
         return AlStatusCode.NO_ERROR
 
     def state_changed(self, new: AlState, code: AlStatusCode, now: float) -> None:
@@ -178,6 +184,8 @@ class CoeNode:
         if old is AlState.OP and new is not AlState.OP:
             self._waiting = None
             self._stop_axes(now)
+        if new is AlState.PRE_OP:
+            self._synchronisation.leave()
         if new in (AlState.INIT, AlState.BOOTSTRAP):
             self._sdo.close()
             self._emergencies.clear()
@@ -218,6 +226,9 @@ class CoeNode:
     def pending_coe(self, now: float) -> list[bytes]:
         """Return and forget the emergencies that wait."""
         return self._emergencies.take()
+
+    def _is_pre_op(self) -> bool:
+        return self.state is AlState.PRE_OP
 
     def _entries_of(self, index: int) -> Sequence[Entry]:
         entries = self._by_index.get(index)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 
 from drive_env.devices import Device
+from drive_env.dictionary.entries import read_eds
 from drive_env.ethercat.object_descriptions import (
     ARRAY,
     MAPS_INPUT,
@@ -21,9 +22,11 @@ from drive_env.ethercat.sii_content import (
     bootstrap,
     configuration,
     entry_of,
+    has_ready_images,
     identity,
     image_size,
     mapped,
+    not_assigned,
     title,
 )
 from drive_env.node import mapping
@@ -43,7 +46,7 @@ def esi_text(device: Device) -> str:
     root = ET.Element("EtherCATInfo", Version="1.6")
     maker = ET.SubElement(root, "Vendor")
     _text(maker, "Id", _hex(vendor, 8))
-    _text(maker, "Name", device.title.split()[0])
+    _text(maker, "Name", str(read_eds(device.eds).device_information.vendor_name))
     descriptions = ET.SubElement(root, "Descriptions")
     group = ET.SubElement(ET.SubElement(descriptions, "Groups"), "Group")
     _text(group, "Type", GROUP)
@@ -75,9 +78,12 @@ def _device(parent: ET.Element, device: Device) -> None:
         places = {"DefaultSize": str(size), "StartAddress": _hex(start), "ControlByte": _hex(control, 2), "Enable": "1"}
         _text(one, "Sm", name, **places)
     for tag, direction, manager in (("RxPdo", OUTPUTS, 2), ("TxPdo", INPUTS, 3)):
-        _pdos(one, objects, tag, direction, manager)
+        _pdos(one, device, objects, tag, direction, manager)
     mailbox = ET.SubElement(one, "Mailbox")
-    ET.SubElement(mailbox, "CoE", SdoInfo="1", PdoAssign="1", PdoConfig="1", CompleteAccess="1", SegmentedSdo="1")
+    configures = "0" if has_ready_images(device) else "1"
+    ET.SubElement(
+        mailbox, "CoE", SdoInfo="1", PdoAssign="1", PdoConfig=configures, CompleteAccess="1", SegmentedSdo="1"
+    )
     ET.SubElement(mailbox, "FoE")
     clock = ET.SubElement(one, "Dc")
     for name, activation in MODES:
@@ -165,16 +171,31 @@ def _flags(parent: ET.Element, entry: EntryDescription) -> None:
         _text(flags, "PdoMapping", maps)
 
 
-def _pdos(parent: ET.Element, objects: dict[int, ObjectDescription], tag: str, direction: int, manager: int) -> None:
-    for index, raws in mapped(objects, direction):
-        pdo = ET.SubElement(parent, tag, Sm=str(manager))
+def _pdos(
+    parent: ET.Element, device: Device, objects: dict[int, ObjectDescription], tag: str, direction: int, manager: int
+) -> None:
+    """Write the images of a direction; of ready-made ones each excludes the others."""
+    assigned = mapped(objects, direction)
+    rows = [*assigned, *not_assigned(objects, direction)]
+    for index, raws in rows:
+        pdo = ET.SubElement(parent, tag)
+        if has_ready_images(device):
+            pdo.set("Fixed", "1")
+        if index in dict(assigned):
+            pdo.set("Sm", str(manager))
         _text(pdo, "Index", _hex(index))
         _text(pdo, "Name", objects[index].name)
+        for other, _ in rows:
+            if other != index:
+                _text(pdo, "Exclude", _hex(other))
         for raw in raws:
             mapped_index, sub, bits = mapping.parse(raw)
-            name, kind = entry_of(objects, (mapped_index, sub))
             entry = ET.SubElement(pdo, "Entry")
             _text(entry, "Index", _hex(mapped_index))
+            if not mapped_index:  # reserved
+                _text(entry, "BitLen", str(bits))
+                continue
+            name, kind = entry_of(objects, (mapped_index, sub))
             _text(entry, "SubIndex", str(sub))
             _text(entry, "BitLen", str(bits))
             _text(entry, "Name", name)

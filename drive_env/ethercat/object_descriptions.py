@@ -8,13 +8,14 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drive_env.devices import Device
 from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
+from drive_env.ethercat.ethercat_objects import ethercat_objects
 
 VARIABLE, ARRAY, RECORD = 7, 8, 9  # object codes
 PDO_MAPPING_TYPE, IDENTITY_TYPE = 0x0021, 0x0023  # records that the standard has
 UNSIGNED8 = datatypes.UNSIGNED8
 # Bits of an entry's access: read and write in Pre-Op, Safe-Op, Op; mappable to outputs and inputs; kept; a setting.
 READ, WRITE, WRITE_PRE_OP, MAPS_OUTPUT, MAPS_INPUT, BACKUP, SETTING = 0x07, 0x38, 0x08, 0x40, 0x80, 0x100, 0x200
-IMAGE = range(0x1C00, 0x1C20)
+IMAGE = range(0x1C00, 0x1C34)
 MAPPINGS = (range(0x1600, 0x1800), range(0x1A00, 0x1C00))
 # Names of the basic types as ETG.2000 writes them.
 TYPE_NAMES = {
@@ -61,12 +62,10 @@ class ObjectDescription:
 
 def describe(device: Device) -> dict[int, ObjectDescription]:
     """Return the objects that a device has on EtherCAT, by index, in ascending order."""
-    hidden = device.ethercat.only_on_can if device.ethercat is not None else ""
-    found = {}
-    for item in read_eds(device.eds).values():
-        if not (hidden and item.name.startswith(hidden)):
-            found[item.index] = _object(item)
-    return dict(sorted(found.items()))
+    behaviour = device.ethercat
+    assert behaviour is not None, "it is asked for devices with EtherCAT"
+    items = {item.index: item for item in read_eds(device.eds).values() if behaviour.has(item.index, item.name)}
+    return {index: _object(item) for index, item in sorted((items | ethercat_objects(device)).items())}
 
 
 def _object(item: ODVariable | ODArray | ODRecord) -> ObjectDescription:

@@ -6,16 +6,18 @@ import struct
 
 from drive_env.devices import Device
 from drive_env.devices.ethercat import EtherCatBehaviour
+from drive_env.devices.image_rows import fixed_images
 from drive_env.ethercat.object_descriptions import ObjectDescription, describe
 from drive_env.ethercat.sii_interface import CONFIGURATION, checksum
 from drive_env.node import mapping
-from drive_env.node.process_image import INPUTS, OUTPUTS
+from drive_env.node.process_image import ASSIGNMENTS, INPUTS, OUTPUTS
 
 STRINGS, GENERAL, FMMU, SYNC_MANAGERS, INPUT_PDO, OUTPUT_PDO, CLOCK = 10, 30, 40, 41, 50, 51, 60  # categories
 PDI_CONTROL, PDI_CONFIGURATION, SYNC_PULSE = 0x0C05, 0x0000, 0x0064  # SPI slave; pulses of 1 us
 COE, FOE = 0x04, 0x08  # mailbox protocols
-# CoE details: SDO, SDO information, PDO assignment and configuration, complete access.
-COE_DETAILS = 0x01 | 0x02 | 0x04 | 0x08 | 0x20
+# CoE details: SDO, SDO information, PDO assignment, complete access; PDO configuration.
+COE_DETAILS, HAS_CONFIGURATION = 0x01 | 0x02 | 0x04 | 0x20, 0x08
+NOT_ASSIGNED = 0xFF  # sync manager of a PDO that none carries at first
 CONTROLS = (0x26, 0x22, 0x64, 0x20)  # of sync managers 0 to 3
 KINDS = (1, 2, 3, 4)
 FMMU_KINDS = (1, 2, 3)  # outputs, inputs, state of the mailbox
@@ -39,13 +41,25 @@ def title(device: Device) -> str:
 
 def mapped(objects: dict[int, ObjectDescription], direction: int) -> list[tuple[int, list[int]]]:
     """Return the mapping objects that the factory assigns to a direction, and the factory's entries of each."""
+    return [(index, _numbers(objects, index)) for index in _numbers(objects, direction)]
 
-    def numbers(index: int) -> list[int]:
-        values = [entry.default for entry in objects[index].entries]
-        found = [value if isinstance(value, int) else 0 for value in values]
-        return found[1 : found[0] + 1]
 
-    return [(index, numbers(index)) for index in numbers(direction)]
+def not_assigned(objects: dict[int, ObjectDescription], direction: int) -> list[tuple[int, list[int]]]:
+    """Return the others that a master can choose in Pre-Op, as `mapped` does."""
+    assigned = _numbers(objects, direction)
+    others = [index for index in objects if index in ASSIGNMENTS[direction] and index not in assigned]
+    return [(index, _numbers(objects, index)) for index in others]
+
+
+def _numbers(objects: dict[int, ObjectDescription], index: int) -> list[int]:
+    values = [entry.default for entry in objects[index].entries]
+    found = [value if isinstance(value, int) else 0 for value in values]
+    return found[1 : found[0] + 1]
+
+
+def has_ready_images(device: Device) -> bool:
+    """Return whether a device's images are ready-made: their mapping cannot be changed."""
+    return bool(fixed_images(device.presets.parent))
 
 
 def image_size(objects: dict[int, ObjectDescription], direction: int) -> int:
@@ -120,8 +134,9 @@ def _general(device: Device, strings: _Strings) -> bytes:
     name = strings.number(title(device))
     order = strings.number(device.name.upper())
     group = strings.number("Drives")
+    details = COE_DETAILS | (0 if has_ready_images(device) else HAS_CONFIGURATION)
     # Group, image, order and name; reserved; CoE, FoE, EoE; SoE, DS402, SysMan; flags; current; group; ports.
-    content = struct.pack("<4B", group, 0, order, name) + bytes((0, COE_DETAILS, 1, 0, 0, device.num_axes, 0, 0))
+    content = struct.pack("<4B", group, 0, order, name) + bytes((0, details, 1, 0, 0, device.num_axes, 0, 0))
     content += struct.pack("<hBBH", 0, 0, 0, 0x0011)  # two ports, MII both
     return _category(GENERAL, content.ljust(32, b"\0"))
 
@@ -137,14 +152,19 @@ def _sync_managers(behaviour: EtherCatBehaviour, outputs: int, inputs: int) -> b
 
 def _pdos(objects: dict[int, ObjectDescription], direction: int, manager: int, strings: _Strings) -> bytes:
     content = b""
-    for index, raws in mapped(objects, direction):
+    rows = [(manager, *one) for one in mapped(objects, direction)]
+    for number, index, raws in [*rows, *((NOT_ASSIGNED, *one) for one in not_assigned(objects, direction))]:
         name = strings.number(objects[index].name)
-        content += struct.pack("<HBBBBH", index, len(raws), manager, 0, name, 0)
+        content += struct.pack("<HBBBBH", index, len(raws), number, 0, name, 0)
         for raw in raws:
             mapped_index, sub, bits = mapping.parse(raw)
-            entry = entry_of(objects, (mapped_index, sub))
-            content += struct.pack("<HBBBBH", mapped_index, sub, strings.number(entry[0]), entry[1], bits, 0)
+            name, kind = (0, 0) if not mapped_index else _named(entry_of(objects, (mapped_index, sub)), strings)
+            content += struct.pack("<HBBBBH", mapped_index, sub, name, kind, bits, 0)
     return content
+
+
+def _named(entry: tuple[str, int], strings: _Strings) -> tuple[int, int]:
+    return strings.number(entry[0]), entry[1]
 
 
 def entry_of(objects: dict[int, ObjectDescription], key: tuple[int, int]) -> tuple[str, int]:

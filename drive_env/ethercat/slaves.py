@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drive_env.bus.config import BusConfigError, build_drives, check_seed, store_folder
+from drive_env.devices import find_device
 from drive_env.ethercat.slave import EtherCatSlave
 from drive_env.ethercat.world import EtherCatWorld
 
@@ -27,7 +28,7 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
     from drive_env.ethercat.coe_node import CoeNode
 
     check_seed(bus)
-    world = EtherCatWorld(lockstep=lockstep)
+    world = EtherCatWorld(lockstep=lockstep, cycle_time=_cycle_time(bus))
     try:
         store = store_folder(bus)
         for k in range(len(bus.machines)):
@@ -47,3 +48,15 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
         world.close()
         raise BusConfigError(str(error)) from None
     return world
+
+
+def _cycle_time(bus: Bus) -> float:
+    """Return the communication cycle of all machines [s]; BusConfigError where it is not the same."""
+    try:
+        rates = {row.device: find_device(row.device).communication_rate for row in bus.machines}
+    except ValueError as error:
+        raise BusConfigError(str(error)) from None
+    if len(set(rates.values())) > 1:
+        told = ", ".join(f"{name} has {1e3 / rate:g} ms" for name, rate in rates.items())
+        raise BusConfigError(f"slaves of a segment have one communication cycle, and {told}; serve them apart")
+    return 1.0 / next(iter(rates.values()))

@@ -44,9 +44,10 @@ class EtherCatDrives(BusDrives):
         pace: "real-time": time passes by the clock, one frame per communication cycle. "lockstep": time passes by
             frames, for an emulator served so.
         safety: Limits; False for none at all, which is for emulators.
-        options: `master`, an `EtherCatMaster` in place of interface and channel; `cycle`, time between two frames in
-            real time [s], whole communication cycles of the drives; `timeout`, longest wait for an answer [s], and
-            `timeouts`, object -> the same.
+        options: `sync0`, whether outputs take effect with SYNC0 of the distributed clocks, once a cycle; `master`, an
+            `EtherCatMaster` in place of interface and channel; `cycle`, time between two frames in real time [s], whole
+            communication cycles of the drives; `timeout`, longest wait for an answer [s], and `timeouts`, object -> the
+            same.
 
     Raises:
         BusError: If the segment cannot be opened, a slave does not answer or is another device.
@@ -67,6 +68,7 @@ class EtherCatDrives(BusDrives):
     ) -> None:
         master: EtherCatMaster | None = options.pop("master", None)
         cycle: float | None = options.pop("cycle", None)
+        sync0 = bool(options.pop("sync0", False))
         timeout: float | None = options.pop("timeout", None)
         timeouts: Mapping[ObjectName, float] = options.pop("timeouts", None) or {}
         for option in options:
@@ -85,10 +87,12 @@ class EtherCatDrives(BusDrives):
             description.cycles_per_sync = cycles_per_sync(cycle, description.cycle, pace)
             description.cycle *= description.cycles_per_sync
         lockstep = pace == "lockstep"
-        paced: Pace = LockstepPace() if lockstep else RealTimePace(description.cycle)
         if master is None:
             master = open_master(interface, channel, description.answer_timeout if lockstep else None)
-        super().__init__(EtherCatLink(master, positions, description, lockstep), description, paced, safety)
+        link = EtherCatLink(master, positions, description, lockstep, sync0)
+        phase = None if link.process.phase is None else link.process.phase.wait
+        paced: Pace = LockstepPace() if lockstep else RealTimePace(description.cycle, phase)
+        super().__init__(link, description, paced, safety)
 
 
 def open_master(interface: str, channel: str | None, frame_timeout: float | None = None) -> EtherCatMaster:

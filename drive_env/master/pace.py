@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 from drive_env.drives.arguments import whole_cycles
 
 MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
+CATCH_UP = 0.02  # of a cycle, by which a SYNC is moved to suit the drives' clocks
 LONGEST_CYCLE = 0.1  # s: slower, nobody watches
 Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
 
@@ -55,13 +56,16 @@ class RealTimePace:
 
     Args:
         cycle: Communication cycle [s].
+        phase: Returns how much later than an instant [s, of perf_counter] a SYNC suits the drives' clocks [s]; None:
+            they have none to suit.
     """
 
     window = 64
     time_waits = False
 
-    def __init__(self, cycle: float) -> None:
+    def __init__(self, cycle: float, phase: Callable[[float], float] | None = None) -> None:
         self._cycle = cycle
+        self._phase = phase
         self._due = 0.0
         self.timing = self.total = Timing(0, 0, 0.0)
 
@@ -69,7 +73,7 @@ class RealTimePace:
         """Begin a cycle after the last SYNC; now, if that was more than half a cycle ago."""
         now = time.perf_counter()
         if now - self._due > 0.5 * self._cycle:
-            self._due = now
+            self._due = now if self._phase is None else now + self._phase(now)
         self.timing = Timing(0, 0, 0.0)
 
     def wait(self, receive: Receive) -> int:
@@ -82,6 +86,10 @@ class RealTimePace:
             Timing(one.cycles + 1, one.late + late, max(one.worst, lateness)) for one in (self.timing, self.total)
         )
         self._due = (now if late else self._due) + self._cycle
+        if self._phase is not None:  # this computer's clock is another one
+            ahead = self._phase(self._due)
+            off = ahead if ahead < 0.5 * self._cycle else ahead - self._cycle
+            self._due += min(max(off, -CATCH_UP * self._cycle), CATCH_UP * self._cycle)
         return int(lateness / self._cycle) if late else 0
 
     def end(self, receive: Receive) -> None:

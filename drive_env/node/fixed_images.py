@@ -1,59 +1,15 @@
-"""Process images that a device has ready-made, as packed structures: its `images.toml` says what each field is."""
+"""The fields of a process image that a device has ready-made (`devices/image_rows.py`), and the objects behind them."""
 
 from __future__ import annotations
 
 import struct
-import tomllib
 from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
-from typing import NamedTuple
 
+from drive_env.devices.image_rows import TYPES, ImageField
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node import mapping
 from drive_env.node.axis import ObjectPort
 from drive_env.node.process_data import order_of_writing
-
-Key = tuple[int, int]
-# Data types of fields: character of `struct` for the bits as they are, and how many.
-TYPES = {"u8": ("B", 8), "u16": ("H", 16), "i16": ("H", 16), "u32": ("I", 32), "i32": ("I", 32), "i64": ("Q", 64)}
-NAMES_ANOTHER = "@"
-
-
-class ImageField(NamedTuple):
-    """A field: its type, the object that it is, None of a reserved one; whether that names the one it carries."""
-
-    type: str
-    key: Key | None
-    is_name: bool
-
-
-class FixedImage(NamedTuple):
-    """An image: whether it goes into the drive, and its fields in the order of the bytes."""
-
-    is_output: bool
-    fields: tuple[ImageField, ...]
-
-
-@cache
-def fixed_images(folder: Path) -> dict[int, FixedImage]:
-    """Return the images of the device in a folder, by number; none where it has no such file."""
-    path = folder / "images.toml"
-    if not path.exists():
-        return {}
-    data = tomllib.loads(path.read_text(encoding="utf-8"))
-    return {
-        int(number, 16): FixedImage(row["direction"] == "outputs", tuple(_field(*one) for one in row["fields"]))
-        for number, row in data.items()
-    }
-
-
-def _field(kind: str, text: str) -> ImageField:
-    name = text.removeprefix(NAMES_ANOTHER)
-    if not name:
-        return ImageField(kind, None, False)
-    index, sub = name.split(":")
-    return ImageField(kind, (int(index, 16), int(sub)), name != text)
 
 
 class PackedFields:

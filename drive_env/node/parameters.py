@@ -65,8 +65,8 @@ class Parameters:
         changed: dict[str, Section] = {name: {} for name in names}
         for entry in self._dictionary.entries:
             name = self._dictionary.section(entry)
-            if name in changed:
-                key = (entry.index, entry.sub)
+            key = (entry.index, entry.sub)
+            if name in changed and key in factory:  # what EtherCAT alone has is the master's to set
                 raw = self._dictionary.port(*key).read()
                 assert isinstance(raw, int), "a parameter is a number"
                 if name == "bus" or raw != factory[key]:

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from drive_env.devices import Device
+from drive_env.devices.image_rows import fixed_images
 from drive_env.dictionary.aborts import (
     SUB_INDEX_ZERO_IN_USE,
     UNSUPPORTED_ACCESS,
@@ -28,7 +29,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.node import mapping
 from drive_env.node.axis import Axis, ObjectPort
-from drive_env.node.fixed_images import PackedFields, fixed_images
+from drive_env.node.fixed_images import PackedFields
 from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.process_data import MappedObjects
 
@@ -197,7 +198,7 @@ class ImageObjects:
         self._check_sub_index(entry)
         for index in [self._values[direction, sub] for sub in range(1, raw + 1)] if entry.sub == 0 else [raw]:
             if not self._can_carry(direction, index):
-                numbers = [one for one in (*self._mappings, *self._fixed) if self._can_carry(direction, one)]
+                numbers = [one for one in {**self._mappings, **self._fixed} if self._can_carry(direction, one)]
                 known = ", ".join(f"{one:04X}h" for one in numbers)
                 raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {index:04X}h; there is {known}")
 

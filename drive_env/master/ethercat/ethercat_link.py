@@ -11,7 +11,8 @@ from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.ethercat.ethercat_master import EtherCatMaster
+from drive_env.master.ethercat.clocks import FramePhase, check_clocks
+from drive_env.master.ethercat.ethercat_master import EtherCatMaster, Sync0
 from drive_env.master.ethercat.image_data import FRAME, EtherCatProcessData
 from drive_env.master.ethercat.process_watchdog import FACTORY, ProcessWatchdog
 from drive_env.master.ethercat.slave_objects import SlaveObjects
@@ -50,6 +51,7 @@ class EtherCatLink:
         nodes: Positions of the slaves.
         description: What device they are.
         lockstep: Time passes by frames with process data alone.
+        sync0: Outputs take effect with SYNC0 of the distributed clocks, once in each of the description's cycles.
 
     Raises:
         BusError: If there are no slaves, or fewer than named.
@@ -58,7 +60,14 @@ class EtherCatLink:
     is_dry = False
     wording = Wording("Op", "check cable and power, and whether another master uses the segment", "process data")
 
-    def __init__(self, master: EtherCatMaster, nodes: Sequence[int], description: Description, lockstep: bool) -> None:
+    def __init__(
+        self,
+        master: EtherCatMaster,
+        nodes: Sequence[int],
+        description: Description,
+        lockstep: bool,
+        sync0: bool = False,
+    ) -> None:
         self.nodes = tuple(nodes)
         self._master = master
         self._description = description
@@ -66,7 +75,7 @@ class EtherCatLink:
         self._alive: Callable[[], None] = lambda: None
         self._restarted: Callable[[int], None] = lambda node: None
         self._frame = description.answer_timeout if lockstep else FRAME
-        master.alive = self._while_waiting
+        master.clock = Sync0(description.cycle, lockstep) if sync0 else None
         try:
             count = master.begin()
             beyond = [position for position in self.nodes if position >= count]
@@ -75,10 +84,14 @@ class EtherCatLink:
                     f"there is no position {beyond[0]}: {count} slave{'s' if count > 1 else ''} answer; count from 0, "
                     "or look with `drive-env scan`"
                 )
+            if sync0:
+                check_clocks(master, range(count))
         except BaseException:
             master.close()
             raise
         self.process = EtherCatProcessData(master, self.nodes, description, lockstep)
+        master.alive = self._while_waiting
+        self.process.phase = FramePhase(description.cycle) if sync0 else None
         words = _controlwords(description)
         self._clients: list[ObjectClient] = [
             SlaveObjects(master, k, position, self.process, words, self.start, partial(self.wake, k), lockstep)

@@ -47,14 +47,25 @@ class ImageSizes(NamedTuple):
     inputs: int
 
 
+class Sync0(NamedTuple):
+    """Cycle of SYNC0 [s]; whether time passes by frames alone, so that its first pulse is that of the next cycle."""
+
+    cycle: float
+    is_lockstep: bool
+
+
 class EtherCatMaster(Protocol):
     """A master of a segment.
 
     Attributes:
         alive: Called again and again while an answer is waited for.
+        clock: What `map` sets the distributed clocks to; None: nothing.
+        system_time: The reference's time that the last exchange has brought [ns]; None: it has brought none.
     """
 
     alive: Callable[[], None]
+    clock: Sync0 | None
+    system_time: int | None
 
     def begin(self) -> int:
         """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends. Returns how many.

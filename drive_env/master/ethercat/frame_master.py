@@ -1,7 +1,7 @@
 """A master of its own, over whatever carries frames as bytes: states, mailbox and images by datagrams (ETG.1000.4).
 
-It is small: slaves in a line, one image of each direction, no distributed clocks. SOEM (`soem_master.py`) has more, and
-wants a network interface.
+It is small: slaves in a line, one image of each direction. SOEM (`soem_master.py`) has more, and wants a network
+interface.
 """
 
 from __future__ import annotations
@@ -17,7 +17,16 @@ from drive_env.ethercat.application import AlState
 from drive_env.ethercat.datagrams import Datagram, DatagramCommand, at_station
 from drive_env.ethercat.state_machine import ACKNOWLEDGE
 from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus
+from drive_env.master.ethercat.clocks import check_clocks, set_offsets, start_sync0
+from drive_env.master.ethercat.ethercat_master import (
+    ERROR,
+    READS,
+    STATE,
+    ImageSizes,
+    SlaveIdentity,
+    SlaveStatus,
+    Sync0,
+)
 from drive_env.master.ethercat.frame_ways import FrameWay
 from drive_env.master.ethercat.mailbox_client import MailboxClient
 from drive_env.master.ethercat.state_names import refusal
@@ -54,10 +63,14 @@ class FrameMaster:
 
     Attributes:
         alive: Called again and again while an answer is waited for.
+        clock: What `map` sets the distributed clocks to.
+        system_time: The reference's time that the last exchange has brought [ns].
     """
 
     def __init__(self, way: FrameWay, frame_timeout: float = FRAME) -> None:
         self.alive: Callable[[], None] = lambda: None
+        self.clock: Sync0 | None = None
+        self.system_time: int | None = None
         self._way = way
         self._timeout = frame_timeout
         self._number = 0
@@ -262,11 +275,20 @@ class FrameMaster:
                 f"the images of {len(sizes)} slaves have {total} bytes, and a frame {LONGEST_IMAGE}; open fewer"
             )
         address = LOGICAL
+        if self.clock is not None:
+            self._synchronise([k for k in sizes if self.status(k).state == AlState.PRE_OP], self.clock)
         for position, size in sizes.items():
             self._mapped[position] = (address, size)
             if self.status(position).state == AlState.PRE_OP:  # others have their places
                 self._place(position, address, size)
             address += size.outputs + size.inputs
+
+    def _synchronise(self, positions: Sequence[int], clock: Sync0) -> None:
+        """Set the clocks of all slaves, and start SYNC0 of some."""
+        check_clocks(self, range(len(self._places)))
+        self._surely(C.BWR, 0, registers.RECEIVE_TIMES, bytes(4), "the clocks")
+        set_offsets(self, len(self._places))
+        start_sync0(self, positions, clock.cycle, clock.is_lockstep)
 
     def _place(self, position: int, address: int, size: ImageSizes) -> None:
         """Give the images of one slave their places in its memory and in the logical one; take it to Safe-Op."""
@@ -311,10 +333,14 @@ class FrameMaster:
         )
         asked = [Datagram(C.LRW, LOGICAL, image)]
         asked += [at_station(C.FPRD, FIRST_STATION + k, registers.AL_STATUS, bytes(6)) for k in self._mapped]
+        if self.clock is not None:
+            asked.append(at_station(C.FRMW, FIRST_STATION, registers.SYSTEM_TIME, bytes(8)))
         found = self._transfer(asked, timeout)
         expected = sum(2 * bool(size.outputs) + bool(size.inputs) for _, size in self._mapped.values())
         if found is None or found[0].counter != expected:
             return [None] * len(self._mapped)
+        if self.clock is not None:
+            self.system_time = int.from_bytes(found.pop().data, "little")
         parts: list[bytes | None] = []
         for (address, size), answer in zip(self._mapped.values(), found[1:], strict=True):
             start = address - LOGICAL + size.outputs
@@ -350,6 +376,8 @@ class FrameMaster:
             self._one(
                 C.FPWR, FIRST_STATION + position, registers.AL_CONTROL, struct.pack("<H", AlState.INIT | ACKNOWLEDGE)
             )
+            if self.clock is not None:
+                self._one(C.FPWR, FIRST_STATION + position, registers.SYNC_ACTIVATION, bytes(1))
         self._way.close()
 
     def _mailbox(self, position: int, places: SlavePlaces) -> MailboxClient:

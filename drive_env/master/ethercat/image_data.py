@@ -19,6 +19,7 @@ from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, WRONG_STATE, ObjectAcc
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import NoAnswerError
+from drive_env.master.ethercat.clocks import FramePhase
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster, ImageSizes
 from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImageLayout, ImagePlanner
 from drive_env.master.ethercat.slave_images import SlaveImages
@@ -105,6 +106,7 @@ class EtherCatProcessData:
         exchanged_at: When images last came back [s].
         owed: Rows of a run of cycles that are not back.
         is_silent: Nothing may go out any more, so that the drives stop by themselves.
+        phase: Learns the reference's time with each exchange; None without distributed clocks.
     """
 
     def __init__(self, master: EtherCatMaster, nodes: Sequence[int], description: Description, lockstep: bool) -> None:
@@ -115,6 +117,7 @@ class EtherCatProcessData:
         self.exchanged_at = 0.0
         self.owed = 0
         self.is_silent = False
+        self.phase: FramePhase | None = None
         self.num_axes = len(nodes) * description.num_axes
         self._master = master
         self._nodes = tuple(nodes)
@@ -262,6 +265,8 @@ class EtherCatProcessData:
             if self.is_silent or len(self._ready) < len(self._nodes):
                 return False
             found = self._master.exchange([bytes(image) for image in self.images], timeout)
+            if self.phase is not None and self._master.system_time is not None:
+                self.phase.take(self._master.system_time)
             row = [image for image in found if image is not None]
             if len(row) < len(self._nodes):
                 return False
@@ -295,7 +300,7 @@ class EtherCatProcessData:
         return set(entries) <= set(self._layouts[direction].entries)
 
     def _check(self, entries: Sequence[Entry], direction: int, wrong_way: str, verb: str) -> None:
-        ready_made = self._layout(direction).entries
+        ready_made = {*self._layout(direction).entries, *self._planner.carried(direction)}
         for entry in entries:
             can = entry.pdo_mappable and entry.access not in (wrong_way, "const")
             if not can and entry not in ready_made:

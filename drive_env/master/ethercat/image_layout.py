@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from drive_env import cia402
+from drive_env.devices.image_rows import TYPES, fixed_images
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Description, Key
@@ -38,8 +39,12 @@ class ImageLayout(NamedTuple):
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Return the entries that each axis has in it."""
-        return tuple(dict.fromkeys(member.entry for member in self.members))
+        """Return the entries that every axis has in it."""
+        axes = {member.axis for member in self.members}
+        of_axes: dict[Entry, set[int]] = {}
+        for member in self.members:
+            of_axes.setdefault(member.entry, set()).add(member.axis)
+        return tuple(entry for entry, found in of_axes.items() if found == axes)
 
     def places(self, description: Description) -> dict[Key, tuple[int, int]]:
         """Return first byte and length of each object of the node."""
@@ -50,7 +55,7 @@ class ImagePlanner:
     """Finds images of a device that carry what is wanted.
 
     Args:
-        description: The device.
+        description: The device. Images that it has ready-made are those of its data.
     """
 
     def __init__(self, description: Description) -> None:
@@ -60,9 +65,24 @@ class ImagePlanner:
         self._by_key = {(entry.index, entry.sub): (entry, 0) for entry in known} | {
             key: (entry, axis) for key, (entry, axis) in description.of_further_axes().items()
         }
+        images = {} if description.device is None else fixed_images(description.device.presets.parent)
+        self._ready_made: dict[int, list[ImageLayout]] = {OUTPUTS: [], INPUTS: []}
+        for pdo, image in images.items():
+            fields = [(None if one.is_name else one.key, TYPES[one.type][1]) for one in image.fields]
+            self._ready_made[OUTPUTS if image.is_output else INPUTS].append(self._of_fields(pdo, fields))
 
     def parsed(self, direction: int, pdo: int, mapped: Sequence[int]) -> ImageLayout | None:
-        """Return the image that a mapping object of a slave makes; None where it is not the same for every axis."""
+        """Return the image that a mapping object of a slave makes; None where it is not the same for every axis.
+
+        One that cannot be written is ready-made, and taken as it is.
+        """
+        for layout in self._ready_made[direction]:
+            if layout.pdo == pdo:
+                return layout
+        known = self._description.dictionary
+        if known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const"):
+            keys = [((raw >> 16, raw >> 8 & 0xFF) if raw >> 16 else None, raw & 0xFF) for raw in mapped]
+            return self._of_fields(pdo, keys)
         entries = []
         for raw in mapped:
             found = self._by_key.get((raw >> 16, raw >> 8 & 0xFF))
@@ -81,7 +101,7 @@ class ImagePlanner:
         if set(wanted) <= set(current.entries):
             return current
         if current.mapped is None:
-            raise ObjectAccessError(CANNOT_BE_MAPPED, f"{wanted[0].label} is in no image of this drive")
+            return self._find_ready_made(direction, wanted, current)
         room = self._room(current.pdo)
         layout = self.free(current.pdo, wanted)
         if len(layout.mapped or ()) > room:
@@ -111,7 +131,38 @@ class ImagePlanner:
                 members.append(Member(entry, axis, places[key], bits // 8))
         return ImageLayout(pdo, tuple(members), start, tuple(mapped))
 
+    def carried(self, direction: int) -> set[Entry]:
+        """Return the entries that are in ready-made images."""
+        return {entry for layout in self._ready_made[direction] for entry in layout.entries}
+
     # --- inside -----------------------------------------------------------------------------------------------------
+    def _find_ready_made(self, direction: int, wanted: Sequence[Entry], current: ImageLayout) -> ImageLayout:
+        """Return the first ready-made image that has what is wanted; ObjectAccessError 06040041h if none has."""
+        others = self._ready_made[direction]
+        for layout in others:
+            if set(wanted) <= set(layout.entries):
+                return layout
+        known = {entry for layout in (current, *others) for entry in layout.entries}
+        missing = next((entry for entry in wanted if entry not in known), None)
+        if missing is None:
+            names = " and ".join(entry.label for entry in wanted)
+            raise ObjectAccessError(CANNOT_BE_MAPPED, f"no ready-made image of this drive has {names} together")
+        raise ObjectAccessError(CANNOT_BE_MAPPED, f"{missing.label} is in no image of this drive, for every axis")
+
+    def _of_fields(self, pdo: int, fields: Iterable[tuple[Key | None, int]]) -> ImageLayout:
+        """Return the ready-made image of fields: each an object, None for what is reserved, and its bits."""
+        known = self._description
+        members, bit = [], 0
+        for key, bits in fields:
+            found = None if key is None else self._by_key.get(key)
+            if found is not None and bit % 8 == 0:
+                entry, axis = found
+                shared = all(known.key(entry, other) == key for other in range(known.num_axes))
+                size = min(bits, entry.bits or 0) // 8
+                members += [Member(entry, k, bit // 8, size) for k in (range(known.num_axes) if shared else (axis,))]
+            bit += bits
+        return ImageLayout(pdo, tuple(members), (bit + 7) // 8, None)
+
     def _room(self, pdo: int) -> int:
         """Return how many entries a mapping object takes."""
         known = self._description.dictionary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import threading
 import time
@@ -12,7 +13,16 @@ from typing import Any
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState
 from drive_env.master.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus
+from drive_env.master.ethercat.clocks import check_clocks, start_sync0
+from drive_env.master.ethercat.ethercat_master import (
+    ERROR,
+    READS,
+    STATE,
+    ImageSizes,
+    SlaveIdentity,
+    SlaveStatus,
+    Sync0,
+)
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 from drive_env.master.ethercat.state_names import refusal
 from drive_env.master.link import ReceivedEmergency
@@ -40,6 +50,8 @@ class SoemMaster:
 
     Attributes:
         alive: Called while an answer is waited for; here before each transfer, which SOEM does in one call.
+        clock: What `map` sets the distributed clocks to; delays and offsets are SOEM's to measure.
+        system_time: The reference's time that the last exchange has brought [ns].
     """
 
     def __init__(self, interface: str) -> None:
@@ -51,6 +63,8 @@ class SoemMaster:
                 "without"
             ) from None
         self.alive: Callable[[], None] = lambda: None
+        self.clock: Sync0 | None = None
+        self.system_time: int | None = None
         self._soem = pysoem
         self._interface = interface
         pysoem.settings.timeouts.ret, pysoem.settings.timeouts.tx_mailbox = FRAME_TIMEOUT, ROOM_TIMEOUT
@@ -156,6 +170,11 @@ class SoemMaster:
     def map(self, sizes: Mapping[int, ImageSizes]) -> None:
         """Give the images of all slaves their places, and take them from Pre-Op to Safe-Op."""
         with self._turn:
+            if self.clock is not None:
+                check_clocks(self, range(len(self._turns)))
+                self._master.config_dc()
+                waiting = [k for k in sizes if self.status(k).state == AlState.PRE_OP]
+                start_sync0(self, waiting, self.clock.cycle, self.clock.is_lockstep)
             try:
                 self._master.config_map()
             except self._soem.ConfigMapError as error:
@@ -205,6 +224,8 @@ class SoemMaster:
             counter = self._master.receive_processdata(round(timeout * MICROSECONDS), release_gil=True)
             if counter != self._master.expected_wkc:
                 return [None] * len(self._mapped)
+            if self.clock is not None:
+                self.system_time = int(self._master.dc_time)
             now = time.monotonic()
             if now - self._looked > STATE_LOOK or not self._states:
                 # A slave that has left Op still answers process data; only its state tells.
@@ -282,4 +303,7 @@ class SoemMaster:
             if self._turns:
                 self._master.state = int(AlState.INIT)
                 self._master.write_state()
+            for position in range(len(self._turns) if self.clock is not None else 0):
+                with contextlib.suppress(NoAnswerError):
+                    self.write_register(position, registers.SYNC_ACTIVATION, bytes(1))
             self._master.close()

@@ -14,8 +14,8 @@ MEANINGS = {
     AlStatusCode.SM_WATCHDOG: "no process data came within its watchdog",
     AlStatusCode.OUTPUT_CONFIGURATION: "its outputs are not mapped as long as the master says",
     AlStatusCode.INPUT_CONFIGURATION: "its inputs are not mapped as long as the master says",
-    AlStatusCode.NO_FREE_RUN: "it wants distributed clocks",
-    AlStatusCode.NO_SYNC: "it has no SYNC0",
+    AlStatusCode.NO_FREE_RUN: "it wants distributed clocks: open it with sync0=True",
+    AlStatusCode.NO_SYNC: "it has no SYNC0: open it with sync0=True",
     AlStatusCode.DC_CYCLE_TIME: "SYNC0 comes too often for it",
 }
 

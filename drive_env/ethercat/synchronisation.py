@@ -1,0 +1,135 @@
+"""How a slave is synchronised: 1C32h of its outputs, 1C33h of its inputs (ETG.1020, 22).
+
+SYNC0 of the distributed clocks decides: switched on before Safe-Op, outputs take effect at its pulses, and both objects
+show type 2 and its cycle. Without it outputs take effect as they come.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from drive_env.devices import Device
+from drive_env.dictionary.aborts import VALUE_RANGE, VALUE_TOO_LOW, WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.access import check_limits
+from drive_env.dictionary.entries import Entry
+from drive_env.ethercat.application import AlStatusCode, ClockSetting
+from drive_env.ethercat.ethercat_objects import (
+    CYCLE_TIME,
+    INPUTS_WITH_OUTPUTS,
+    MISSED,
+    NANOSECOND,
+    SYNC_ERROR,
+    TOO_SHORT,
+    TYPE,
+    WITH_OUTPUTS,
+    WITH_SYNC0,
+    ethercat_objects,
+)
+from drive_env.node.axis import ObjectPort
+from drive_env.node.process_image import SYNCHRONISATION
+
+MOST = 0xFFFF  # of a counter
+# What each object can be set to.
+TYPES = {SYNCHRONISATION[0]: (WITH_OUTPUTS, WITH_SYNC0), SYNCHRONISATION[1]: (INPUTS_WITH_OUTPUTS, WITH_SYNC0)}
+
+
+class Synchronisation:
+    """The objects, and what happens by them.
+
+    Args:
+        device: Whose they are.
+        may_change: Tells whether they may be written now: in Pre-Op.
+
+    Attributes:
+        has_sync0: Outputs take effect with SYNC0.
+    """
+
+    def __init__(self, device: Device, may_change: Callable[[], bool]) -> None:
+        assert device.ethercat is not None, "a device without EtherCAT is not synchronised"
+        self._may_change = may_change
+        self._shortest = device.ethercat.shortest_cycle
+        own = ethercat_objects(device)
+        self._factory = {(index, sub): int(one.default) for index in SYNCHRONISATION for sub, one in own[index].items()}
+        self.restart()
+
+    def restart(self) -> None:
+        """Be as after power-on."""
+        self._values = dict(self._factory)
+        self._shown: dict[tuple[int, int], int] = {}  # in place of what the master has set, while SYNC0 decides
+        self.has_sync0 = False
+        self._came: float | None = None  # when outputs came last [s]
+        self._is_new = False
+
+    def owns(self, entry: Entry) -> bool:
+        """Return whether an object is one of these."""
+        return (entry.index, entry.sub) in self._values
+
+    def port(self, entry: Entry) -> ObjectPort:
+        """Return the way to one of them."""
+        key = (entry.index, entry.sub)
+
+        def read() -> int:
+            return self._shown[key] if key in self._shown else self._values[key]
+
+        def write(raw: int) -> None:
+            self._values[key] = raw
+
+        return ObjectPort(entry, read, partial(self._check, entry), write)
+
+    def begin(self, clock: ClockSetting) -> AlStatusCode:
+        """Take the clocks as they are set before Safe-Op; return why that cannot be, or NO_ERROR.
+
+        A cycle of SYNC0 that the device cannot keep up with is refused; 0, a single pulse, is none.
+        """
+        if clock.has_sync0 and clock.sync0_cycle < self._shortest:
+            return AlStatusCode.DC_CYCLE_TIME
+        if not clock.has_sync0 and WITH_SYNC0 in (self._values[index, TYPE] for index in SYNCHRONISATION):
+            return AlStatusCode.DC_SYNC_CONFIGURATION
+        self.has_sync0 = clock.has_sync0
+        self._shown = {}
+        if clock.has_sync0:
+            cycle = round(clock.sync0_cycle / NANOSECOND)
+            self._shown = {(index, TYPE): WITH_SYNC0 for index in SYNCHRONISATION}
+            self._shown |= {(index, CYCLE_TIME): cycle for index in SYNCHRONISATION}
+        for index in SYNCHRONISATION:
+            for sub in (MISSED, TOO_SHORT, SYNC_ERROR):
+                self._values[index, sub] = 0
+        self._came, self._is_new = None, False
+        return AlStatusCode.NO_ERROR
+
+    def leave(self) -> None:
+        """Be in Pre-Op again: what the master has set counts."""
+        self._shown = {}
+
+    def outputs_came(self, now: float) -> None:
+        """Count outputs that come sooner after the last ones than the device's shortest cycle."""
+        if self._came is not None and not self.has_sync0 and now - self._came < self._shortest - NANOSECOND:
+            self._count(TOO_SHORT)
+        self._came, self._is_new = now, True
+
+    def pulse(self) -> None:
+        """Count a pulse of SYNC0 in Op without new outputs since the one before."""
+        missed = self._came is not None and not self._is_new  # the first outputs have begun it
+        if missed:
+            self._count(MISSED)
+        self._is_new = False
+        for index in SYNCHRONISATION:
+            self._values[index, SYNC_ERROR] = int(missed)
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _count(self, sub: int) -> None:
+        for index in SYNCHRONISATION:
+            self._values[index, sub] = min(self._values[index, sub] + 1, MOST)
+
+    def _check(self, entry: Entry, raw: int) -> None:
+        check_limits(entry, raw)
+        if not self._may_change():
+            raise ObjectAccessError(WRONG_STATE, f"{entry.label} can only be written in pre-operational")
+        if entry.sub == TYPE and raw not in TYPES[entry.index]:
+            known = " and ".join(map(str, TYPES[entry.index]))
+            raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw}; this slave knows {known}")
+        if entry.sub == CYCLE_TIME and raw * NANOSECOND < self._shortest - 0.5 * NANOSECOND:
+            raise ObjectAccessError(
+                VALUE_TOO_LOW, f"{entry.label} = {raw} ns is below {self._shortest / NANOSECOND:.0f} ns"
+            )
