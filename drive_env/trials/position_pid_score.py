@@ -21,7 +21,7 @@ from drive_env.phase_current import swing_period
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW
 from drive_env.trials.position_pid import PID_P, pid_terms, pid_time, steps_of
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
-from drive_env.trials.score import RobustScore, Terms
+from drive_env.trials.score import CurrentSwings, RobustScore, Terms
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -49,8 +49,8 @@ class PidScore(RobustScore):
         alone = self._loop.kind == PID_ALONE
         return np.full(np.shape(filters), pid_time(self._loop) if alone else swing_period(self._drives.motor))
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s], no swing, (machines, runs, axes) each."""
+    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
+        """Return the terms of every axis without E_d/E_0, E_d [rad s], no swings, (machines, runs, axes) each."""
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -82,8 +82,9 @@ class PidScore(RobustScore):
         error = np.abs(wrapped(target - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
         least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
+        nothing = np.full(self._axes, np.nan)
         return (
             terms.each(lambda value: value.reshape(self._axes)),
             np.maximum(error, least).reshape(self._axes),
-            np.full(self._axes, np.nan),
+            CurrentSwings(nothing, nothing),
         )
