@@ -113,6 +113,22 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
 
 
 @pytest.mark.slow
+def test_it_tunes_both_axes_of_an_amplifier_on_mains():
+    """The TGZ, whose registers, units and machines it has never seen; each axis turns a load of its own."""
+    with emulated("tgz_d", "inertia", num_machines=2) as target:
+        tuned = tune_target(target, load_policy(shipped("gain_tuning")), trials=3)
+        assert all(trial.gains.shape == (2, 5) for trial in tuned.trials)
+        for axis in range(2):
+            answer = tuned.trials[tuned.answers[axis]]
+            assert not answer.aborted[axis]
+            assert answer.measured[axis] < tuned.trials[0].measured[axis]
+            assert answer.gains[axis].tolist() == tuned.gains[axis].tolist()
+        written = np.stack([target.drives.read(name) for name in target.device.gains.keys], axis=-1)
+        np.testing.assert_array_equal(written, tuned.gains)
+        assert not is_enabled(target).any()
+
+
+@pytest.mark.slow
 def test_json_for_programs(tmp_path):
     code, out, _ = command("--trials", 1, "--load", "inertia", "--json", "--out", tmp_path / "run")
     found = json.loads(out)

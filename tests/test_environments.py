@@ -375,6 +375,29 @@ def test_stable_baselines_view_follows_the_schedule(kind):
             assert lanes.stage == pytest.approx(2 * k / 30)
 
 
+# --- another kind of drive --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("kind", "load"),
+    [
+        ("Tracking", "gantry"),
+        ("GainScheduling", "inertia"),
+        pytest.param("GainTuning", "inertia", marks=pytest.mark.slow),  # takes some seconds
+        pytest.param("GainTuning", "gantry", marks=pytest.mark.slow),
+    ],
+)
+def test_an_amplifier_on_mains_is_a_drive_like_any_other(kind, load):
+    """The TGZ: torques in parts of a peak current, speeds by 6094h, a D-Mode of its own; random machines."""
+    with lanes_of(kind, 2, device="tgz_d", load=load) as lanes:
+        steps = steps_of(lanes)
+        observations, rewards, ends, cuts, _ = run(lanes, actions(lanes, steps))
+        assert all(lanes.observation_space.contains(one) for one in observations)
+        assert np.isfinite(rewards).all()
+        assert not ends.any() and cuts[-1].all()
+        assert (np.ptp(observations, axis=0) > 0.0).any(axis=-1).all(), "both machines move"
+        again = run(lanes, actions(lanes, steps))[0]
+        np.testing.assert_array_equal(observations, again)
+
+
 # --- a wrong configuration --------------------------------------------------------------------------------------------
 @EVERY_KIND
 @pytest.mark.parametrize(("options", "says"), [

@@ -240,6 +240,7 @@ STANDARD = [
 NUMBERS, WAYS, ENDS, LAST_WAYS = (np.array(column) for column in zip(*STANDARD, strict=True))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("with_index", [False, True])
 @pytest.mark.parametrize("where", [-0.15, -0.0605, -0.04, -0.0195, 0.1])
 def test_each_method_of_the_standard_ends_at_its_edge_or_at_the_index_beyond_it(belt, where, with_index):

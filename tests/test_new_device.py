@@ -244,6 +244,7 @@ def test_modes_and_homing_are_what_both_have(folders, name, modes, methods):
 
 
 # By the index to the right of the left edge, where a turn of the motor begins; to the edges, where they become active.
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("method", "home"), [(4, -0.04), (24, -0.06), (28, -0.02)])
 def test_methods_of_the_standard_home_it_at_real_switches(folders, method, home):
     """A carriage on a belt, by a drive whose EDS lists no methods: the home switch is from -0.06 to -0.02 m."""

@@ -449,6 +449,21 @@ def test_a_motor_that_runs_away_from_its_current_has_a_wrong_commutation(drives)
     assert field(drives, "stage_on")[0] == 0.0
 
 
+@pytest.mark.parametrize("load", ["inertia", "two_mass"])
+def test_a_motor_that_oscillates_has_no_wrong_commutation(load):
+    """With gains that no loop stands, at all of its current: speed is against the current for a part of each period."""
+    with new_drives(load=load) as drives:
+        drives.write(cia402.FOLLOWING_WINDOW, 0)
+        drives.write(0x23D2, 300)  # velocity P
+        drives.write(0x23D4, 12_000)  # position P
+        motion.enable(drives, mode="csp")
+        targets = np.where(np.arange(600) // 30 % 2 == 0, 0, TURN // 16)
+        trace = drives.record([cia402.VELOCITY_ACTUAL], 0.6, play={cia402.TARGET_POSITION: targets})
+        speed = trace[cia402.VELOCITY_ACTUAL][:, 0]
+        assert np.count_nonzero(np.diff(np.sign(speed[200:]))) > 10
+        assert all(one.code != 0x7122 for one in drives.emergencies())
+
+
 def test_a_cyclic_set_point_that_no_motor_could_follow_is_no_trajectory(drives):
     motion.enable(drives, mode="csp")
     drives.write(cia402.FOLLOWING_WINDOW, 0)

@@ -108,6 +108,7 @@ def test_a_method_ends_where_the_manual_says_from_everywhere(belt, method, edge,
     assert_homed(belt, method, edge, way)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("method", "way"), [(1, -1), (2, 1), (17, -1), (18, 1), (19, 1), (21, -1)])
 def test_the_initial_movement_is_the_methods(belt, method, way):
     bring(belt, 0.1)
@@ -115,6 +116,7 @@ def test_the_initial_movement_is_the_methods(belt, method, way):
     assert (way * (carriage(belt) - 0.1) > 0.02).all()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("method", [3, 5, 19, 21])
 def test_at_a_home_switch_the_initial_movement_depends_on_its_state(belt, method):
     """On the switch the axis leaves it by the edge; beside it the axis goes to it."""

@@ -77,7 +77,7 @@ WEIGHTS = {"tracking": 1.0, "smoothness": 0.3, "trip": 20.0}
 class GainSchedulingConfig:
     """Configuration of GainScheduling.
 
-    load, device, motor, friction: As `EmulatedDrives` takes them.
+    load, device, motor, friction: As `EmulatedDrives` takes them; without a motor the device's usual one.
     mode: "csp" (position) or "csv" (velocity).
     excitation: The programme: "moves" from point to point, or "sine".
     step: Time between two sets of gains [s], 5 to 20 ms, whole milliseconds.
@@ -99,7 +99,7 @@ class GainSchedulingConfig:
 
     load: Any = "belt"
     device: str = "tmcm1636"
-    motor: str | Motor = "qbl4208"
+    motor: str | Motor | None = None
     friction: str = "stribeck"
     mode: str = "csp"
     excitation: str = "moves"
@@ -118,6 +118,8 @@ class GainSchedulingConfig:
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
+        if self.motor is None:
+            object.__setattr__(self, "motor", find_device(self.device).default_motor)
         check_choice("mode", self.mode, MODES)
         check_choice("excitation", self.excitation, EXCITATIONS)
         check_choice("base", self.base, BASES)
@@ -143,6 +145,12 @@ class GainSchedulingConfig:
             raise ValueError(f"duration must be at least one step of {self.step:g} s, not {self.duration:g} s")
         if not 0.0 <= self.stage <= 1.0:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
+
+    @property
+    def motor_row(self) -> Motor:
+        """The motor, by name or as it was given."""
+        assert self.motor is not None
+        return find_motor(self.motor)
 
     @property
     def chosen(self) -> tuple[str, ...]:
@@ -328,7 +336,7 @@ class GainScheduling(VectorEnvironment):
 
     def _prepare_scales(self, load: Load) -> None:
         """Set what the programme may ask for: half of what motor and travel give, with the heaviest payload."""
-        motor, alone = find_motor(self.config.motor), one(load)
+        motor, alone = self.config.motor_row, one(load)
         shaft, turning = shaft_load(alone), way(alone)
         self._nominal_inertia = motor.inertia + shaft.inertia[0]
         heaviest = motor.inertia + self._payload.high * shaft.inertia[0]
@@ -371,7 +379,7 @@ class GainScheduling(VectorEnvironment):
         if drives.machine is None or self.config.base == "present":
             self.base_gains = read_gains(drives)
         else:
-            motor = find_motor(self.config.motor)
+            motor = self.config.motor_row
             self.base_gains = np.tile(rule_gains(device_of(drives), motor, self._nominal_inertia), (self.num_envs, 1))
         known = device_of(drives).gains
         columns = known.columns(self.config.chosen)

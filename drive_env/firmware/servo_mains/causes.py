@@ -49,12 +49,15 @@ def watch_motion(drive, lane, dt):
     asked = drive.i_q_ref[lane]
     most = REVERSE_SHARE * drive.i_max[lane] * drive.current_share[lane]
     omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
+    # It gains speed against the current. One that oscillates has it against the current, too, and loses it then.
+    gained = omega - drive.omega_before[lane]
+    drive.omega_before[lane] = omega
     runs_away = (
         drive.stage_on[lane] > 0.0
         and drive.torque_share[lane] > 0.0  # in open loop the current is not asked to turn anything
         and abs(asked) > most
         and asked * omega < 0.0
-        and abs(omega) > abs(slow)
+        and asked * gained < 0.0
         and abs(omega) > drive.standstill[lane]
     )
     drive.reverse_time[lane] = drive.reverse_time[lane] + dt if runs_away else 0.0

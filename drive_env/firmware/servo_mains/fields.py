@@ -62,6 +62,7 @@ STATE = (
     Field("disconnected", "i4", "", "1: the D-Mode does not fit, the master is ignored"),
     Field("following_time", "f8", "s", "for which the following error has been outside of its window"),
     Field("reverse_time", "f8", "s", "for which the motor has run away against its current"),
+    Field("omega_before", "f8", "rad/s", "omega_meas a period ago"),
     Field("off_time", "f8", "s", "for which the stage has been off"),
     Field("stuck_time", "f8", "s", "for which the brake has held the motor although it was to move"),
     Field("digital_inputs", "i4", "", "4000h: levels of the module's inputs, bits 0 to 7"),

@@ -89,6 +89,7 @@ def connect(drive, lane):
     drive.reverse_time[lane] = 0.0
     drive.stuck_time[lane] = 0.0
     drive.off_time[lane] = 0.0
+    drive.omega_before[lane] = 0.0
     drive.torque_feed_forward[lane] = 0.0
 
 
