@@ -180,6 +180,7 @@ DISABLE_VOLTAGE, QUICK_STOP, SHUTDOWN, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02,
 ENABLING = (SHUTDOWN, SWITCH_ON, ENABLE_OPERATION)  # one after the other, from switch on disabled
 FAULT_RESET = 0x80  # acts as it rises
 NEW_SET_POINT, CHANGE_AT_ONCE, RELATIVE = 0x10, 0x20, 0x40  # in pp
+CHANGE_ON_SET_POINT = 0x200  # in pp, of drives with a set-point buffer
 HALT = 0x100
 COMMANDS = {
     "shutdown": Pattern(0x87, 0x06),

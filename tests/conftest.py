@@ -1,11 +1,11 @@
 import functools
-import os
 import signal
 from collections import Counter
 
 import numpy as np
 import pytest
 import typer.testing
+from thinning import STRIDE
 
 from drive_env import EmulatedDrives, motion
 from drive_env.master.description import Description
@@ -25,9 +25,8 @@ if hasattr(signal, "SIGHUP"):
 def pytest_collection_modifyitems(config, items):
     """Of the rows of a test that is marked `every(n)` and are not slow each n-th is in each run; the others are slow.
 
-    SLOW_STRIDE=n takes of each test's slow rows the first of n alone.
+    SLOW_STRIDE=n takes of each test's slow rows the first of n alone (and see thinning.py).
     """
-    stride = int(os.environ.get("SLOW_STRIDE", "1"))
     rows, slow, left_out = Counter(), Counter(), []
     for item in items:
         test = item.nodeid.partition("[")[0]
@@ -37,7 +36,7 @@ def pytest_collection_modifyitems(config, items):
                 item.add_marker(pytest.mark.slow)
             rows[test] += 1
         if item.get_closest_marker("slow") is not None:
-            if slow[test] % stride:
+            if slow[test] % STRIDE:
                 left_out.append(item)
             slow[test] += 1
     if left_out:

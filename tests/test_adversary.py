@@ -33,12 +33,13 @@ from adversary import (
     runs,
 )
 from fault_injection import eds_read_once
+from thinning import part
 
 from drive_env import Limits
 from drive_env.cia402 import State
 from drive_env.cores import usable_cores
 
-SAMPLE, MANY = 40, 300
+SAMPLE, MANY = 20, part(300, 40)
 PATIENCE = 60.0  # s
 ON, OFF = 4, 1  # of the automaton
 

@@ -52,6 +52,7 @@ def test_train_judge_resume_export(tmp_path, shrunk):
     assert (tmp_path / "agent.npz").is_file()
 
 
+@pytest.mark.slow
 def test_a_search_finds_and_goes_on(tmp_path, shrunk):
     out = tmp_path / "study"
     for trials, best in ((2, "trial 1: "), (1, "trial 2: ")):

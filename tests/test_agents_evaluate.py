@@ -500,6 +500,7 @@ def test_what_the_policy_breaks_is_told_in_one_line():
     assert "the policy failed: KeyError: 'speed'" in found.output and "test_agents_evaluate.py, line" in found.output
 
 
+@pytest.mark.slow
 def test_the_gap_as_a_command(tmp_path):
     path = agent(tmp_path / "agent.npz")
     found = run("evaluate", path, "--gap", 2, "--lockstep", "--stall", 30, "--out", tmp_path / "out")

@@ -124,6 +124,7 @@ def test_neither_the_order_of_trials_matters_nor_what_is_not_known(policy):
     assert second[1] == pytest.approx(first[1], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_training_learns_to_foresee_from_other_trials_and_to_judge_a_trial_by_itself(policy):
     """The mean error of ln J over machines not trained on: nothing known, others known, the trial itself known."""
     test = trials(200, seed=5)

@@ -120,6 +120,7 @@ def test_a_curriculum_goes_on_where_a_run_was_cut(tmp_path, monkeypatch):
     assert stages == expected[-len(stages) :] and min(stages) > 0.4
 
 
+@pytest.mark.slow
 def test_a_training_counts_to_the_end_of_its_last_rollout(tmp_path):
     """PPO learns from whole rollouts, here of 8 steps in 4 environments: "32 of 10 steps" would be no progress."""
     told = []

@@ -63,6 +63,7 @@ class Broken:
         return self._policy.act(observation) if self._good >= 0 else np.full(3, np.nan)
 
 
+@pytest.mark.slow
 def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     code, out, error = command("--trials", 2, "--out", tmp_path / "run")
     assert (code, error) == (0, "")
@@ -129,7 +130,7 @@ def test_json_for_programs(tmp_path):
     (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),
     (["--interface", "virtual", "--channel", "none"], "--travel is missing: give how far the motor may turn"),
     (["--trials", "0"], "--trials 0 must be 1 or more"),
-    (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes one axis"),
+    (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes axes one by one"),
     (["--load", "nothing"], "no load is named 'nothing'"),
 ])  # fmt: skip
 def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, arguments, message):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,8 +13,10 @@ from auto_stages import basis, recorded
 from drive_env import cia402, motion
 from drive_env.devices import find_device
 from drive_env.gains import write_gains
+from tuning.auto import calmer_gains
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
+from tuning.auto.calmer_gains import far_enough
 from tuning.identify.true_plant import true_plant
 from tuning.response import frequency_response
 from tuning.response.linear_model import OPEN_LOOPS
@@ -135,3 +138,44 @@ def test_a_loop_that_comes_too_near_to_instability_gets_half_its_gain(velocity, 
     np.testing.assert_array_equal(calmed.gains[0], full * [1, 1, factors[0], 1, factors[1]])
     is_calmed = factors != (1.0, 1.0)
     assert (calmed is not start, not calmed.spare.any(), bool(bench.journals[0].notes)) == (is_calmed,) * 3
+
+
+@pytest.mark.parametrize("tell", [True, False])
+@pytest.mark.parametrize("found", [[4000, 1500, 300, 250, 400], None])
+def test_what_less_p_cannot_calm_gets_other_gains_by_its_twins_or_the_rules(found, tell, monkeypatch):
+    """Less velocity P beside the same integral part may be nearer to instability."""
+    own, rule = np.array([4000, 1500, 400, 300, 200]), np.array([4000, 1500, 100, 90, 80])
+    near = Margins(40.0, 10.0, 30.0, 60.0, 9.0)
+    monkeypatch.setattr(auto_margins, "margins_with", lambda *given: {"velocity": near, "position": near})
+    monkeypatch.setattr(auto_margins, "sensitivity", lambda target, basis, response, gains, k: 2.0)
+    monkeypatch.setattr(auto_margins, "twins_tell", lambda *given: tell)
+    by_twins = None if found is None else np.array(found)
+    monkeypatch.setattr(auto_margins, "far_enough", lambda bench, basis, recorded, k: by_twins)
+    bench = SimpleNamespace(target=SimpleNamespace(linked=False, device=find_device("tmcm1636")), journals=[Journal()])
+    response = SimpleNamespace(f=np.arange(80.0), refined=lambda k: (None, None, np.ones(80, bool)))
+    calmed = auto_margins.calm(bench, basis(rule[None]), recorded(own[None], spare=9), 0, response)
+    is_searched = tell and found is not None
+    assert calmed.gains[0].tolist() == (found if is_searched else rule.tolist())
+    assert bench.journals[0].notes[0].startswith("other gains were searched" if is_searched else "the gains of the")
+    assert "the measured velocity loop has a sensitivity peak Ms of 9.0" in bench.journals[0].notes[0]
+
+
+def test_gains_by_twins_are_far_from_instability_by_the_measured_loop(monkeypatch):
+    """By the twins more velocity P is better, without an end; the measured loop ends it."""
+
+    @contextmanager
+    def twins(bench, basis, k, sets, repeats):
+        device = find_device("tmcm1636")
+        yield SimpleNamespace(device=device, num_axes=1, sets=sets, score=lambda gains: 100.0 / gains[..., 2])
+
+    monkeypatch.setattr(calmer_gains, "_twins_of", twins)
+    monkeypatch.setattr(calmer_gains, "cost_on_twins", lambda bench, basis, axes, gains: 100.0 / gains[..., 2])
+    most = 4.0
+    monkeypatch.setattr(calmer_gains, "sensitivity", lambda target, basis, response, gains, k: most * gains[2] / 300.0)
+    bench = SimpleNamespace(target=SimpleNamespace(device=find_device("tmcm1636")), rng=np.random.default_rng(1))
+    start = recorded(np.array([[4000, 1500, 400, 300, 200]]), response=object())
+    rule = basis([[4000, 1500, 200, 300, 200]])
+    found = far_enough(bench, rule, start, 0)
+    assert found is not None and 270 < found[2] <= 300
+    most = 4000.0
+    assert far_enough(bench, rule, start, 0) is None, "nothing near is far enough"

@@ -369,7 +369,7 @@ class Life:
         return np.concatenate(self.seen, axis=1)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 @pytest.mark.parametrize(
     ("device", "load", "motor"),
     [pytest.param(*row, id="-".join(row), marks=[] if is_quick(*row) else [pytest.mark.slow]) for row in ROWS],

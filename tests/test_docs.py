@@ -14,7 +14,7 @@ from docs_pages import DOCS, ROOT, SHELL, SNIPPET, Block, blocks, compare, follo
 PROGRAMS = {"drive-env": "drive_env.commands.cli", "drive-tune": "tuning.commands.cli",
             "drive-agent": "agents.commands.cli"}  # fmt: skip
 # Pages that are followed within 10 s; the others are slow.
-QUICK = {"docs/faults.md", "docs/how-to/wireshark.md", "docs/tutorials/policy-at-1-khz.md"}
+QUICK = {"docs/how-to/wireshark.md"}
 TRAINS = re.compile(r"stable_baselines3|drive-agent (train|search|export)|own_reward|own_load|curriculum\.py")
 OLD_WORDS = (
     "hidden J",

@@ -143,6 +143,53 @@ def test_a_relative_set_point_in_the_buffer_goes_on_from_the_target_before(tmp_p
         assert one(drives, 0x6062) == 3 * TURN
 
 
+ON_SET_POINT = 0x21F  # bit 9, change on set-point
+
+
+@pytest.mark.parametrize("second", [5, 1])
+def test_change_on_set_point_passes_the_first_target_with_the_profiles_velocity(tmp_path, second):
+    """Bit 9 of the set-point that waits; without it the axis stops at the first one."""
+    speeds = {}
+    for word in (0x1F, ON_SET_POINT):
+        with build(tmp_path, set_point_buffer=1) as drives:
+            motion.enable(drives, mode="pp")
+            v = one(drives, 0x6081)
+            set_point(drives, 3 * TURN)
+            drives.advance(0.02)
+            assert set_point(drives, second * TURN, word) == (1, 1)
+            trace = drives.record([0x6041, 0x6062], 3.0)
+            demand = trace[0x6062][:, 0]
+            passed = int(np.argmax(demand >= 3 * TURN))
+            speeds[word] = (demand[passed] - demand[passed - 1]) * 1000 / v
+            full = trace[0x6041][:, 0] >> 12 & 1
+            assert full[: passed - 1].all() and not full[passed + 2 :].any()
+            assert not np.any(trace[0x6041][: passed + 2, 0] & 0x0400)
+            assert demand[-1] == second * TURN and trace[0x6041][-1, 0] & 0x0400
+            if word == ON_SET_POINT and second > 3:
+                assert np.all(np.diff(demand) >= 0)
+        (tmp_path / "quirky.toml").unlink()
+        find_device.cache_clear()
+    assert speeds[0x1F] < 0.1
+    assert speeds[ON_SET_POINT] == pytest.approx(1.0, abs=0.02)
+
+
+def test_bit_9_does_nothing_at_rest_nor_without_a_buffer(tmp_path):
+    for buffer in (0, 1):
+        with build(tmp_path, **({"set_point_buffer": 1} if buffer else {})) as drives:
+            motion.enable(drives, mode="pp")
+            assert set_point(drives, TURN, ON_SET_POINT) == (1, 0)
+            drives.advance(1.0)
+            assert one(drives, 0x6062) == TURN
+            if not buffer:
+                set_point(drives, 20 * TURN)
+                drives.advance(0.05)
+                assert set_point(drives, 2 * TURN, ON_SET_POINT) == (1, 0)
+                drives.advance(2.0)
+                assert one(drives, 0x6062) == 2 * TURN
+        (tmp_path / "quirky.toml").unlink()
+        find_device.cache_clear()
+
+
 @pytest.mark.parametrize("buffer", [0, 1])
 def test_change_set_immediately_replaces_what_is_under_way(tmp_path, buffer):
     with build(tmp_path, **({"set_point_buffer": 1} if buffer else {})) as drives:

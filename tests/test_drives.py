@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
+from drive_env.dictionary.roles import Role
 from tuning.snapshot import load_snapshot
 
 
@@ -237,3 +238,19 @@ def test_enable_resumes_from_a_quick_stop_that_stays(running):
     assert running.read(0x6041)[0] & 0x6F == 0x07
     motion.enable(running)
     assert running.read(0x6041)[0] & 0x6F == 0x27
+
+
+@pytest.mark.parametrize("name", ["tmcm1636", "tmcm6212", "tmcm3313"])
+def test_enable_right_after_a_quick_stop_waits_for_what_follows_its_ramp(name):
+    """605Ah: 2 goes on to switch on disabled by itself, 6 stays in quick stop active; both are enabled then."""
+    with EmulatedDrives(name, "inertia", num_machines=2, num_threads=1) as drives:
+        turn = drives.read(Role.POSITION_SCALE)
+        drives.write(0x605A, [2, 6])
+        drives.write(0x6085, 10 * turn)
+        motion.enable(drives, mode="pv")
+        drives.write(0x60FF, 2 * turn)
+        drives.advance(1.0)
+        motion.quick_stop(drives)
+        assert np.all(drives.read(0x6041) & 0x6F == 0x07)
+        motion.enable(drives)
+        assert np.all(drives.read(0x6041) & 0x6F == 0x27)

@@ -88,6 +88,7 @@ def as_integers(traces):
     return [np.stack([trace[index] for index in SAMPLED]) for trace in traces]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("safety", [True, False], ids=["enveloped", "bare"])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_same_script_gives_the_same_integers(name, safety):

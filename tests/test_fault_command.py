@@ -104,6 +104,7 @@ def test_a_fault_that_serve_begins_with():
             wait_until(lambda: drives.read(0x6041)[0] & 0x4F == 0x08, "the drive did not trip")
 
 
+@pytest.mark.slow
 def test_a_master_is_told_what_the_bus_lost_and_goes_on_without_a_restart():
     with (
         served("tmcm1636", "--load", "inertia", "--control", 0) as (_, channel, control),

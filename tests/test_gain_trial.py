@@ -23,7 +23,20 @@ from drive_env.trials.gain_trial import (
     softness,
 )
 from drive_env.trials.oscillation import OSCILLATION, shakes
-from drive_env.trials.positioning import CYCLE, PROFILE, TRIAL, WATCH, plan_move, power_up, start, swing, write_profile
+from drive_env.trials.positioning import (
+    CYCLE,
+    PROFILE,
+    QUIET,
+    SETTLED,
+    TRIAL,
+    WATCH,
+    plan_move,
+    power_up,
+    resting_swing,
+    start,
+    swing,
+    write_profile,
+)
 from drive_env.trials.score import Terms, cost
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -81,6 +94,13 @@ def test_a_swing_is_the_largest_of_any_window_of_25_ms_and_each_axis_has_its_own
     current[WATCH + 5, 0] = 2.0  # two changes of 2 A among 24
     current[3 * WATCH :, 1] = 7.0  # a jump between two windows is in neither
     np.testing.assert_allclose(swing(current, 2.0), [max(0.25, np.sqrt(2 * 4.0 / 24) / 2.0), 0.0])
+
+
+def test_a_swing_at_rest_is_about_its_mean_and_of_the_last_45_ms_before_the_load_step():
+    current = np.zeros((TRIAL, 2))
+    current[:QUIET], current[SETTLED:] = 9.0, -9.0  # the move, and the load step
+    current[QUIET:SETTLED, 0] = 5.0 + 0.4 * np.sin(2.0 * np.pi * np.arange(SETTLED - QUIET) / 15.0)
+    np.testing.assert_allclose(resting_swing(current, 2.0), [0.4 / np.sqrt(2.0) / 2.0, 0.0], atol=1e-12)
 
 
 # --- identification -------------------------------------------------------------------------------------------------

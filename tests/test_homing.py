@@ -227,6 +227,77 @@ def test_the_error_of_the_edge_grows_with_the_slow_speed_and_never_beyond_a_cycl
     assert late.min() > -2 * ENCODER_COUNT - STRETCH
 
 
+# --- CiA 402-2: methods that the TMCM-1636 lacks, of drives that are known by their EDS -------------------------------
+# Method without an index, which way it searches, the edge, and the way in which that is passed in the end; the same
+# method with an index has 16 less, and looks for it that way.
+STANDARD = [
+    (17, -1, LEFT, 1), (18, 1, RIGHT, -1),
+    (19, 1, HOME_LOW, -1), (20, 1, HOME_LOW, 1), (21, -1, HOME_HIGH, 1), (22, -1, HOME_HIGH, -1),
+    (23, 1, HOME_LOW, -1), (24, 1, HOME_LOW, 1), (25, 1, HOME_HIGH, -1), (26, 1, HOME_HIGH, 1),
+    (27, -1, HOME_HIGH, 1), (28, -1, HOME_HIGH, -1), (29, -1, HOME_LOW, 1), (30, -1, HOME_LOW, -1),
+    (23, 1, HOME_LOW, -1), (30, -1, HOME_LOW, -1),
+]  # fmt: skip
+NUMBERS, WAYS, ENDS, LAST_WAYS = (np.array(column) for column in zip(*STANDARD, strict=True))
+
+
+@pytest.mark.parametrize("with_index", [False, True])
+@pytest.mark.parametrize("where", [-0.15, -0.0605, -0.04, -0.0195, 0.1])
+def test_each_method_of_the_standard_ends_at_its_edge_or_at_the_index_beyond_it(belt, where, with_index):
+    """An axis for each method: left of the home switch, at its edges, on it, right of it."""
+    radius = TURN / (2.0 * np.pi)
+    index = 2.0  # rad
+    belt.machine.set("motor.index_angle", index)
+    bring(belt, where)
+    set_up(belt, 17)
+    set_lanes(belt.inside.records, "homing_method", NUMBERS - (16 if with_index else 0))
+    start(belt)
+    belt.advance(0.05)
+    moved = carriage(belt) - where
+    if where in (-0.15, 0.1):  # beside the home switch
+        assert (WAYS * moved > 5e-4).all()
+    wait(belt)
+    word = belt.read(0x6041)
+    assert (word & (REACHED | ATTAINED) == REACHED | ATTAINED).all(), dict(zip(NUMBERS, word, strict=True))
+    assert belt.emergencies() == []
+    if not with_index:
+        np.testing.assert_allclose(zero(belt), ENDS, rtol=0, atol=TOLERANCE)
+        return
+    beyond = LAST_WAYS * (index - ENDS / radius) % (2.0 * np.pi)
+    assert (np.minimum(beyond, 2.0 * np.pi - beyond) > 0.1).all()
+    angle = belt.machine.rotor_angle - belt.read(0x6064) / 65536 * 2.0 * np.pi
+    np.testing.assert_allclose(angle, ENDS / radius + LAST_WAYS * beyond, rtol=0, atol=3 * 2.0 * np.pi / 4096)
+
+
+@pytest.mark.parametrize("width", [0.002, 0.03])
+def test_a_narrow_cam_gives_each_method_the_same_edges(belt, width):
+    """Braking from the fast speed crosses a cam of 2 mm, and not one of 30 mm."""
+    low, high = -0.04 - 0.5 * width, -0.04 + 0.5 * width
+    set_home_switch(belt, np.full(COUNT, low), np.full(COUNT, high))
+    bring(belt, np.where(np.arange(COUNT) % 2 == 0, -0.15, 0.1))
+    set_up(belt, 17)
+    set_lanes(belt.inside.records, "homing_method", NUMBERS)
+    start(belt)
+    wait(belt)
+    ends = np.where(ENDS == HOME_LOW, low, np.where(ENDS == HOME_HIGH, high, ENDS))
+    assert (belt.read(0x6041) & ATTAINED != 0).all()
+    np.testing.assert_allclose(zero(belt), ends, rtol=0, atol=TOLERANCE)
+
+
+def test_a_method_whose_edge_does_not_exist_fails_at_the_limit_switch(belt):
+    """A home switch that is active up to the right end has no right edge."""
+    set_home_switch(belt, np.full(COUNT, -0.04), np.full(COUNT, 1.0))
+    bring(belt, 0.0)
+    set_up(belt, 17)
+    set_lanes(belt.inside.records, "homing_method", NUMBERS)
+    start(belt)
+    wait(belt, 16.0)
+    word = belt.read(0x6041)
+    homed = (ENDS == LEFT) | (ENDS == RIGHT) | (ENDS == HOME_LOW)
+    np.testing.assert_array_equal(word & ATTAINED != 0, homed)
+    assert (word & REACHED != 0).all()
+    assert (np.abs(carriage(belt)) < 0.25).all()
+
+
 # --- 2005h ------------------------------------------------------------------------------------------------------------
 def test_deactivated_home_switch_both_limits_hit_is_the_documented_error(belt):
     bring(belt, np.linspace(-0.2, 0.2, COUNT), settings=0x10)

@@ -514,6 +514,7 @@ def test_who_listens_and_does_not_read_is_dropped_and_nobody_else_loses_a_frame(
     assert caplog.text.count("it does not read") == 1
 
 
+@pytest.mark.slow
 def test_who_pauses_loses_nothing_that_fits(hub):
     count = 30_000  # 800 kB
     with plain(hub) as sleeper, plain(hub) as sender:

@@ -433,6 +433,7 @@ def test_an_axis_that_is_enabled_is_left_alone():
         identify(target)
 
 
+@pytest.mark.slow
 def test_only_the_chosen_axes_move():
     target = emulated(load="inertia", num_machines=3, num_threads=1)
     found = identify(target, np.array([True, False, True]))

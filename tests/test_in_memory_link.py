@@ -285,6 +285,7 @@ def target_of(drives):
     return Target(drives, find_device("tmcm1636"), motor, np.array([24.0]), -way, way, *limits, bus={"channel": "here"})
 
 
+@pytest.mark.slow
 def test_an_axis_is_identified_over_it():
     with linked() as (drives, _), swinging_allowed(drives):
         (found,) = identify_briefly(target_of(drives))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tuning.response.margins import margins
+from tuning.response.margins import _gain_margin, margins
 
 F = np.geomspace(1.0, 1000.0, 2000)
 S = 2j * math.pi * F
@@ -189,3 +189,19 @@ def test_rows_have_one_dimension_and_two_frequencies():
             margins(f, L)
     with pytest.raises(ValueError, match="rows of one length"):
         margins([1.0, 2.0], [1.0, 1.0], [True])
+
+
+@pytest.mark.parametrize(("decibels", "margin"), [
+    # Of crossings at 10 Hz (the phase rises through -180 degrees) and at 100 Hz (it falls), the gain there.
+    ((-0.5, -4.0), (0.5, 10.0)),  # both below 1: the nearer one, which the phase rises through, too
+    ((-4.0, -0.5), (0.5, 100.0)),
+    ((0.5, -4.0), (4.0, 100.0)),  # a rise with a gain above 1 is no instability
+    ((-4.0, 0.5), (-0.5, 100.0)),  # a fall is
+])  # fmt: skip
+def test_which_crossing_of_minus_180_degrees_is_the_margin(decibels, margin):
+    f = np.array([5.0, 20.0, 50.0, 200.0])
+    # Straight lines over log f pass the two crossings where the gain is as told.
+    slope = (decibels[1] - decibels[0]) / np.log(10.0)
+    log_gain = np.log(10.0) / 20.0 * (decibels[0] + slope * np.log(f / 10.0))
+    found = _gain_margin(f, log_gain, np.array([-1.0, 1.0, 1.0, -1.0]), np.array([10.0, 100.0]))
+    np.testing.assert_allclose(found, margin)

@@ -103,8 +103,9 @@ def literals(tree):
     docstrings = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
     docstrings |= {id(n.msg) for n in ast.walk(tree) if isinstance(n, ast.Assert)}
     inner = {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
+    others = docstrings | inner
     for node in ast.walk(tree):
-        if id(node) not in docstrings | inner and isinstance(node, ast.Constant | ast.JoinedStr) and text_of(node):
+        if id(node) not in others and isinstance(node, ast.Constant | ast.JoinedStr) and text_of(node):
             yield node.lineno, text_of(node)
 
 

@@ -32,7 +32,7 @@ def truth(target, axis, gains):
     return {loop: (180.0 if math.isnan(one.phase_deg) else one.phase_deg, one.gain_db) for loop, one in found.items()}
 
 
-@pytest.mark.every(6)
+@pytest.mark.slow
 @pytest.mark.parametrize("load", ["inertia", "fan", "winder", "two_mass", "belt", "vertical_screw"])
 def test_a_bound_by_the_identified_model_is_below_the_truth(load):
     """Four machines as drawn, gains of 45 and of 60 degrees; intervals of 95 % are missed now and then, by little."""
@@ -101,9 +101,8 @@ def test_a_model_that_is_none_gives_no_bound_and_says_why():
     assert "its resonance is not known for certain: the response depends on the direction" in why_unbounded(loose)
 
 
-@pytest.mark.parametrize(
-    "load", ["inertia", *(pytest.param(load, marks=pytest.mark.slow) for load in ("two_mass", "belt", "winder"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("load", ["inertia", "two_mass", "belt", "winder"])
 def test_an_axis_whose_drive_time_runs_out_has_bounds_and_is_amber(load, tmp_path):
     with emulated(load=load, num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", budget=SPENT)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mutation
 import pytest
+from thinning import part
 
 TABLE = mutation.read_table()
 QUICK = ["drive_env/safety/oscillation.py", "tuning/auto/trial_order.py", "tuning/identify/confidence.py"]
@@ -56,9 +57,10 @@ def test_a_change_that_python_cannot_read_is_none(monkeypatch):
 @pytest.mark.slow
 def test_a_sample_of_changes_is_noticed():
     pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")
-    outcomes = list(mutation.run(mutation.sample(QUICK, 20, 0), TABLE))
+    many = part(20, 5)
+    outcomes = list(mutation.run(mutation.sample(QUICK, many, 0), TABLE))
     survived = [f"{o.mutant.file}:{o.mutant.line} {o.before} -> {o.after}" for o in outcomes if not o.caught]
-    assert len(survived) <= 2, "\n".join(survived)
+    assert len(survived) <= max(many // 10, 1), "\n".join(survived)
 
 
 def test_tests_that_fail_as_it_is_are_no_judges(monkeypatch):

@@ -239,6 +239,25 @@ def test_modes_and_homing_are_what_both_have(folders, name, modes, methods):
             assert device.allowed_values[0x6098, 0] == methods
             with pytest.raises(ObjectAccessError, match="cannot be -4"):
                 drives.write(0x6098, -4)
+            told = {note.what: note.why for note in folders[name].modes}
+            assert told["homing method -4"].startswith("60E3h has it, and the emulator does not: negative numbers are")
+
+
+# By the index to the right of the left edge, where a turn of the motor begins; to the edges, where they become active.
+@pytest.mark.parametrize(("method", "home"), [(4, -0.04), (24, -0.06), (28, -0.02)])
+def test_methods_of_the_standard_home_it_at_real_switches(folders, method, home):
+    """A carriage on a belt, by a drive whose EDS lists no methods: the home switch is from -0.06 to -0.02 m."""
+    with EmulatedDrives(str(folders["everest_ed1"].folder), "belt", MOTOR, num_threads=1, ideal=True) as drives:
+        assert set(drives.device.allowed_values[0x6098, 0]) == {0, *range(1, 15), *range(17, 31), 33, 34, 35, 37}
+        metre = int(drives.read(Role.POSITION_SCALE)[0]) / 0.04
+        counts = float(np.min(per_increment(drives, 0x60FF)))
+        drives.write((0x6099, 1), round(0.1 * metre * counts))
+        drives.write((0x6099, 2), round(0.02 * metre * counts))
+        drives.write(0x6098, method)
+        motion.home(drives, timeout=12.0)
+        carriage = float(drives.inside.records["load_position"][0][0])
+        assert carriage - int(drives.read(0x6064)[0]) / metre == pytest.approx(home, abs=1e-4)
+        assert carriage == pytest.approx(home, abs=1e-3)
 
 
 def test_an_object_that_is_lacking_is_no_role_and_is_not_made(folders):

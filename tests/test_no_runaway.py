@@ -497,6 +497,7 @@ def stacked_relative_moves(drives):
     read_on(drives, 1.5)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("script", [
     coarser_scale, coarser_scale_in_torque, home_and_move_again, offset_in_csp, offset_by_sdo, stacked_relative_moves,
 ], ids=lambda script: script.__name__)  # fmt: skip
@@ -579,6 +580,7 @@ def too_fast(drives):
     drives.record([0x606C], 0.3, play={0x6071: np.full(300, 800)})
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("end", [
     close_at_speed, exception_at_speed, ctrl_c_at_speed, too_fast,
 ], ids=lambda end: end.__name__)  # fmt: skip

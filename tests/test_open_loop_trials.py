@@ -215,6 +215,7 @@ def run(*arguments):
     return result
 
 
+@pytest.mark.slow
 def test_sweep_runs_the_open_loop_experiment_says_what_is_not_measured_and_repeats(stepper, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
     result = run("sweep", "--device", stepper, "--out", first)

@@ -457,6 +457,7 @@ def free_axis(drives):
     return Target(drives, drives.device, motor, supply, -free, free, motor.rated_speed, motor.rated_current)
 
 
+@pytest.mark.slow
 def test_a_search_runs_on_one_axis_of_a_bus_inside_the_envelope():
     from tuning.commands.optimise import leave_oscillations_to_trials
 

@@ -184,6 +184,7 @@ def emulated(name):
     return _emulated[name]
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("safety", [True, False], ids=["enveloped", "bare"])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_same_script_gives_the_same_integers(name, safety):

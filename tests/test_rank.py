@@ -240,6 +240,7 @@ def test_the_factory_leaves_and_the_baseline_rule_computes():
     assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("baseline"))
 
 
+@pytest.mark.slow
 def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
     names = {"tpe": False, "tpe-safe": True}
     found = compare(RIGID, {name: find_tuner(name) for name in names})
@@ -248,6 +249,7 @@ def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
     assert by_name["tpe-safe"].aborts < by_name["tpe"].aborts
 
 
+@pytest.mark.slow
 def test_a_rule_identifies_once_for_all_rules(monkeypatch):
     calls = []
     real = compare_module.identify_all
@@ -437,6 +439,7 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
     assert told["gains"][0][2:] == [int(best[name]) for name in ("velocity_p", "velocity_i", "position_p")]
 
 
+@pytest.mark.slow
 def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their_place(tmp_path):
     first, again, other = tmp_path / "first", tmp_path / "again", tmp_path / "other"
     options = ("--searches", 2, "--copies", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",
@@ -455,7 +458,7 @@ def test_the_picture_shows_the_trials_of_every_search():
     rows = [row(search, number, cost) for search, cost in ((0, 2.0), (1, 1.0)) for number in range(3)]
     found = Optimised(np.ones((2, 5), int), np.ones((2, 5), int), np.array([2.0, 1.0]), tuple(rows), 0.0,
                       np.zeros(2, int), np.zeros(2, int), ("", ""), 0.01)  # fmt: skip
-    axes = trials_figure(found, Settings()).axes[0]
+    axes = trials_figure(found, Settings(), "tmcm1636").axes[0]
     assert len(axes.collections[0].get_offsets()) == 6
     assert [line.get_ydata().tolist() for line in axes.lines] == pytest.approx(np.exp([[2.0] * 3, [1.0] * 3]))
 
@@ -469,7 +472,7 @@ def test_the_best_so_far_is_of_accepted_trials_alone():
         row(0, 3, 1.0),
         row(0, 4, -2.0, aborted=True),
     )
-    (line,) = trials_figure(searched(rows), Settings()).axes[0].lines
+    (line,) = trials_figure(searched(rows), Settings(), "tmcm1636").axes[0].lines
     np.testing.assert_allclose(line.get_ydata(), [np.nan, *np.exp([2.0, 2.0, 1.0, 1.0])])
 
 
@@ -480,7 +483,7 @@ def test_the_front_is_of_accepted_trials_and_its_axes_have_units():
         row(0, 1, 0.0, objectives=(0.0, np.log(5.0), 4.0)),
         row(0, 2, -1.0, objectives=(-1.0, 0.0, 1.0), aborted=True),
     )
-    axes = trials_figure(searched(rows), Settings(objectives=("speed", "robustness"))).axes[0]
+    axes = trials_figure(searched(rows), Settings(objectives=("speed", "robustness")), "tmcm1636").axes[0]
     (front,) = axes.lines
     np.testing.assert_allclose(sorted(front.get_xydata().tolist()), [[10.0, 5.0], [20.0, 3.0]])  # t_0 is 10 ms
     assert axes.get_xlabel() == "settling time, the slower of move and reversal [ms]"

@@ -624,6 +624,7 @@ def test_viewer_plays_the_run(monkeypatch, belt_run):
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @needs_gl
 def test_command_films_and_tells_what_happened(command, tmp_path):
     config = tmp_path / "run.toml"

@@ -270,6 +270,18 @@ def test_a_fit_never_draws_around_fewer_than_four(monkeypatch):
     assert second.std() == pytest.approx(np.sqrt(3.0) * 4 / 200 / np.sqrt(12.0), rel=0.5)
 
 
+def test_a_share_beyond_the_ends_of_its_law_is_reflected_there():
+    """A parameter at its limit stays reachable, and none is drawn that the law does not have."""
+    steps = np.array([-0.2, 1.3, 2.4, 0.25, 1.0])
+    rng = SimpleNamespace(
+        choice=lambda best, count: np.zeros(count, int),
+        multivariate_normal=lambda mean, spread, count: steps[:count, None],
+    )
+    tried = np.linspace(0.0, 1.0, 8)[:, None]  # the first is 0
+    found = _candidates(rng, tried, np.arange(8.0), len(steps), 1, 0.1)
+    np.testing.assert_allclose(found[:, 0], [0.2, 0.7, 0.4, 0.25, 1.0])
+
+
 # --- parts of it --------------------------------------------------------------------------------------------------
 def rows_of(times, values=None):
     values = range(len(times)) if values is None else values

@@ -66,6 +66,7 @@ def test_a_mistake_is_one_line_and_code_2(arguments, message):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_folder_with_results_is_not_written_over(run):
     folder, _ = run
     done = in_process("--out", str(folder / "out"))

@@ -134,6 +134,7 @@ def test_a_run_goes_on_between_what_another_width_has_done(experiment):
     assert edges == [(576, 832), (832, 1024), (1088, 1344), (1344, 1600), (1600, 1856), (1856, 2112), (2112, 2304)]
 
 
+@pytest.mark.slow
 def test_any_cut_gives_the_digits_of_any_other(experiment, whole, tmp_path):
     class Wide:
         width, shares_disk = 9, True
@@ -312,6 +313,7 @@ def small_cluster():
         yield cluster
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_goes_is_told_with_the_remedy(small_cluster):
     address = small_cluster.scheduler_address
     with (

@@ -275,6 +275,7 @@ def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
     np.testing.assert_allclose(scores.j, np.mean([one.j for one in found], axis=0))
     np.testing.assert_allclose(scores.terms.settling, np.mean([one.terms.settling for one in found], axis=0))
     np.testing.assert_allclose(scores.swing, np.max([one.swing for one in found], axis=0))
+    np.testing.assert_allclose(scores.rest, np.mean([one.rest for one in found], axis=0))
 
 
 def test_a_score_depends_on_machine_and_gains_alone(two_mass):

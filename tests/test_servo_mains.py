@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives, cia402, motion
+from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 from drive_env.devices import find_device
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.firmware.servo_mains.causes import CAUSES
@@ -118,6 +118,35 @@ def test_both_modes_may_change_within_a_period_of_an_axis_that_runs(drives):
     drives.advance(0.01)
     assert shows(drives, ENABLED)
     assert state(drives) & REMOTE
+
+
+def test_the_makers_service_program_sets_the_d_mode_beside_the_master(drives):
+    """It "allows for a virtual disconnection of the servo from the master" (manual); no frame tells it."""
+    motion.enable(drives, mode="pp")
+    assert drives.machine.drive_mode.tolist() == [7]
+    drives.machine.drive_mode = 2
+    drives.advance(0.3)
+    assert not state(drives) & REMOTE
+    assert int(drives.read(D_MODE)[0]) == 2
+    assert field(drives, "stage_on")[0] == 0.0
+    drives.machine.drive_mode = 7
+    drives.advance(0.002)
+    assert state(drives) & REMOTE
+    with pytest.raises(ObjectAccessError, match="its highest is 7"):
+        drives.machine.drive_mode = 99
+
+
+def test_60c1h_is_607ah_inside(drives):
+    for written, read in (((0x60C1, 1), cia402.TARGET_POSITION), (cia402.TARGET_POSITION, (0x60C1, 1))):
+        drives.write(written, 4321 if written == (0x60C1, 1) else -1234)
+        assert drives.read(read).tolist() == drives.read(written).tolist()
+    drives.write(cia402.MODE, cia402.IP)
+    drives.write(D_MODE, 3)
+    drives.advance(0.002)
+    drives.write((0x60C1, 1), 0)
+    step_up(drives)
+    trace = drives.record([cia402.POSITION_DEMAND], 0.1, play={(0x60C1, 1): np.arange(100) * 40})
+    assert trace[cia402.POSITION_DEMAND][-1, 0] == pytest.approx(99 * 40, abs=80)
 
 
 # --- torque -----------------------------------------------------------------------------------------------------------
@@ -278,7 +307,7 @@ def test_each_error_of_the_table_is_a_row_and_can_be_set(drives, bit, name, code
     assert row.status_flag == 1 << bit
     assert find_device("tgz_d").emergencies[name].code == code
     motion.enable(drives, mode="pp")
-    put(drives, "error_bits", 1 << bit)
+    drives.machine.error_bits = 1 << bit
     drives.advance(1.1)
     assert shows(drives, FAULT)
     assert [one.code for one in drives.emergencies()] == [code]
@@ -287,13 +316,20 @@ def test_each_error_of_the_table_is_a_row_and_can_be_set(drives, bit, name, code
     drives.write(cia402.CONTROLWORD, 0)
     drives.write(cia402.CONTROLWORD, 0x80)
     assert shows(drives, FAULT)  # the cause holds
-    put(drives, "error_bits", 0)
+    drives.machine.error_bits = 0
     drives.advance(0.002)
     drives.write(cia402.CONTROLWORD, 0)
     drives.write(cia402.CONTROLWORD, 0x80)
     drives.advance(0.002)
     assert shows(drives, DISABLED)
     assert int(field(drives, "error_register")[0]) == 0
+
+
+def test_bits_that_are_no_errors_are_refused(drives):
+    for bits in (1 << 24, 1 << 28, 0.5, [1, 2]):
+        with pytest.raises(ValueError, match=r"error bits of tgz_d are whole numbers of bits 0, 1, 2, |broadcast"):
+            drives.machine.error_bits = bits
+    assert drives.machine.error_bits.tolist() == [0]
 
 
 def cause_of(drives, run=0.3):
@@ -329,6 +365,20 @@ def by_speed(drives):
     drives.write(cia402.TARGET_VELOCITY, rpm(drives, 2000))
 
 
+def by_dip(drives):
+    """The link falls below its limit for a moment, and is charged again."""
+    put(drives, "u_dc", 250.0)
+
+
+def by_overload(drives):
+    put(drives, "nominal_current", 1.0)
+    put(drives, "overload_time", 0.05)
+    drives.machine.brake = "closed"
+    put(drives, "pole_pairs", 5.0)
+    motion.enable(drives, mode="cst")
+    drives.write(cia402.TARGET_TORQUE, 16_000)
+
+
 def by_parameters(drives):
     put(drives, "pole_pairs", 0.0)
 
@@ -346,6 +396,8 @@ def by_brake(drives):
         (0x3130, by_parameter("stage.mains_phase_lost", 1.0)),
         (0x3100, by_supply),
         (0x3110, by_high_supply),
+        (0x3120, by_dip),
+        (0x8310, by_overload),
         (0x5430, by_sto),
         (0x7110, by_brake),
         (0x4310, by_temperature(160.0, 25.0)),

@@ -1,6 +1,6 @@
 """Soak: machines under random faults that come and go, with what must always hold checked every communication cycle.
 
-The slow test is an hour of machine time: sixteen machines for 225 s each, side by side; the short one is in every run.
+It is an hour of machine time: sixteen machines for 225 s each, side by side.
 soak_cycle.py composes the stages of a cycle as firmware/cycle.py does, and sums energies tick by tick beside them.
 """
 
@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from soak_cycle import BRIDGE, CHOPPER, COPPER, IDLE, LEAP, OFF_CURRENT, SHAFT, SOURCE, SPEED, run_cycle
+from thinning import part
 
 from drive_env import EmulatedDrives, motion
 from drive_env.bus.wire import Wire
@@ -220,17 +221,11 @@ def soak(load, seconds, seed):
 
 
 @pytest.mark.slow
-def test_a_few_seconds_under_faults():
-    run = soak("two_mass", 3.0, 1)
-    assert sum(run.given.values()) > 50
-    assert run.enabled_cycles > 0.1 * 3000 * MACHINES
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("load", "seconds"), [("two_mass", 150.0), ("ball_screw", 75.0)])
+@pytest.mark.parametrize(("load", "seconds"), [("two_mass", 150), ("ball_screw", 75)])
 def test_an_hour_of_machine_time_under_faults(load, seconds):
+    seconds = part(seconds, 20)
     run = soak(load, seconds, 2)
-    assert min(run.given.values()) > 50
+    assert min(run.given.values()) > seconds / 3
     assert run.enabled_cycles > 0.1 * seconds * 1000 * MACHINES
 
 
@@ -289,10 +284,6 @@ def bus_soak(seconds, seed):
 
 
 @pytest.mark.slow
-def test_a_bus_for_a_few_seconds_under_faults():
-    assert sum(bus_soak(4.0, 1).values()) > 20
-
-
-@pytest.mark.slow
 def test_a_bus_for_minutes_under_faults():
-    assert min(bus_soak(300.0, 2).values()) > 20
+    seconds = part(300, 40)
+    assert min(bus_soak(seconds, 2).values()) > seconds / 15

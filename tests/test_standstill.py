@@ -81,7 +81,8 @@ class Uneven:
         return getattr(self._drives, name)
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 4])
 def test_over_a_bus_in_real_time_resistance_is_told_and_inductance_refused(monkeypatch, seed):
     """R within 10 % over the bus; L is seen in step with the drive alone."""
     with served("calls", load="inertia", seed=seed, randomise=["stage", "motor"]) as bus:

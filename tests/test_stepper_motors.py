@@ -80,7 +80,7 @@ def test_friction_is_small_and_damps_a_swinging_rotor_lightly(motor):
     assert motor.coulomb < motor.cogging_torque
 
 
-@pytest.mark.every(4)
+@pytest.mark.slow
 def test_the_pull_out_curve_is_that_of_ideal_comparators(motor):
     curve = motor.pull_out
     assert curve.supply == motor.voltage

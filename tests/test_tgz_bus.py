@@ -61,6 +61,7 @@ WATCHED = [0x6041, 0x6062, 0x6064, 0x606C, 0x6077]
 @pytest.fixture(scope="module")
 def inside():
     with eds_read_once(), EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1) as drives:
+        drives.inside.connect_axes(0, 2)  # as on the node, which all these tests put them on
         yield drives
 
 
@@ -278,6 +279,7 @@ def disable_voltage(drives):
 ENDS = {end.__name__: end for end in (close, interrupt, fail, disable, quick_stop, reset_fault, disable_voltage)}
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("gate", GATES)
 @pytest.mark.parametrize("end", ENDS)
 def test_every_end_finds_an_axis_that_takes_no_commands(inside, end, gate):

@@ -471,7 +471,7 @@ def test_the_image_does_what_the_objects_do_one_by_one():
 
 
 # --- the example ------------------------------------------------------------------------------------------------------
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "is_lost", "is_late"),
     [(("0.2",), False, False), (("1.2",), True, True), (("1.2", "--closed-loop"), False, True)],

@@ -13,17 +13,21 @@ from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
+from drive_env.devices.gain_set import LOAD_ANGLE, PID_ALONE, PID_ON_RAMP
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.envs.gain_tuning import GainTuning
+from drive_env.firmware.stepper_loop.fields import PARAMETERS
 from drive_env.motors import MOTORS
-from drive_env.phase_current import rated_setting
+from drive_env.phase_current import holding_torque, rated_setting
 from drive_env.trials.closed_loop import BEHIND, OVERLOAD, full_step, held_in_trial, plan_overload
 from drive_env.trials.gain_trial import Identified
+from drive_env.trials.method import check_tried
 from drive_env.trials.open_loop import unmeasured
+from drive_env.trials.position_pid import CLOCK, load_step_error
 from drive_env.trials.positioning import plan_move, start, write_profile
 from tuning.commands.cli import app
-from tuning.runs.experiment import SweptObject, load_experiment
+from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve
 from tuning.runs.metrics import MoveRecording, figures, tracking
 from tuning.runs.sweep import _close_loop, run
 from tuning.search.optimise import Settings, optimise
@@ -168,7 +172,7 @@ def test_what_trials_do_not_show_is_refused_before_anything_moves(names, remedy)
 
 # --- closed loop ------------------------------------------------------------------------------------------------------
 def closed_experiment(*swept, **excitation):
-    shipped = load_experiment(closed_loop=True)
+    shipped = load_experiment(closed_loop=LOAD_ANGLE)
     return replace(shipped, sweep=swept, excitation=replace(shipped.excitation, **excitation))
 
 
@@ -224,7 +228,7 @@ def test_why_trials_of_the_closed_loop_overload_the_motor(rotors, acts):
     with drives:
         drives.write(cia402.SENSOR_SELECTION, 0)
         motion.enable(drives, mode="pp")
-        assert not _close_loop(drives).any()
+        assert not _close_loop(drives, DEVICE.gains.loop_of_kind(LOAD_ANGLE)).any()
         scale = drives.read(Role.POSITION_SCALE)
         move = plan_move(MOTOR, np.full(3, (rotors + 1) * MOTOR.inertia), scale, np.full(3, 20.0))
         write_profile(drives, move)
@@ -302,12 +306,151 @@ def test_an_axis_whose_loop_does_not_close_counts_as_one_in_fault(monkeypatch):
     assert result.columns["fault"].all() and not result.usable.any()
 
 
+# --- position PID -----------------------------------------------------------------------------------------------------
+def pid_loop(kind=PID_ON_RAMP):
+    return DEVICE.gains.loop_of_kind(kind)
+
+
+def test_a_search_of_the_pid_begins_with_table_3_of_the_manual():
+    """Section 1.6.3; 2022h alone is another: table 3's 255 is a full step, within which nothing is corrected."""
+    table = {0x202B: 8000, 0x202C: 500, 0x202D: 400, 0x202E: 2, 0x202F: 400_000, 0x2021: 10_000, 0x2022: 8}
+    for kind, mode in ((PID_ON_RAMP, 2), (PID_ALONE, 3)):
+        loop = pid_loop(kind)
+        objects = {DEVICE.gains.keys[DEVICE.gains.columns([name])[0]]: value for name, value in loop.first.items()}
+        assert objects == {(index, 0): value for index, value in table.items()}
+        assert loop.mode == mode and loop.first.keys() == loop.gains.keys()
+
+
+def test_names_of_two_loops_are_refused_and_one_object_has_a_name_in_each():
+    known = DEVICE.gains
+    assert len({int(known.columns([name])[0]) for name in ("correction_position_p", "pid_d", "pid_v0_d")}) == 1
+    assert known.loop_of(("pid_p", "pid_d")).mode == 2 and known.loop_of(("pid_v0_p",)).mode == 3
+    assert known.loop_of(("correction_position_p",)).mode == 1 and known.loop_of(("run_current",)) is None
+    for names in (("pid_p", "pid_v0_i"), ("pid_p", "correction_velocity_i")):
+        with pytest.raises(ValueError, match="gains of different loops"):
+            check_tried(DEVICE, names)
+    with pytest.raises(ValueError, match="different ones"):
+        known.columns(("pid_p", "correction_velocity_p"))
+    with pytest.raises(ValueError, match="different loops"):
+        GainTuning(device="tmcm3313", load="inertia", gains=("pid_p", "pid_v0_i"))
+
+
+VARIED = {"p": (4000, 30_000), "i": (1, 8000), "d": (1, 100_000), "limit": (2000, 400_000), "tolerance": (255, 1),
+          "divider": (200, 2)}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("prefix", "without"),
+    [
+        ("pid", ()),
+        # A motion that the PID makes alone needs the sum, too.
+        ("pid_v0", (("sum_limit", (2, 400)),)),
+    ],
+)
+def test_trials_tell_each_gain_of_the_pid_apart(prefix, without):
+    """Each of them alone is another than table 3's, and J of a trial is, too; what oscillates or slips is stopped."""
+    rows = [(name, value) for name, values in (*VARIED.items(), *without) for value in values]
+    names = tuple(f"{prefix}_{name}" for name in VARIED)
+    with emulated("tmcm3313", "inertia", NAME, num_machines=len(rows) + 1, num_threads=1, identical=True) as target:
+        bench = TrialBench(target, anew=True, gains=names)
+        bench.identify()
+        gains = bench.rule.copy()
+        for machine, (name, value) in enumerate(rows, 1):
+            gains[machine, DEVICE.gains.columns([f"{prefix}_{name}"])[0]] = value
+        tried = bench.run(gains)
+        assert not tried.aborted[0]
+        cost = {(name, value): float(tried.cost[k]) for k, (name, value) in enumerate(rows, 1)}
+        unlike = {name for name, value in rows if abs(cost[name, value] - float(tried.cost[0])) > 0.02}
+        assert unlike == {name for name, _ in rows}
+        stopped = {row for k, row in enumerate(rows, 1) if tried.aborted[k]}
+        assert {("p", 30_000), ("d", 100_000), ("divider", 200)} <= stopped
+        bench.leave(gains)
+        assert np.array_equal(DEVICE.gains.read(target.drives), gains)
+        assert not target.drives.read(Role.LOOP_MODE).any() and np.all(target.drives.read(cia402.FOLLOWING_WINDOW) != 0)
+
+
+def test_what_a_load_step_costs_a_pid_follows_from_its_gains():
+    """Closed forms: P alone lets e decay with 256 / P, within 2022h it stays, and 202Fh takes it away evenly."""
+    loop, columns = pid_loop(), dict(zip(pid_loop().gains, DEVICE.gains.columns_of_loop(pid_loop()), strict=True))
+    gains = np.tile(DEVICE.gains.lowest, (4, 1))
+    for name, values in {
+        "pid_p": [8000, 8000, 8000, 8000],
+        "pid_limit": [10**6, 10**6, 10**6, 100],
+        "pid_tolerance": [1, 100, 1, 1],
+        "pid_d": [1, 1, 125_000 // 2, 1],
+        "pid_divider": [1, 1, 2, 1],
+    }.items():
+        gains[:, columns[name]] = values
+    found = load_step_error(DEVICE, MOTOR, loop, gains)
+    held = float(holding_torque(MOTOR, MOTOR.rated_current))
+    away = np.arcsin(0.3 * MOTOR.rated_torque / held) / (np.pi / 2.0) * 256.0
+    tau = 256.0 / 8000.0
+    decays = away * tau * (1.0 - np.exp(-0.1 / tau))
+    slower = away * 2.0 * tau * (1.0 - np.exp(-0.1 / (2.0 * tau)))  # D of 1 halves the speed
+    assert found == pytest.approx([decays, 0.1 * away, slower, 0.1 * away - 0.5 * 100 * 0.1**2], rel=0.01)
+    assert next(field.initial for field in PARAMETERS if field.name == "motion_clock") == CLOCK
+
+
+def test_optimise_finds_gains_of_the_pid_and_leaves_the_loop_as_it_was():
+    with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
+        found = optimise(target, Settings(trials=6, seed=1, gains=("pid_p", "pid_i")), anew=True)
+        assert found.cost[0] <= found.rows[0].cost and len({row.cost for row in found.rows}) > 3
+        columns = DEVICE.gains.columns(("pid_p", "pid_i"))
+        others = np.delete(found.gains[0], columns), np.delete(found.rule[0], columns)
+        assert np.array_equal(*others) and not target.drives.read(Role.LOOP_MODE).any()
+
+
+@pytest.mark.parametrize(("prefix", "slow"), [("pid", 1.1), ("pid_v0", 1.3)])
+def test_gain_tuning_and_its_robust_cost_tell_gains_of_the_pid_apart(prefix, slow):
+    env = GainTuning(device="tmcm3313", motor=NAME, load="inertia", trials=2, num_threads=1,
+                     gains=(f"{prefix}_p", f"{prefix}_i"), distributions={"parameters": {}})  # fmt: skip
+    try:
+        _, info = env.reset(seed=1)
+        rule = float(info["robust_cost"][0])
+        assert 1.0 < rule < 30.0
+        _, _, _, _, info = env.step(np.array([[-0.7, 0.0]], np.float32))
+        assert float(info["trial_robust_cost"][0]) > slow * rule, "less P resists a load less"
+        assert info["trial_gains"][0, 0, DEVICE.gains.columns([f"{prefix}_p"])[0]] == 3973
+    finally:
+        env.close()
+
+
+def test_a_sweep_of_the_pid_measures_no_current_and_says_so(tmp_path):
+    shipped = load_experiment(closed_loop=PID_ON_RAMP)
+    few = replace(shipped, sweep=(replace(shipped.sweep[0], count=3), replace(shipped.sweep[1], count=2)))
+    config = tmp_path / "pid.toml"
+    config.write_text(few.to_toml({}), encoding="utf-8")
+    said = call("sweep", "--config", config, "--out", tmp_path / "out")
+    assert said.exit_code == 0, said.output
+    assert "No torque current is measured (a PID does not commutate" in said.output
+    result = run(load_experiment(tmp_path / "out" / "settings.toml"), num_threads=1)
+    assert result.objects == ("202Bh:00", "202Ch:00")
+    assert not {"ripple [A]", "peak_current [A]", "rms_current [A]"} & result.columns.keys()
+    usable = result.usable.reshape(3, 2)
+    assert usable[:2].all() and not usable[2].any(), "P = 32000 makes the rotor swing in its field"
+    behind = result.columns["behind [s]"].reshape(3, 2)
+    assert behind[0, 1] < 0.8 * behind[0, 0], "the I part takes away what the load turns the rotor by"
+
+
+def test_a_sweep_by_objects_closes_the_first_loop_in_which_they_act():
+    shipped = load_experiment(closed_loop=PID_ON_RAMP)
+    for objects, mode in ((("202B:00",), 1), (("202D:00",), 2), (("pid_v0_p", "202C:00"), 3), (("run_current",), None)):
+        swept = tuple(SweptObject(name, 10, 100, 2, "lin") for name in objects)
+        metric = replace(shipped.metric, name="settling", weights={})
+        loop = resolve(replace(shipped, sweep=swept, metric=metric)).loop
+        assert (None if loop is None else loop.mode) == mode
+    two = tuple(SweptObject(name, 10, 100, 2, "lin") for name in ("pid_p", "pid_v0_i"))
+    with pytest.raises(ExperimentError, match="gains of different loops"):
+        resolve(replace(shipped, sweep=two))
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("--device", "tmcm6212"), "tmcm6212 has no loop to close"),
+        (("--pid",), "give one of them"),
         (("--device", "tmcm1636"), "tmcm1636 has no loop to close"),
-        (("--config", "my.toml"), "leave it out with --config"),
+        (("--config", "my.toml"), "leave them out with --config"),
     ],
 )
 def test_a_loop_that_cannot_be_closed_is_refused_with_the_reason(arguments, said, tmp_path):

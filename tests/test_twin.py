@@ -146,11 +146,13 @@ def test_scores_do_not_depend_on_the_lane_nor_on_the_other_axes():
 
 def test_the_worlds_count_by_their_geometric_mean():
     rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)
-    scores = []
+    scores, rests = [], []
     for worlds in (WORLDS[:1], WORLDS[1:2], WORLDS[:2]):
         with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 1, worlds=worlds) as twins:
             scores.append(float(twins.score(rule[:, None])[0, 0]))
+            rests.append(float(twins.cost_and_rest(rule[:, None])[1][0, 0]))
     assert scores[2] == pytest.approx(math.sqrt(scores[0] * scores[1]), rel=1e-9)
+    assert rests[2] == max(rests[:2]) > min(rests[:2]) > 0.0, "what stands on one variant may shake on another"
     assert scores[0] != scores[1]
 
 

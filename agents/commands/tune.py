@@ -133,11 +133,12 @@ def _check_gains(policy: Any, device: str) -> None:
 def _emulated_node(
     device: str, motor: str | None, load: str, seed: int | None, supply: float | None, travel: str | None
 ) -> Iterator[Target]:
-    """Serve an emulated drive on a hub of its own and reach it over that."""
+    """Serve an emulated drive on a hub of its own and reach it over that; each of its axes turns a load of its own."""
     from drive_env import EmulatedDrives
     from drive_env.bus.hub import Hub
     from drive_env.bus.server import Server
     from drive_env.bus.world import World
+    from drive_env.devices import find_device
     from tuning.commands.options import parse_travel
     from tuning.target import emulated, on_bus
 
@@ -146,23 +147,24 @@ def _emulated_node(
         ways = [(float(low), float(high)) for low, high in zip(own.low, own.high, strict=True)]
         name = own.machine
         own.drives.advance(0.001)  # compiles the kernels, the first time: a node that does would not answer in time
-    drives = EmulatedDrives(device, load, motor, supply=volts)
+    if len(ways) > 1:
+        raise ValueError(f"load {load!r} has {len(ways)} axes; an agent tunes axes one by one: choose a load with one")
+    count = find_device(device).num_axes
+    drives = EmulatedDrives(device, load, motor, supply=volts, num_machines=count)
     if seed is not None:
         import numpy as np
 
         from drive_env.envs.randomisation import RandomMachines, laws_of
 
         laws = laws_of(load, drives.device, drives.machine.parameters)
-        RandomMachines(drives, laws).redraw([np.random.default_rng(seed)], np.ones(1, bool), 1.0)
-    if drives.num_axes > 1:
-        drives.close()
-        raise ValueError(f"load {load!r} has {drives.num_axes} axes; an agent tunes one axis: choose a load with one")
+        draws = [np.random.default_rng(seed if axis == 0 else (seed, axis)) for axis in range(count)]
+        RandomMachines(drives, laws).redraw(draws, np.ones(count, bool), 1.0)
     world = World()
     world.add(drives, [1])
     hub = Hub()
     try:
         with Server(world, hub), on_bus(
-            device, motor, interface="slcan", channel=hub.channel, nodes=[1], supply=volts, travel=ways,
+            device, motor, interface="slcan", channel=hub.channel, nodes=[1], supply=volts, travel=ways * count,
             pace="lockstep", timeout=PATIENCE,
         ) as target:  # fmt: skip
             from dataclasses import replace

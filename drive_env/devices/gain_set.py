@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,11 +36,29 @@ class Gain(NamedTuple):
     steps: int = 0
 
 
-class ClosedLoop(NamedTuple):
-    """A loop that an open-loop stepper's drive may close: the loop of its gains, and its mode (`Role.LOOP_MODE`)."""
+# Kinds of loops that a stepper's drive may close: the encoder commutates; or a PID moves the field besides the ramp, or
+# alone.
+LOAD_ANGLE, PID_ON_RAMP, PID_ALONE = "load angle", "PID on the ramp", "PID alone"
+KINDS = (LOAD_ANGLE, PID_ON_RAMP, PID_ALONE)
 
-    loop: str
+
+class ClosedLoop(NamedTuple):
+    """A loop that an open-loop stepper's drive may close.
+
+    kind: One of `KINDS`. mode: Its mode (`Role.LOOP_MODE`). gains: Names of what acts in it alone, P first, and of the
+    gains that these stand for: one object may be P of one loop and D of another. first: Values where a search begins,
+    by the first of these names; what is left out begins as commissioned.
+    """
+
+    kind: str
     mode: int
+    gains: Mapping[str, str]
+    first: Mapping[str, int]
+
+    @property
+    def is_pid(self) -> bool:
+        """Whether the encoder regulates the position and does not commutate."""
+        return self.kind != LOAD_ANGLE
 
 
 RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of a stepper's phases: loop and part
@@ -52,12 +70,12 @@ class GainSet:
 
     cascade: Structure of the loops that they are gains of, one of those of `drive_env/gains.py`, from which their
     rule comes; "" for loops that nothing is known of.
-    closed_loop: What a stepper's drive may close; None for nothing.
+    closed_loops: What a stepper's drive may close.
     """
 
     rows: tuple[Gain, ...]
     cascade: str = ""
-    closed_loop: ClosedLoop | None = None
+    closed_loops: tuple[ClosedLoop, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,10 +118,31 @@ class GainSet:
         return self.column(*RUN) is not None and not self.columns_of("velocity", "position")
 
     @property
-    def closed_rows(self) -> tuple[Gain, ...]:
-        """Those that act only where the drive has closed its loop."""
-        closed = self.closed_loop
-        return tuple(row for row in self.rows if closed is not None and row.loop == closed.loop)
+    def searched(self) -> tuple[str, ...]:
+        """Names by which gains can be asked for: their own, and those that they have in loops that may be closed."""
+        return tuple(dict.fromkeys([*self.names, *(name for loop in self.closed_loops for name in loop.gains)]))
+
+    def loop_of_kind(self, kind: str) -> ClosedLoop | None:
+        """Return the loop of a kind; None for none."""
+        return next((loop for loop in self.closed_loops if loop.kind == kind), None)
+
+    def loop_of(self, names: Sequence[str]) -> ClosedLoop | None:
+        """Return the loop in which gains of these names act alone; None where they act in open loop.
+
+        Raises:
+            ValueError: For names of several loops.
+        """
+        loops = [loop for loop in self.closed_loops if not loop.gains.keys().isdisjoint(names)]
+        if len(loops) > 1:
+            raise ValueError(
+                f"{', '.join(names)} are gains of different loops ({', '.join(loop.kind for loop in loops)}), of which "
+                "a drive closes one; name gains of one of them"
+            )
+        return loops[0] if loops else None
+
+    def columns_of_loop(self, loop: ClosedLoop) -> list[int]:
+        """Return which gains act in a loop that a drive may close."""
+        return [self.names.index(name) for name in loop.gains.values()]
 
     @property
     def lowest(self) -> Integers:
@@ -121,12 +160,13 @@ class GainSet:
         Raises:
             ValueError: For a name that none has, naming those there are, and unless they are different ones.
         """
+        own = {name: name for name in self.names} | {k: v for loop in self.closed_loops for k, v in loop.gains.items()}
         for name in names:
-            if name not in self.names:
-                raise ValueError(f"no gain is named {name!r}; there are {', '.join(self.names)}")
-        if not names or len(set(names)) != len(names):
-            raise ValueError(f"give different ones of gain: {', '.join(self.names)}, not {', '.join(names) or 'none'}")
-        return np.array([self.names.index(name) for name in names])
+            if name not in own:
+                raise ValueError(f"no gain is named {name!r}; there are {', '.join(self.searched)}")
+        if not names or len({own[name] for name in names}) != len(names):
+            raise ValueError(f"give different ones of gain: {', '.join(own)}, not {', '.join(names) or 'none'}")
+        return np.array([self.names.index(own[name]) for name in names])
 
     def clipped(self, raw: ArrayLike) -> Integers:
         """Return gains as integers within what the device takes; those of a loop are 1 at least: 0 opens it."""
@@ -193,7 +233,18 @@ def load_gain_set(path: Path) -> GainSet:
                 row.get("steps", 0),
             )
         )
-    closed = data.get("closed_loop")
-    return GainSet(
-        tuple(rows), data.get("cascade", ""), None if closed is None else ClosedLoop(closed["loop"], closed["mode"])
-    )
+    loops = tuple(_closed_loop(table, [row.name for row in rows]) for table in data.get("closed_loop", ()))
+    return GainSet(tuple(rows), data.get("cascade", ""), loops)
+
+
+def _closed_loop(table: Mapping[str, Any], known: Sequence[str]) -> ClosedLoop:
+    loop = ClosedLoop(table["kind"], table["mode"], table["gains"], table.get("first", {}))
+    if loop.kind not in KINDS:
+        raise ValueError(f"closed_loop: kind = {loop.kind!r} is unknown; there are {', '.join(KINDS)}")
+    for what, given, there in (
+        ("gains", loop.gains.values(), known),
+        ("first", loop.first, tuple(loop.gains)),
+    ):
+        if wrong := [name for name in given if name not in there]:
+            raise ValueError(f"closed_loop: {what}: {', '.join(wrong)}: no such gain; there are {', '.join(there)}")
+    return loop

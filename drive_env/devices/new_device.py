@@ -226,6 +226,13 @@ class _Draft:
             self._told_of_modes.append(
                 Note("homing methods", ", ".join(map(str, methods)) + " of 6098h; others are refused")
             )
+            self._told_of_modes += [
+                Note(
+                    f"homing method {one}",
+                    f"60E3h has it, and the emulator does not: {_why_not(one)}; 6098h refuses it",
+                )
+                for one in sorted(self._listed_methods() - set(methods))
+            ]
         return numbers
 
     def _homing_methods(self) -> list[int]:
@@ -233,8 +240,12 @@ class _Draft:
         variable = self._types.get((cia402.HOMING_METHOD, 0))
         low = -128 if variable is None or variable.min is None else variable.min
         high = 127 if variable is None or variable.max is None else variable.max
-        listed = {self._default(cia402.HOMING_METHODS, sub) for sub in range(1, 255)} - {0}
+        listed = self._listed_methods()
         return [one for one in HOMING_METHODS if low <= one <= high and (not listed or one in listed)]
+
+    def _listed_methods(self) -> set[int]:
+        """Return the methods that 60E3h lists."""
+        return {self._default(cia402.HOMING_METHODS, sub) for sub in range(1, 255)} - {0}
 
     def _standard_bindings(self) -> dict[Key, Binding]:
         found = {}
@@ -465,6 +476,15 @@ class _Draft:
                       f'object = "{_text(key)}"', "highest = 1_000_000", f'loop = "{loop}"', f'part = "{part.upper()}"',
                       ""]  # fmt: skip
         return "\n".join(lines)
+
+
+def _why_not(method: int) -> str:
+    """Return why the emulator lacks a method of homing that an EDS lists."""
+    if method < 0:
+        return "negative numbers are the maker's own methods"
+    if method in HOMING_METHODS:
+        return "it lies outside 6098h's limits"
+    return "the standard has none of that number"
 
 
 def _text(key: Key) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
+from drive_env.devices.standard_objects import HOMING_HERE
 from drive_env.dictionary.codec import code_of, encode_one
 from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
@@ -65,7 +66,7 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
             found[_text((index, 0))] = max(round(rated), 1)
     methods = device.allowed_values.get((cia402.HOMING_METHOD, 0), ())
     if methods and dictionary.find(cia402.HOMING_METHOD).default not in methods:
-        found[_text((cia402.HOMING_METHOD, 0))] = methods[-1]
+        found[_text((cia402.HOMING_METHOD, 0))] = next((one for one in HOMING_HERE if one in methods), methods[-1])
     return found
 
 

@@ -15,7 +15,8 @@ from drive_env.dictionary.bindings import Binding
 VELOCITY, ACCELERATION, TORQUE = "velocity", "acceleration", "torque"
 ERROR_REGISTER = 0x1001
 # Numbers of 6098h that homing knows (firmware/common/modes/hm.py).
-HOMING_METHODS = (1, 2, 3, 5, 17, 18, 19, 21, 33, 34, 35)
+HOMING_METHODS = (*range(1, 15), *range(17, 31), 33, 34, 35, 37)
+HOMING_HERE = (35, 37)  # which need no switch
 # Values of 605Ah that the automaton knows (firmware/common/fsa.py).
 QUICK_STOP_OPTIONS = (1, 2, 5, 6)
 

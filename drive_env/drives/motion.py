@@ -29,7 +29,13 @@ STOP_TIMEOUT = 5.0  # s, for the stop of an axis whose own mode was changed whil
 
 
 def wait_for(
-    drives: BasicDrives, pattern: tuple[int, int], timeout: float, what: str, where: Mask | None = None
+    drives: BasicDrives,
+    pattern: tuple[int, int],
+    timeout: float,
+    what: str,
+    where: Mask | None = None,
+    *,
+    or_else: tuple[int, int] | None = None,
 ) -> None:
     """Let time pass until the statusword of every axis matches.
 
@@ -39,16 +45,18 @@ def wait_for(
         timeout: Longest wait [s].
         what: What is waited for, for the message.
         where: Axes that count; all by default.
+        or_else: Another mask and value that end the wait of an axis.
 
     Raises:
         TimeoutError: If an axis does not get there, with its statusword; RuntimeError if one is in fault.
     """
-    mask, value = pattern
     axes = np.ones(drives.num_axes, bool) if where is None else where
     waited = 0.0
     while True:
         status = drives.read(cia402.STATUSWORD)
-        late = axes & (status & mask != value)
+        late = axes & ~cia402.matches(status, pattern)
+        if or_else is not None:
+            late &= ~cia402.matches(status, or_else)
         if not late.any():
             return
         fault = axes & cia402.matches(status, cia402.FAULT)
@@ -205,7 +213,9 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
     stopped = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.QUICK_STOP_ACTIVE)
     if stopped.any():
         drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=stopped)
-        wait_for(drives, cia402.OPERATION_ENABLED, timeout, "operation enabled after the quick stop", stopped)
+        # By 605Ah the drive takes transition 16, or goes on to switch on disabled by itself: it is enabled from there.
+        wait_for(drives, cia402.OPERATION_ENABLED, timeout, "the end of the quick stop", stopped,
+                 or_else=cia402.SWITCH_ON_DISABLED)  # fmt: skip
     not_enabled = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if not not_enabled.any():
         return

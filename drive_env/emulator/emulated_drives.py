@@ -382,7 +382,7 @@ class EmulatedDrives:
         records["set_point_buffer"] = device.quirks.set_point_buffer
         self._kind.set_constants(records, device, self.motor)
         if self._kind.connect is not None:
-            self._kind.connect(records, self.load.num_axes)
+            self._kind.connect(records, device, np.full(self.num_axes, self.load.num_axes % device.num_axes == 0))
         self._set_noise(np.ones(self.num_axes, bool))
 
     def _set_noise(self, axes: Mask) -> None:

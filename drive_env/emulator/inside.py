@@ -67,6 +67,18 @@ class Inside:
         """
         return self._drives._cycles(duration)
 
+    def connect_axes(self, first: int, number: int) -> None:
+        """Let machines of one axis each have in common what axes of one drive share, as a DC link: as on a node.
+
+        Args:
+            first: The drive's first axis.
+            number: Its axes that turn a machine.
+        """
+        drives = self._drives
+        if drives._kind.connect is not None and drives.load.num_axes == 1:
+            axes = np.arange(drives.num_axes)
+            drives._kind.connect(drives._records, drives.device, (axes >= first) & (axes < first + number))
+
     def refresh_inertia(self) -> None:
         """Tell the rotors what they turn, after a load was changed."""
         self._drives._refresh_inertia()

@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
+ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
 _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
@@ -265,6 +266,47 @@ class Machines:
         entries = self._drives._objects.entries
         first = entries.find(Role.ANALOG_INPUTS)
         return [(entry.index, entry.sub) for entry in entries if entry.index == first.index and entry.sub >= first.sub]
+
+    @property
+    def drive_mode(self) -> NDArray[np.int64]:
+        """The drive's own mode, shape (num_axes,), as its maker's service program sets it (the TGZ's D-Mode, 2303h).
+
+        Setting it is what such a program does beside a master: none of its frames is seen on the bus. The numbers are
+        the object's; ObjectAccessError for another one, and for a drive that has no such mode.
+        """
+        return self._drives.read(Role.MODE_GATE)
+
+    @drive_mode.setter
+    def drive_mode(self, value: ArrayLike) -> None:
+        self._drives.write(Role.MODE_GATE, value)
+
+    @property
+    def error_bits(self) -> NDArray[np.int64]:
+        """Errors that are there whatever machine and drive do, shape (num_axes,); bit k is error k of the table.
+
+        Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is none of
+        its errors, and on drives whose errors have no numbers.
+        """
+        self._check_has_errors()
+        return self._axis_field(ERRORS_FIELD).astype(np.int64)
+
+    @error_bits.setter
+    def error_bits(self, value: ArrayLike) -> None:
+        self._check_has_errors()
+        device = self._drives.device
+        known = 0
+        for cause in device.firmware.causes:
+            known |= cause.status_flag
+        values = np.broadcast_to(np.asarray(value), (self._drives.num_axes,))
+        if values.dtype.kind not in "iu" or np.any(values & ~known):
+            bits = ", ".join(str(bit) for bit in range(32) if known >> bit & 1)
+            raise ValueError(f"error bits of {device.name} are whole numbers of bits {bits}, not {value!r}")
+        set_lanes(self._drives._records, ERRORS_FIELD, values)
+
+    def _check_has_errors(self) -> None:
+        device = self._drives.device
+        if not device.firmware.layout.has(ERRORS_FIELD):
+            raise ValueError(f"errors of {device.name} have no numbers; make them by what causes them")
 
     @property
     def leds(self) -> tuple[NDArray[np.str_], NDArray[np.str_]]:

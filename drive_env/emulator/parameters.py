@@ -48,7 +48,7 @@ class MachineKind(NamedTuple):
         set_constants: (records, device, motor): writes the fields that no parameter is.
         apply: (records, device, motor, name, values, axes): brings a parameter's values, one per axis, into records.
         noise: Field that is the state of the axes' noise generator; "" without one.
-        connect: (records, axes of a machine): connects what the axes of a machine have in common; None: nothing.
+        connect: (records, device, axes): connects what the axes of one drive have in common; None: nothing.
     """
 
     motor_parameters: Callable[[Motor], list[MachineParameter]]
@@ -57,7 +57,7 @@ class MachineKind(NamedTuple):
     set_constants: Callable[[Records, Device, Motor], None]
     apply: Callable[[Records, Device, Motor, str, Floats, Mask], None]
     noise: str
-    connect: Callable[[Records, int], None] | None = None
+    connect: Callable[[Records, Device, Mask], None] | None = None
 
 
 def parameter_table(

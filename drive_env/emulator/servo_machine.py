@@ -36,6 +36,7 @@ _FIELDS = {
     "motor.hall_offset": ("hall_true_offset", 0),
     "motor.hall_broken": ("hall_broken", 0),
     "motor.encoder_broken": ("encoder_broken", 0),
+    "motor.index_angle": ("index_angle", 0),
     "motor.open_a": ("open_a", 0),
     "motor.open_b": ("open_b", 0),
     "motor.cogging_torque": ("cogging_torque", 0),
@@ -101,9 +102,10 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
 
 
 def wiring_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return how the motor's cables may be wired."""
+    """Return how the motor's cables may be wired, and where its encoder's index is."""
     wired = {name: float(getattr(motor, name.removeprefix("motor."))) for name in WIRING}
-    return [MachineParameter(name, "1", value, 0.0, 1.0, value) for name, value in wired.items()]
+    rows = [MachineParameter(name, "1", value, 0.0, 1.0, value) for name, value in wired.items()]
+    return [*rows, MachineParameter("motor.index_angle", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0)]
 
 
 # Parameters that are no field as they stand: how each is brought into the records.

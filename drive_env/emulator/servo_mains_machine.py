@@ -1,7 +1,9 @@
 """Machines with servo amplifiers on mains: a servo machine's parameters, and those of rectifier, link and resistor.
 
-The axes of a machine with an even number of them are the pairs of two-axis modules, and share links. Machines have
-nothing in common with each other, so an axis that is alone in its machine has a link of its own.
+The axes of a machine with an even number of them are the pairs of two-axis modules, and share links. Machines of one
+axis have nothing in common with each other, each with a module of its own, until a node of a fieldbus has two of them:
+axes of one module share its link, whatever they turn. A machine of three axes has three links, and so has each axis
+of a device with one axis.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from drive_env.firmware.record import LANES, set_lanes
 from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
 from drive_env.motors import Motor
 
+AXES = 2  # that share a link
 OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off
 CHOPPER, CHOPPER_HYSTERESIS = 0.92, 0.025  # of the over-voltage: where the chopper begins, and how far it draws down
 OVERSPEED = 1.5  # of the rated speed
@@ -74,10 +77,14 @@ def set_constants(records: Records, device: Device, motor: Motor) -> None:
     records["encoder_direction"] = motor.encoder_direction
 
 
-def connect(records: Records, axes_per_machine: int) -> None:
-    """Let the axes of a machine share links in pairs."""
-    shared = axes_per_machine % 2 == 0
-    records["link_shared"] = 1.0 if shared else 0.0
+def connect(records: Records, device: Device, axes: Mask) -> None:
+    """Let axes of a two-axis device share link and inputs with the other one of their pair: axes 2k and 2k + 1."""
+    if device.num_axes != AXES:
+        return
+    pairs = np.zeros(len(axes) + len(axes) % 2, bool)
+    pairs[: len(axes)] = axes
+    both = np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: len(axes)]
+    set_lanes(records, "link_shared", both.astype(float), both)
 
 
 SERVO_MAINS = MachineKind(

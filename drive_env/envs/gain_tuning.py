@@ -79,11 +79,11 @@ class GainTuningConfig:
             object.__setattr__(self, "motor", find_device(self.device).default_motor)
         object.__setattr__(self, "gains", known.outer if self.gains is None else tuple(self.gains))
         for name in self.chosen:
-            check_choice("a gain", name, known.names)
+            check_choice("a gain", name, known.searched)
         if known.is_open_loop:
             check_tried(find_device(self.device), self.chosen)
         if not self.chosen or len(set(self.chosen)) != len(self.chosen):
-            raise ValueError(f"gains must be different ones of {', '.join(known.names)}, not {self.gains}")
+            raise ValueError(f"gains must be different ones of {', '.join(known.searched)}, not {self.gains}")
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.step < math.inf:

@@ -31,6 +31,7 @@ class NodeAxes(Sequence[Axis]):
                 f"first_axis={first_axis}: {device.name} has {number} of the {drives.num_axes} axes there are; "
                 f"use 0 to {drives.num_axes - number}"
             )
+        drives.inside.connect_axes(first_axis, number)
         mask = np.zeros(drives.num_axes, bool)
         mask[first_axis : first_axis + number] = True
         self._axes = [Axis(objects, int(k)) for k in np.flatnonzero(mask)]

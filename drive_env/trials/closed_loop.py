@@ -48,7 +48,6 @@ FRICTION_SHARE = 0.5  # of the trial's torque, that friction and a constant load
 PROBE = 0.8  # run current of the probe over that of the trial: a greater overload
 CLOSING, LONGEST_CLOSING = 0.6, 3.2  # s: the rotor swings in for 0.4 s, and for 3 s at most
 LOOK = 0.05  # s
-LOAD_ANGLE = 1  # of `Role.LOOP_MODE`: it alone has an initialisation
 
 
 class ClosedLoopTrial(NamedTuple):
@@ -168,7 +167,6 @@ class ClosedLoopTrials(OpenLoopTrials):
     ) -> ClosedLoopTrial:
         """Try gains in a move from the origin, back, and there again with less current; as `Trials.run` has it."""
         drives, count = self._drives, self._drives.num_axes
-        device = device_of(drives)
         away = origin + direction * move.distance
         shape = (len(PHASES), count)
         aborted = np.zeros(shape, bool)
@@ -177,23 +175,36 @@ class ClosedLoopTrials(OpenLoopTrials):
         first_error = np.zeros((TRIAL, count))
         size = np.maximum(np.abs(move.distance), 1)
         write_profile(drives, move, where)
-        for phase, (target, share) in enumerate(((away, 1.0), (origin, 1.0), (away, PROBE))):
-            used = np.where(stopped[:, None], incumbent, with_run_current(device, gains, share * move.share))
-            write_gains(drives, used, where)
+        for phase, target in enumerate((away, origin, away)):
+            tried = self._tried(gains, move, is_probe=phase == len(PHASES) - 1)
+            write_gains(drives, np.where(stopped[:, None], incumbent, tried), where)
             position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)
             culprit |= new
             aborted[phase] = stopped
             sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
-            settling[phase], noise[phase], overshoot[phase] = move_terms(
-                position, current * ampere_per_count(drives), move, self._t_0, self._motor.rated_current, target, sign
-            )
-            error = wrapped(demand - position) / size
-            following[phase] = np.abs(error).sum(axis=0) * CYCLE
+            settling[phase], noise[phase], overshoot[phase] = self._terms(position, current, move, target, sign)
+            error = wrapped(demand - position)
+            following[phase] = np.abs(error / self._following_scale(move)).sum(axis=0) * CYCLE
             if phase == 0:
-                first_error = error
+                first_error = error / size
         write_gains(drives, np.where(stopped[:, None], incumbent, gains), where)
         terms = Terms(settling, 1.0 + following / self._t_0, noise, overshoot, aborted)
         return ClosedLoopTrial(terms, np.maximum(following, 0.5 * CYCLE), aborted, first_error, culprit)
+
+    def _tried(self, gains: Integers, move: Move, *, is_probe: bool) -> Integers:
+        """Return gains as a phase of the trial has them."""
+        return with_run_current(device_of(self._drives), gains, (PROBE if is_probe else 1.0) * move.share)
+
+    def _terms(
+        self, position: Floats, current: Floats, move: Move, target: Integers, sign: Integers
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return t_s/t_0, n and os of a phase, (num_axes,) each."""
+        ampere = current * ampere_per_count(self._drives)
+        return move_terms(position, ampere, move, self._t_0, self._motor.rated_current, target, sign)
+
+    def _following_scale(self, move: Move) -> Floats:
+        """Return over what the integral of |demand - encoder| counts [inc]."""
+        return np.maximum(np.abs(move.distance), 1).astype(float)
 
     def _watch_no_window(self) -> None:
         """Take 6065h away, which drives have again that were switched on: an axis that is overloaded falls behind."""
@@ -216,8 +227,4 @@ class ClosedLoopTrials(OpenLoopTrials):
         """Return whose loop is closed: of load angle control, once the encoder commutates."""
         drives = self._drives
         asked = drives.read(Role.LOOP_MODE) == self._closed.mode
-        return np.asarray(asked & ((self._closed.mode != LOAD_ANGLE) | (drives.read(Role.LOOP_INITIALISED) != 0)))
-
-
-def _full_step(motor: Motor) -> float:
-    return 2.0 * np.pi / (4.0 * motor.n_p)
+        return np.asarray(asked & (self._closed.is_pid | (drives.read(Role.LOOP_INITIALISED) != 0)))

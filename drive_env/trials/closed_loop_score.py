@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.gains import write_gains
 from drive_env.phase_current import swing_period
-from drive_env.trials.closed_loop import CLOSING, LOAD_ANGLE, OVERLOAD, full_step, held_in_trial
+from drive_env.trials.closed_loop import CLOSING, OVERLOAD, full_step, held_in_trial
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW, with_run_current
 from drive_env.trials.positioning import (
     CYCLE,
@@ -28,11 +29,10 @@ from drive_env.trials.positioning import (
     move_terms,
     power_up,
     start,
-    swing,
     wrapped,
     write_profile,
 )
-from drive_env.trials.score import LOAD_SHARE, RobustScore, Terms
+from drive_env.trials.score import LOAD_SHARE, CurrentSwings, RobustScore, Terms, swings
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -74,17 +74,17 @@ class ClosedLoopScore(RobustScore):
     def _close(self) -> Mask:
         """Enable the drives at rest and close their loops; return of which axes they are closed."""
         drives = self._drives
-        closed = drives.device.gains.closed_loop
-        assert closed is not None, "a drive that closes a loop"
+        closed = drives.device.gains.loop_of_kind(LOAD_ANGLE)
+        assert closed is not None, "a drive that closes such a loop"
         drives.write(cia402.SENSOR_SELECTION, ENCODER)
         drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
         power_up(drives)
         drives.write(Role.LOOP_MODE, closed.mode)
         drives.advance(CLOSING)
-        return np.asarray((drives.read(Role.LOOP_INITIALISED) != 0) | (closed.mode != LOAD_ANGLE))
+        return np.asarray(drives.read(Role.LOOP_INITIALISED) != 0)
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, variants, axes) each."""
+    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
+        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swings, (machines, variants, axes) each."""
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -119,5 +119,5 @@ class ClosedLoopScore(RobustScore):
         return (
             terms.each(lambda value: value.reshape(self._axes)),
             np.maximum(error, least).reshape(self._axes),
-            swing(np.asarray(current, float), drives.motor.rated_current).reshape(self._axes),
+            swings(np.asarray(current, float), drives.motor.rated_current, self._axes),
         )

@@ -228,7 +228,7 @@ class Trials:
                 trace = self._record(objects, WATCH)
             traces.append(trace)
             down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
-            shaking = shakes(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives), self._motor.rated_current)
+            shaking = self._shaking(trace)
             new = self._whole_lanes(down | shaking) & where & ~stopped
             if new.any():
                 write_gains(drives, incumbent, new)
@@ -239,6 +239,11 @@ class Trials:
                 start(drives, to, down)
         position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
         return position, demand, current, stopped, culprit
+
+    def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
+        """Return which axes oscillate in the samples of a look, (num_axes,)."""
+        current = trace[cia402.TORQUE_ACTUAL] * ampere_per_count(self._drives)
+        return np.asarray(shakes(current, self._motor.rated_current))
 
     def _prepare(self, objects: list[Any]) -> None:
         """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""

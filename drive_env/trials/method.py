@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.devices.gain_set import PID_ALONE
 from drive_env.gains import (
     BASELINE_RULE,
     bandwidth_gains,
@@ -21,11 +22,13 @@ from drive_env.phase_current import currents_for, rated_setting, swing_period, w
 from drive_env.trials.closed_loop import ClosedLoopTrials, plan_overload
 from drive_env.trials.gain_trial import Identified, Trials, softness
 from drive_env.trials.open_loop import OpenLoopTrials, open_loop_cost, open_loop_softness
+from drive_env.trials.position_pid import PID_I, PID_P, PidTrials, load_step_error, pid_time, plan_pid
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.devices.gain_set import ClosedLoop
     from drive_env.drives.interface import Drives
     from drive_env.motors import Motor
     from drive_env.trials.positioning import Move
@@ -41,6 +44,7 @@ SAFE_RULE = BASELINE_RULE._replace(
 )
 
 SLOW = 1.0 / 3.0  # of the gains of a stepper's closed loop, where a safe search begins
+SLOW_I = SLOW**2  # of the integral gain of a PID: as slow in time as its P
 
 
 class Cascade(NamedTuple):
@@ -198,6 +202,7 @@ class ClosedStepper(NamedTuple):
 
     device: Device
     motor: Motor
+    loop: ClosedLoop
 
     @property
     def measures_current(self) -> bool:
@@ -210,25 +215,28 @@ class ClosedStepper(NamedTuple):
         return 1
 
     def t_0(self) -> float:
-        """Return the period of the rotor's swing in its field at rated current [s]."""
-        return swing_period(self.motor)
+        """Return the period of the rotor's swing in its field at rated current; of a PID alone its own time [s]."""
+        return pid_time(self.loop) if self.loop.kind == PID_ALONE else swing_period(self.motor)
 
     def highest(self) -> Integers:
         """Return the greatest integers."""
         return OpenLoop(self.device, self.motor).highest()
 
     def first(self, supply: Floats) -> Integers:
-        """Return the rated current, and what the device is commissioned with for its loop."""
+        """Return the rated current, and the loop's first values, or what the device is commissioned with for it."""
         gains = OpenLoop(self.device, self.motor).first(supply)
         dictionary = self.device.new_dictionary()
         entries = [(dictionary.find(name), value) for name, value in self.device.preset(self.motor).items()]
         preset = {(entry.index, entry.sub): value for entry, value in entries}
-        for row in self.device.gains.closed_rows:
-            gains[:, self.device.gains.names.index(row.name)] = preset.get(row.key, row.lowest)
+        for name, column in zip(self.loop.gains, self._columns(), strict=True):
+            row = self.device.gains.rows[column]
+            gains[:, column] = self.loop.first.get(name, preset.get(row.key, row.lowest))
         return gains
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return a move that overloads the motor."""
+        """Return a move that overloads the motor; for a PID one that it follows."""
+        if self.loop.is_pid:
+            return plan_pid(self.motor, self.loop, found, scaler, reach)
         return plan_overload(self.device, self.motor, found, scaler, reach)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
@@ -237,8 +245,12 @@ class ClosedStepper(NamedTuple):
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return a third of that: slower to catch up."""
-        gains = self.first(supply)
-        return self.device.gains.scaled(gains, SLOW, self._columns())
+        gains, known = self.first(supply), self.device.gains
+        if not self.loop.is_pid:
+            return known.scaled(gains, SLOW, self._columns())
+        p, i = (known.column(*part) for part in (PID_P, PID_I))
+        assert p is not None and i is not None, "a PID has both"
+        return known.scaled(known.scaled(gains, SLOW, [p]), SLOW_I, [i])
 
     def keep(self, gains: Integers, present: Integers) -> Integers:
         """Return gains with the load detection's settings that drives have at present."""
@@ -248,12 +260,13 @@ class ClosedStepper(NamedTuple):
 
     def trials(self, drives: Drives, axes: int) -> ClosedLoopTrials:
         """Return what runs trials."""
-        closed = self.device.gains.closed_loop
-        assert closed is not None, "a drive that closes a loop"
-        return ClosedLoopTrials(drives, self.motor, axes, self.t_0(), closed)
+        kind = PidTrials if self.loop.is_pid else ClosedLoopTrials
+        return kind(drives, self.motor, axes, self.t_0(), self.loop)
 
     def softness(self, gains: Integers) -> Floats:
-        """Return 1: how an overload is caught up with is measured in each trial."""
+        """Return 1: how an overload is caught up with is measured in each trial; of a PID it by its gains' model."""
+        if self.loop.is_pid:
+            return load_step_error(self.device, self.motor, self.loop, gains)
         return np.ones(len(gains))
 
     def cost(self, terms: Terms) -> Floats:
@@ -261,25 +274,20 @@ class ClosedStepper(NamedTuple):
         return cost(terms)
 
     def current(self, terms: Terms) -> Floats:
-        """Return the ripple of the torque current."""
+        """Return the ripple of the torque current; of a PID, where none is measured, the vibration as J counts it."""
         return terms.noise
 
     def _columns(self) -> list[int]:
-        return [self.device.gains.names.index(row.name) for row in self.device.gains.closed_rows]
+        return self.device.gains.columns_of_loop(self.loop)
 
 
 Method = Cascade | OpenLoop | ClosedStepper
 
 
-def closes_loop(device: Device, names: tuple[str, ...]) -> bool:
-    """Return whether gains of these names act with a stepper's loop closed alone."""
-    return any(row.name in names for row in device.gains.closed_rows)
-
-
 def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Method:
     """Return how gains of a device are tried; with names of gains that act in a closed loop alone with it closed."""
-    if closes_loop(device, names):
-        return ClosedStepper(device, motor)
+    if (loop := device.gains.loop_of(names)) is not None:
+        return ClosedStepper(device, motor, loop)
     return OpenLoop(device, motor) if device.gains.is_open_loop else Cascade(device, motor)
 
 
@@ -291,14 +299,15 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
             "tell apart; name gains of its gains.toml"
         )
     device.gains.columns(names)
-    closed = [row.name for row in device.gains.closed_rows]
-    if closes_loop(device, names):
-        if others := [name for name in names if name not in closed]:
+    if (loop := device.gains.loop_of(names)) is not None:
+        if others := [name for name in names if name not in loop.gains]:
             raise ValueError(
-                f"{', '.join(others)}: trials of {', '.join(name for name in names if name in closed)} close the loop "
-                f"at the motor's rated current, and show what {', '.join(closed)} do; search the others by themselves"
+                f"{', '.join(others)}: trials of {', '.join(name for name in names if name in loop.gains)} close the "
+                f"loop at the motor's rated current, and show what {', '.join(loop.gains)} do; search the others by "
+                "themselves"
             )
         return
+    closed = [name for each in device.gains.closed_loops for name in each.gains]
     if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
         shown = ", ".join(device.gains.outer)
         shown += f", and with its loop closed what {', '.join(closed)} do" if closed else ""
@@ -318,9 +327,12 @@ def new_score(
     from drive_env.devices import find_device
     from drive_env.trials.closed_loop_score import ClosedLoopScore
     from drive_env.trials.open_loop_score import OpenLoopScore
+    from drive_env.trials.position_pid_score import PidScore
 
     known = find_device(device)
-    if closes_loop(known, gains):
+    if (loop := known.gains.loop_of(gains)) is not None:
+        if loop.is_pid:
+            return PidScore(device, load, motor, num_machines, loop=loop, **options)
         return ClosedLoopScore(device, load, motor, num_machines, **options)
     kind: Callable[..., RobustScore] = OpenLoopScore if known.gains.is_open_loop else RobustScore
     return kind(device, load, motor, num_machines, **options)

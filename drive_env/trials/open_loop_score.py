@@ -26,19 +26,19 @@ from drive_env.trials.open_loop import (
     with_run_current,
 )
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
-from drive_env.trials.score import RobustScore, Scores
+from drive_env.trials.score import CurrentSwings, RobustScore, Scores
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
 class OpenLoopScore(RobustScore):
-    """As `RobustScore`, of open-loop steppers; it has no swing of a measured current, which is nan."""
+    """As `RobustScore`, of open-loop steppers; it has no swings of a measured current, which are nan."""
 
     def _settling_scale(self, filters: Floats) -> Floats:
         return np.full(np.shape(filters), swing_period(self._drives.motor))
 
-    def _run(self, gains: Integers) -> tuple[OpenLoopTerms, Floats, Floats]:  # type: ignore[override]
+    def _run(self, gains: Integers) -> tuple[OpenLoopTerms, Floats, CurrentSwings]:  # type: ignore[override]
         """Return the terms of every axis without E_d/E_0, E_d [rad s], no swing, (machines, runs, axes) each."""
         drives, move, motor = self._drives, self._move, self._drives.motor
         drives.machine.load_torque = self._constant
@@ -76,9 +76,9 @@ class OpenLoopScore(RobustScore):
         return (
             terms.each(lambda value: value.reshape(self._axes)),
             np.maximum(error, least).reshape(self._axes),
-            np.full(self._axes, np.nan),
+            CurrentSwings(np.full(self._axes, np.nan), np.full(self._axes, np.nan)),
         )
 
-    def _scores(self, terms: OpenLoopTerms, disturbance: Floats, swings: Floats) -> Scores:  # type: ignore[override]
+    def _scores(self, terms: OpenLoopTerms, disturbance: Floats, swings: CurrentSwings) -> Scores:  # type: ignore[override]
         terms = terms._replace(disturbance=disturbance / self._reference[:, None])
         return self._averaged(terms, open_loop_cost(terms), swings)

@@ -147,6 +147,16 @@ def swing(current: Floats, rated_current: float) -> Floats:
     return np.asarray(np.sqrt(np.mean(np.diff(windows, axis=1) ** 2, axis=1)).max(axis=0) / rated_current)
 
 
+def resting_swing(current: Floats, rated_current: float) -> Floats:
+    """Return how the current swings about its mean late in a move (RMS), over the rated one, (num_axes,).
+
+    Args:
+        current: Of a move from its start on, before any load step [A], (SETTLED cycles, num_axes).
+        rated_current: Of the motor, peak i_q [A].
+    """
+    return np.asarray(current[QUIET:SETTLED].std(axis=0) / rated_current)
+
+
 def wrapped(increments: Floats | Integers) -> Floats:
     """Return differences of positions that wrap at 2^31, as they are."""
     return (np.asarray(increments, float) + 2.0**31) % 2.0**32 - 2.0**31

@@ -40,6 +40,7 @@ from drive_env.trials.positioning import (
     move_terms,
     plan_move,
     power_up,
+    resting_swing,
     start,
     swing,
     wrapped,
@@ -130,13 +131,25 @@ class Scores(NamedTuple):
 
     A machine with several axes is as good as its worst. Of several runs it is the mean of each. swing: What a trial
     would measure, the largest RMS increment of the current over 25 ms until the load step, over the rated one,
-    likewise, and the largest of several runs; J does not count it.
+    likewise, and the largest of several runs; J does not count it. rest: How the current swings about its mean before
+    the load step (RMS), over the rated one, likewise, and the mean of several runs; neither does J count that.
     """
 
     robust_cost: Floats
     j: Floats
     terms: Terms
     swing: Floats
+    rest: Floats
+
+
+class CurrentSwings(NamedTuple):
+    """How currents swing, over the rated one, each of shape (machines, runs, axes); nan where no current is measured.
+
+    moving: The largest RMS increment over 25 ms until the load step. resting: RMS about the mean before it.
+    """
+
+    moving: Floats
+    resting: Floats
 
 
 class RobustScore:
@@ -176,15 +189,15 @@ class RobustScore:
         from mechanics.shaft import one, way
 
         found = find_load(load)
-        is_open_loop = find_device(device).gains.is_open_loop
+        by_current = self._tries_current(find_device(device).gains.is_open_loop)
         fields = {parameter.field for parameter in found.parameters}
         self.variants = tuple(
             variant
             for variant in VARIANTS
             if (variant.inertia == 1.0 or fields & set(_INERTIA))
             and (variant.stiffness == 1.0 or fields & set(_STIFFNESS))
-            and (variant.velocity_p == 1.0 or not is_open_loop)
-            and (variant.run_current == 1.0 or is_open_loop)
+            and (variant.velocity_p == 1.0 or not by_current)
+            and (variant.run_current == 1.0 or by_current)
         )
         self.num_machines, self.repeats = num_machines, repeats
         self._runs = repeats * len(self.variants)  # of a machine
@@ -264,6 +277,11 @@ class RobustScore:
         """Close the drives."""
         self._drives.close()
 
+    @staticmethod
+    def _tries_current(is_open_loop: bool) -> bool:
+        """Return whether a variant has less run current, in place of more gain."""
+        return is_open_loop
+
     def _settling_scale(self, filters: Floats) -> Floats:
         """Return t_0 of the machines with these velocity filters [s]."""
         return 4.0 * small_time_constants(self._drives.device, filters)
@@ -275,8 +293,8 @@ class RobustScore:
         full = (machines, runs, axes, *values.shape[1:])
         return np.broadcast_to(values.reshape(shape), full).reshape(-1, *values.shape[1:])
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, runs, axes) each."""
+    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
+        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swings, (machines, runs, axes) each."""
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -312,24 +330,37 @@ class RobustScore:
         least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         shape = self._axes
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
-        swings = swing(free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives), drives.motor.rated_current)
+        measured = free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives)
         return (
             terms.each(lambda value: value.reshape(shape)),
             np.maximum(error, least).reshape(shape),
-            swings.reshape(shape),
+            swings(measured, drives.motor.rated_current, shape),
         )
 
-    def _scores(self, terms: Terms, disturbance: Floats, swings: Floats) -> Scores:
+    def _scores(self, terms: Terms, disturbance: Floats, swings: CurrentSwings) -> Scores:
         terms = terms._replace(disturbance=disturbance / self._reference[:, None])
         return self._averaged(terms, cost(terms), swings)
 
-    def _averaged(self, terms: Any, j: Floats, swings: Floats) -> Scores:
-        """Return the scores by terms, J and swing of every axis in all runs, (machines, runs, axes)."""
+    def _averaged(self, terms: Any, j: Floats, swings: CurrentSwings) -> Scores:
+        """Return the scores by terms, J and swings of every axis in all runs, (machines, runs, axes)."""
         worst = j.argmax(axis=-1)[..., None]
         of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
         shape = (self.num_machines, self.repeats, len(self.variants))
-        j, swings = j.max(axis=-1).reshape(shape), swings.max(axis=-1).reshape(shape)
+        j, moving, resting = (one.max(axis=-1).reshape(shape) for one in (j, *swings))
         if self.repeats > 1:
             tripped = of_worst.tripped.reshape(shape).any(axis=1)
             of_worst = of_worst.each(lambda value: value.reshape(shape).mean(axis=1))._replace(tripped=tripped)
-        return Scores(robust_cost(j).mean(axis=1), j.mean(axis=1), of_worst, swings.max(axis=1))
+        cost_of_runs = robust_cost(j)
+        return Scores(cost_of_runs.mean(axis=1), j.mean(axis=1), of_worst, moving.max(axis=1), resting.mean(axis=1))
+
+
+def swings(current: Floats, rated_current: float, shape: tuple[int, ...]) -> CurrentSwings:
+    """Return how the measured current of runs swings, of the given shape.
+
+    Args:
+        current: Until the load step [A], (SETTLED cycles, axes of all machines).
+        rated_current: Of the motor, peak i_q [A].
+        shape: Machines, runs, axes.
+    """
+    found = (swing(current, rated_current), resting_swing(current, rated_current))
+    return CurrentSwings(*(one.reshape(shape) for one in found))

@@ -16,6 +16,7 @@ from drive_env.gains import write_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
+from tuning.auto.calmer_gains import far_enough, twins_tell
 from tuning.auto.measured_margins import CALMED, SENSITIVITY, judged_loops, margins_with, sensitivity
 from tuning.auto.moves import show
 from tuning.auto.stages import Verdict
@@ -121,6 +122,19 @@ def _rule_instead(
     return recorded
 
 
+def _others_instead(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, why: str) -> RecordedGains:
+    """Take other gains for an axis whose own cannot be calmed by less P: the best by its twins, or the rule's."""
+    assert recorded.response is not None, "it was measured"
+    gains = far_enough(bench, basis, recorded, k) if twins_tell(bench, basis, k) else None
+    if gains is None:
+        return _rule_instead(bench, basis, recorded, k, recorded.response, why)
+    bench.journals[k].note(
+        f"other gains were searched on the digital twins: with the first ones {why}; the margins with the new gains "
+        "are computed from that measurement"
+    )
+    return recorded.with_gains(k, gains)
+
+
 def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, response: MeasuredLoop) -> RecordedGains:
     """Lower the gains of an axis one of whose loops comes too near to instability."""
     seen = _seen(response, k)
@@ -138,7 +152,7 @@ def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, respon
                 break
         else:
             why = f"the measured {loop} loop has a sensitivity peak Ms of {found.ms:.1f}"
-            return _rule_instead(bench, basis, recorded, k, response, why)
+            return _others_instead(bench, basis, replace(recorded, response=response), k, why)
         if factor != 1.0:
             names = " and ".join(known.titles[column] for column in calmed)
             bench.journals[k].note(
@@ -150,8 +164,13 @@ def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, respon
     return recorded if np.array_equal(gains, recorded.gains[k]) else recorded.with_gains(k, gains)
 
 
-def _try_again(bench: AutoBench, basis: Basis, recorded: RecordedGains, calmed: Mask) -> RecordedGains:
-    """Try gains that were lowered, and record a move with them; without time for a trial, only the move."""
+def _try_again(
+    bench: AutoBench, basis: Basis, recorded: RecordedGains, calmed: Mask, use_rule: bool = True
+) -> RecordedGains:
+    """Try gains that were changed, and record a move with them; without time for a trial, only the move.
+
+    What fails gives way to the baseline rule's, slowed as far as needed, which are tried in turn.
+    """
     where = calmed & bench.affordable(TRIAL_TIME + MOVE_TIME + basis.look_back_time(bench))
     bench.reserve(
         calmed & ~where, "the lowered gains were tried by one move only: the drive time of the run was used up"
@@ -162,8 +181,18 @@ def _try_again(bench: AutoBench, basis: Basis, recorded: RecordedGains, calmed: 
             proof = bench.ground.run(recorded.gains, where)
         proven = np.where(where[:, None], recorded.gains, recorded.proven)
         recorded = replace(recorded, proof=np.where(where, proof.cost, recorded.proof), proven=proven)
-        for k in map(int, np.flatnonzero(where & ~proof.passed)):
-            bench.journals[k].stop(f"the lowered gains failed their trial: {proof.reason[k]}")
+        failed = where & ~proof.passed
+        again = failed & bench.affordable(TRIAL_TIME + MOVE_TIME) if use_rule else np.zeros_like(failed)
+        for k in map(int, np.flatnonzero(failed)):
+            why = f"the lowered gains failed their trial: {proof.reason[k]}"
+            if again[k]:
+                assert recorded.response is not None, "it was measured"
+                recorded = _rule_instead(bench, basis, recorded, k, recorded.response, why)
+            else:
+                bench.journals[k].stop(why)
+        if again.any():
+            recorded = _try_again(bench, basis, recorded, again & bench.going, use_rule=False)
+            calmed &= ~again
     return show(bench, basis, recorded, calmed & bench.going)
 
 

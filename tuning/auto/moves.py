@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env.gains import cascade_columns, write_gains
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
-from tuning.auto.calmer_gains import calmer
+from tuning.auto.calmer_gains import calmer, searches_all
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.proving import RESTLESS, without_noise
 from tuning.auto.stages import RecordedGains
@@ -98,16 +98,19 @@ def ease(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, swing:
     journal, own, rule = bench.journals[k], recorded.gains[k], basis.reference[k]
     torque_p, _, velocity_p, *_ = cascade_columns(bench.target.device)
     factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
-    # What less velocity P has not calmed may be the current loop's doing.
-    has_fast_current = recorded.eased[k] and own[torque_p] > rule[torque_p]
+    # What less velocity P has not calmed may be the current loop's doing, whose gains are searched on twins as well.
+    has_fast_current = recorded.eased[k] and own[torque_p] > rule[torque_p] and not searches_all(bench.target)
     failed = recorded.rule is not None and recorded.rule.where[k] and not recorded.rule.passed[k]
     if not np.array_equal(own, rule) and not failed and (swing > LIMIT_CYCLE or has_fast_current):
         gains = rule
         journal.note(f"the gains of the baseline rule are kept: with faster ones {why}")
     else:
-        gains = calmer(bench, basis, recorded, k, factor)
-        share = 100.0 * gains[velocity_p] / own[velocity_p]
-        journal.note(f"velocity P lowered to {share:.0f} %, the other gains with it: {why}")
+        gains = calmer(bench, basis, recorded, k, factor, swing, EASED_TO * RESTLESS)
+        share = gains[velocity_p] / own[velocity_p]
+        if share < 1.0:
+            journal.note(f"velocity P lowered to {100.0 * share:.0f} %, the others chosen for it: {why}")
+        else:
+            journal.note(f"gains taken with which its digital twins swing less at rest: {why}")
     # The second best are about as fast as the best, which shook.
     return replace(recorded.with_gains(k, gains), eased=recorded.eased + (np.arange(len(recorded.eased)) == k))
 

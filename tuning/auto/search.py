@@ -12,10 +12,11 @@ from drive_env.dictionary.roles import Role
 from drive_env.gains import bandwidth_gains, rule_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
+from tuning.auto.calmer_gains import REPEATS
 from tuning.auto.checks import sound_gains, unsafe_gains, wrong_wiring
 from tuning.auto.stages import Basis, Candidates, IdentifiedAxes
 from tuning.auto.trial_order import BOLD, OTHERS, SLIPPERY
-from tuning.auto.twin import WORLDS, Known, Optimum, Twins, search
+from tuning.auto.twin import SLIPPERY_WORLDS, WORLDS, Known, Optimum, Twins, search
 from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
 from tuning.response.linear_model import Plant
@@ -32,9 +33,8 @@ Identify = Callable[[Target, NDArray[np.bool_]], "list[Identification]"]  # of t
 
 SETS, GENERATIONS = 16, 24  # of a search on twins: sets of gains at once, and how often
 SEARCHES = 3  # side by side
+FINALISTS = 4  # of each of them, that are scored again
 OTHER_GENERATIONS, OTHER_WIDTH = 12, 0.5  # of a search on other twins, from what was found, and how wide it begins
-# Two short moves take for dry friction what is drag: an axis that is held by less of it hunts at rest.
-SLIPPERY_WORLDS = tuple(world._replace(friction=0.02) for world in WORLDS)
 SOFT = "margin_60"  # the rule that is tried when nothing faster passes: 60 degrees and 20 dB
 # The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
@@ -121,8 +121,14 @@ def _search_apart(bench: AutoBench, known: Sequence[Known], starts: Integers, sc
     target, n = bench.target, len(known)
     with Twins(target.device, target.motor, [*known] * SEARCHES, np.tile(scaler, SEARCHES), SETS) as twins:
         found = search(twins, np.tile(starts, (SEARCHES, 1, 1)), bench.rng, generations=GENERATIONS)
-    best = found.cost[:, 0].reshape(SEARCHES, n).argmin(axis=0) * n + np.arange(n)
-    return Optimum(found.gains[best], found.cost[best], found.start[best])
+    # The least cost of hundreds of runs is partly luck: the best few of each search are run again with other noises.
+    by_axis = found.gains[:, :FINALISTS].reshape(SEARCHES, n, -1, found.gains.shape[-1]).swapaxes(0, 1)
+    few = by_axis.reshape(n, -1, found.gains.shape[-1])
+    with Twins(target.device, target.motor, known, scaler, few.shape[1], repeats=REPEATS) as twins:
+        cost = twins.score(few)
+    order = cost.argsort(axis=1, kind="stable")
+    start = found.start.reshape(SEARCHES, n).min(axis=0)
+    return Optimum(np.take_along_axis(few, order[:, :, None], axis=1), np.take_along_axis(cost, order, axis=1), start)
 
 
 def calm_gains(target: Target, plant: Plant) -> Integers:

@@ -9,7 +9,7 @@ cost cannot be measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -122,6 +122,8 @@ WORLDS = (
     ),
     MachineVariant("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
+# An axis that shakes at rest is held by less of it than was found.
+SLIPPERY_WORLDS = tuple(world._replace(friction=0.02) for world in WORLDS)
 # What the current may swing in a move, likewise of the rated one, and the power by which more than that counts.
 MOST_SWING, SWINGING = 0.8 * OSCILLATION, 2.0
 FARTHEST = 0.6  # relative: an interval that says less than this says nothing
@@ -202,6 +204,7 @@ class Twins:
         sets: Sets of gains per axis that are scored at once.
         num_threads: Threads that run them; the number of cores by default.
         worlds: Variants on which the gains are scored.
+        repeats: Runs of each variant, with a noise of their own, whose scores are averaged.
     """
 
     def __init__(
@@ -213,6 +216,7 @@ class Twins:
         sets: int,
         num_threads: int | None = None,
         worlds: Sequence[MachineVariant] = WORLDS,
+        repeats: int = 1,
     ) -> None:
         self.sets = sets
         self.device = device
@@ -223,7 +227,7 @@ class Twins:
             if mask.any():
                 axes = np.flatnonzero(mask)
                 chosen = [known[int(k)] for k in axes]
-                part = _Part(device, motor, load, axes, chosen, scaler[mask], sets, num_threads, worlds)
+                part = _Part(device, motor, load, axes, chosen, scaler[mask], sets, num_threads, worlds, repeats)
                 self._parts.append(part)
 
     def score(self, gains: Integers) -> Floats:
@@ -231,10 +235,17 @@ class Twins:
 
         The mean of the robust cost, with a penalty for gains that a trial would stop as oscillating.
         """
-        cost = np.empty(gains.shape[:2])
+        return self.cost_and_rest(gains)[0]
+
+    def cost_and_rest(self, gains: Integers) -> tuple[Floats, Floats]:
+        """Return the cost of gains, as `score`, and how the current swings at rest on the worst variant, (n, sets).
+
+        That is about its mean (RMS), over the rated one.
+        """
+        cost, rest = np.empty(gains.shape[:2]), np.empty(gains.shape[:2])
         for part in self._parts:
-            cost[part.axes] = part.score(gains[part.axes])
-        return cost
+            cost[part.axes], rest[part.axes] = part.score(gains[part.axes])
+        return cost, rest
 
     def close(self) -> None:
         """Close the emulated machines."""
@@ -262,11 +273,12 @@ class _Part:
         sets: int,
         num_threads: int | None,
         worlds: Sequence[MachineVariant],
+        repeats: int,
     ) -> None:
         self.axes = axes
         self._shape = (len(axes), sets, len(worlds))
         machines = math.prod(self._shape)
-        self._robust = RobustScore(device.name, load, motor, machines, num_threads=num_threads)
+        self._robust = RobustScore(device.name, load, motor, machines, num_threads=num_threads, repeats=repeats)
         rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
         parameters = {
             name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
@@ -291,13 +303,14 @@ class _Part:
         """Return values per axis and world, (axes, worlds), for all machines, (machines,)."""
         return np.broadcast_to(values[:, None], self._shape).reshape(-1)
 
-    def score(self, gains: Integers) -> Floats:
-        """Return the geometric mean of the costs over the variants, of gains (axes, sets, count)."""
+    def score(self, gains: Integers) -> tuple[Floats, Floats]:
+        """Return the geometric mean of the costs over the variants, and the most swing at rest; (axes, sets) each."""
         every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
         found = self._robust.score(every)
         # A drive on which that swings would be stopped: a trial sees the move and the probe.
         beyond = np.maximum(found.swing.max(axis=1) / MOST_SWING, 1.0)
-        return np.asarray(np.exp(np.log(found.robust_cost * beyond**SWINGING).reshape(self._shape).mean(axis=2)))
+        costs = np.exp(np.log(found.robust_cost * beyond**SWINGING).reshape(self._shape).mean(axis=2))
+        return np.asarray(costs), found.rest.max(axis=1).reshape(self._shape).max(axis=2)
 
     def close(self) -> None:
         self._robust.close()
@@ -334,6 +347,7 @@ def search(
     keep: int = 12,
     free: Sequence[str] | None = None,
     width: float = 1.0,
+    score: Callable[[Integers], Floats] | None = None,
 ) -> Optimum:
     """Return the gains of least robust cost on twins, found by an evolution strategy in the logarithms of the gains.
 
@@ -348,14 +362,16 @@ def search(
         keep: Sets that are returned.
         free: Names of the gains that are searched, all by default; the others stay those of the best start.
         width: First standard deviation of a gain's logarithm.
+        score: Gives the cost of gains, (n, sets), in place of the twins.
     """
     known = twins.device.gains
     columns = known.columns(known.names if free is None else free)
     n, sets, d = twins.num_axes, twins.sets, len(columns)
-    least, highest = least_gains(twins.device)[columns], known.highest[columns]
+    least = least_gains(twins.device)[columns]
+    highest, score = known.highest[columns], score or twins.score
     reach = np.array([math.log(top) for top in highest])
     first = starts[:, np.arange(sets) % starts.shape[1]]
-    cost = twins.score(first)
+    cost = score(first)
     at = np.arange(n)
     best = cost.argmin(axis=1)
     base = first[at, best]
@@ -376,7 +392,7 @@ def search(
         drawn[:, 1] = np.log(np.maximum(pool_gains[:, 0, columns], 1).astype(float))
         gains = np.repeat(base[:, None], sets, axis=1)
         gains[:, :, columns] = np.clip(np.rint(np.exp(np.clip(drawn, 0.0, reach))), least, highest)
-        cost = twins.score(gains)
+        cost = score(gains)
         order = cost.argsort(axis=1)[:, :parents]
         chosen = np.take_along_axis(drawn, order[:, :, None], axis=1)
         step = chosen - mean[:, None]

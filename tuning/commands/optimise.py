@@ -318,7 +318,6 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
 
     from drive_env.devices import find_device
     from tuning.search.optimise import COST
-    from tuning.search.trials_files import is_tried_open
     from tuning.search.trials_files import titles as titles_of
 
     searches = sorted({row.search for row in found.rows})
@@ -350,25 +349,40 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
             which = f"search {row.search}, trial" if len(searches) > 1 else "trial"
             lines.append(f"{which} {row.number} was stopped: the drive reported {row.cause}")
     lines += sorted({note for note in found.notes if note})
-    if not is_tried_open(device, settings.gains) and find_device(device).gains.is_open_loop:
-        lines.append(
-            "The loop was closed in trials, at the motor's rated current or less: the ramp asks for more than the "
-            "motor gives, and in place of E_d/E_0 J has 1 + b/t_0, b the time for which the axis is behind its demand."
-        )
-    elif find_device(device).gains.is_open_loop:
-        from drive_env.trials.open_loop import unmeasured
-
-        lines.append(
-            "J has no load step and no ripple of the current here: no torque current is measured "
-            f"({unmeasured(find_device(device))}). E_d/E_0 follows from the standby current, effort from the settings; "
-            "settling, load angle, vibration and lost steps are the encoder's."
-        )
+    lines += _what_counts(device, settings.gains)
     if before is None and len(searches) > 1 and np.isfinite(found.cost).any():
         lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")
     if before is not None:
         lines.append(f"drive-tune undo {before} restores the drives' state before")
     print_lines(lines)
+
+
+def _what_counts(device: str, gains: tuple[str, ...] | None) -> list[str]:
+    """Return what J of a stepper has in place of a servo's terms, for people; nothing for a servo."""
+    from drive_env.devices import find_device
+    from drive_env.trials.open_loop import unmeasured
+    from tuning.search.trials_files import is_tried_by_pid, is_tried_open
+
+    if is_tried_by_pid(device, gains):
+        return [
+            "The PID regulated the position in trials, at the motor's rated current. J has no load step and no ripple "
+            "of the current here: a PID does not commutate, 6077h is the size of the current that is set. E_d/E_0 "
+            "follows from the gains, and has 1 + b/t_0 beside it, b the integral of |demand - encoder|; in place of "
+            "the ripple stands the vibration of the encoder."
+        ]
+    if not is_tried_open(device, gains) and find_device(device).gains.is_open_loop:
+        return [
+            "The loop was closed in trials, at the motor's rated current or less: the ramp asks for more than the "
+            "motor gives, and in place of E_d/E_0 J has 1 + b/t_0, b the time for which the axis is behind its demand."
+        ]
+    if find_device(device).gains.is_open_loop:
+        return [
+            "J has no load step and no ripple of the current here: no torque current is measured "
+            f"({unmeasured(find_device(device))}). E_d/E_0 follows from the standby current, effort from the settings; "
+            "settling, load angle, vibration and lost steps are the encoder's."
+        ]
+    return []
 
 
 def _on_two_lines(title: str) -> str:

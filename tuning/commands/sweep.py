@@ -13,6 +13,7 @@ import typer
 
 from drive_env.commands.progress import progress_on
 from drive_env.commands.tables import Column, print_lines, print_names, print_table
+from drive_env.devices.gain_set import LOAD_ANGLE, PID_ON_RAMP
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -41,6 +42,9 @@ def sweep(
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="Of a stepper: close its loop, and sweep the loop's gains.")
     ] = False,
+    pid: Annotated[
+        bool, typer.Option("--pid", help="Of a stepper: have its position PID regulate it, and sweep the PID's gains.")
+    ] = False,
     show_config: Annotated[bool, typer.Option("--show-config", help="Print the experiment and stop.")] = False,
     workers: Workers = None,
     cluster: Cluster = None,
@@ -57,13 +61,15 @@ def sweep(
     """
     overrides: dict[str, Any] = {"device": device, "motor": motor, "load": load, "seed": seed}
     with errors_as_exit_codes():
-        if closed_loop and config is not None:
+        if (closed_loop or pid) and config is not None:
             raise ValueError(
-                "--closed-loop chooses the experiment that ships; leave it out with --config: the loop is closed "
-                "wherever a gain of it is swept"
+                "--closed-loop and --pid choose the experiment that ships; leave them out with --config: the loop is "
+                "closed wherever a gain of it is swept"
             )
-        if closed_loop:
-            overrides["closed_loop"] = True
+        if closed_loop and pid:
+            raise ValueError("--closed-loop and --pid choose different experiments; give one of them")
+        if closed_loop or pid:
+            overrides["closed_loop"] = PID_ON_RAMP if pid else LOAD_ANGLE
         if list_names:
             _list_names()
         elif show_config:
@@ -188,6 +194,11 @@ def _print_result(result: Any, folder: Path) -> None:
             "and no peak current; effort is the square of the run current that is set, load angle and lost steps are "
             "by the encoder."
         )
+    elif not result.response.measures_current:
+        lines.append(
+            "No torque current is measured (a PID does not commutate: 6077h is the size of the current that is set): "
+            "there is no ripple and no peak current; vibration is by the encoder."
+        )
     lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]
     if result.simulated > 0.0:
         lines.append(
@@ -235,6 +246,7 @@ def _list_names() -> None:
         METRICS,
         OPEN_LOOP_METRICS,
         OPEN_LOOP_TRACKING,
+        PID_TRACKING,
         TRACKING,
     )
 
@@ -265,6 +277,9 @@ def _list_names() -> None:
                 f"{row.name} [{row.unit}]": row.meaning
                 for row in CLOSED_LOOP_METRICS.values()
                 if row.name not in METRICS
+            },
+            "metrics of a stepper's position PID, without ripple and peak": {
+                f"{TRACKING.name} [{TRACKING.unit}]": PID_TRACKING.meaning
             },
         }
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device, find_device
-from drive_env.devices.gain_set import Key
+from drive_env.devices.gain_set import LOAD_ANGLE, PID_ON_RAMP, ClosedLoop
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
@@ -25,13 +25,16 @@ from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
-from tuning.runs.metrics import TRACKING, closes_loop, combined_of, metric_names
+from tuning.runs.metrics import TRACKING, combined_of, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
 
 DEFAULT = Path(__file__).parent / "sweep.toml"
 OPEN_LOOP = Path(__file__).parent / "open_loop_sweep.toml"  # of drives without loops
-CLOSED_LOOP = Path(__file__).parent / "closed_loop_sweep.toml"  # of those that may close one
+CLOSED_LOOPS = {  # of those that may close one, by its kind
+    LOAD_ANGLE: Path(__file__).parent / "closed_loop_sweep.toml",
+    PID_ON_RAMP: Path(__file__).parent / "pid_sweep.toml",
+}
 MAX_POINTS = 262_144
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
@@ -139,24 +142,17 @@ class Resolved(NamedTuple):
     velocity: int  # as 60FFh counts it
     acceleration: int  # as 6083h does
     velocity_ratio: float = 1.0  # rpm of a velocity unit
-
-    @property
-    def swept(self) -> tuple[Key, ...]:
-        """The swept objects."""
-        return tuple((entry.index, entry.sub) for entry in self.entries)
-
-    @property
-    def closes_loop(self) -> bool:
-        """Whether the drives close their loop: some of the swept gains act in it alone."""
-        return closes_loop(self.device, self.swept)
+    loop: ClosedLoop | None = None  # that the drives close: some of the swept gains act in it alone
 
 
-def load_experiment(config: str | Path | None = None, *, closed_loop: bool = False, **overrides: Any) -> Experiment:
+def load_experiment(
+    config: str | Path | None = None, *, closed_loop: str | None = None, **overrides: Any
+) -> Experiment:
     """Return the experiment of a TOML file, by default the one that ships, checked.
 
     Args:
         config: The file.
-        closed_loop: Without a file take the one that ships for steppers whose loop is closed.
+        closed_loop: Without a file take the one that ships for steppers with a loop of this kind closed.
         overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
             sweeps the same gains of any device, over the same range in its units, with the device's usual motor where
             its own is none of that device's.
@@ -186,24 +182,25 @@ def load_experiment(config: str | Path | None = None, *, closed_loop: bool = Fal
     return experiment
 
 
-def shipped_experiment(device: str | None, *, closed_loop: bool = False) -> Path:
+def shipped_experiment(device: str | None, *, closed_loop: str | None = None) -> Path:
     """Return the experiment that ships for a device, None for the default one.
 
     Raises:
         ExperimentError: For a device that is none, or that closes no loop where one is wanted.
     """
     if device is None:
-        return CLOSED_LOOP if closed_loop else DEFAULT
+        return CLOSED_LOOPS[closed_loop] if closed_loop else DEFAULT
     try:
         known = find_device(device).gains
     except ValueError as error:
         raise ExperimentError(str(error)) from None
-    if closed_loop and not known.closed_rows:
+    if closed_loop and known.loop_of_kind(closed_loop) is None:
         raise ExperimentError(
-            f"{device} has no loop to close: its gains.toml has no [closed_loop]; leave --closed-loop out"
+            f"{device} has no loop to close ({closed_loop}): its gains.toml has no such [[closed_loop]]; leave "
+            "--closed-loop and --pid out"
         )
     if closed_loop:
-        return CLOSED_LOOP
+        return CLOSED_LOOPS[closed_loop]
     return OPEN_LOOP if known.is_open_loop else DEFAULT
 
 
@@ -224,7 +221,8 @@ def resolve(experiment: Experiment) -> Resolved:
     dictionary = device.new_dictionary()
     entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(experiment.sweep, 1))
     _check_grid(experiment, entries)
-    _check_metric(experiment.metric, device, [(entry.index, entry.sub) for entry in entries])
+    loop = _loop_of(device, experiment.sweep, entries)
+    _check_metric(experiment.metric, device, loop)
     _check_times(experiment.excitation, 1.0 / device.communication_rate)
     scaler = _position_scale(device, dictionary, preset)
     ratio = _velocity_ratio(device, dictionary, preset)
@@ -242,7 +240,20 @@ def resolve(experiment: Experiment) -> Resolved:
             f"excitation: velocity is {velocity} and acceleration {acceleration} as raw integers; a step needs a "
             "velocity other than 0 and an acceleration above 0"
         )
-    return Resolved(device, entries, scaler, velocity, acceleration, ratio)
+    return Resolved(device, entries, scaler, velocity, acceleration, ratio, loop)
+
+
+def _loop_of(device: Device, sweep: tuple[SweptObject, ...], entries: tuple[Entry, ...]) -> ClosedLoop | None:
+    """Return the loop that a sweep closes: a name tells it, an object the first in which it acts."""
+    known = device.gains
+    try:
+        loop = known.loop_of([swept.object for swept in sweep])
+    except ValueError as error:
+        raise ExperimentError(f"sweep: {error}") from None
+    if loop is not None:
+        return loop
+    own = {known.names[known.keys.index((entry.index, entry.sub))] for entry in entries}
+    return next((each for each in known.closed_loops if not own.isdisjoint(each.gains.values())), None)
 
 
 def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> int:
@@ -312,13 +323,13 @@ def label(entry: Entry) -> str:
 def _swept_entry(device: Device, dictionary: ObjectDictionary, number: int, swept: SweptObject) -> Entry:
     where = f"sweep {number}"
     match, known, gains = _INDEX.fullmatch(swept.object.strip()), device.gains, gain_objects(device, dictionary)
-    by_name = known.keys[known.names.index(swept.object)] if swept.object in known.names else swept.object
+    by_name = known.keys[known.columns([swept.object])[0]] if swept.object in known.searched else swept.object
     try:
         entry = dictionary.find((int(match[1], 16), int(match[2], 16)) if match else by_name)
     except ObjectAccessError as error:
         raise ExperimentError(
             f"{where}: object: {str(error).rsplit(' (abort code', 1)[0]}; gains of {device.name} are "
-            f"{', '.join(known.names)}"
+            f"{', '.join(known.searched)}"
         ) from None
     if entry not in gains:
         raise ExperimentError(
@@ -357,10 +368,10 @@ def _check_grid(experiment: Experiment, entries: tuple[Entry, ...]) -> None:
         raise ExperimentError(f"the grid has {product} = {points} points; the limit is {MAX_POINTS}: lower a count")
 
 
-def _check_metric(metric: MetricChoice, device: Device, swept: list[Key]) -> None:
-    if metric.name not in (known := metric_names(device, swept)):
+def _check_metric(metric: MetricChoice, device: Device, loop: ClosedLoop | None) -> None:
+    if metric.name not in (known := metric_names(device, loop)):
         raise ExperimentError(f"metric: name = {metric.name!r} is unknown; there are {', '.join(known)}")
-    wanted = combined_of(device, swept).weights if metric.name == TRACKING.name else {}
+    wanted = combined_of(device, loop).weights if metric.name == TRACKING.name else {}
     if set(metric.weights) != set(wanted):
         needed = f"the weights {', '.join(wanted)}" if wanted else "no weights"
         raise ExperimentError(
@@ -420,10 +431,10 @@ def _default_weights(name: str, sweep: tuple[SweptObject, ...]) -> Mapping[str, 
     try:
         device = find_device(name)
         dictionary = device.new_dictionary()
-        entries = [_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(sweep, 1)]
+        entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(sweep, 1))
+        return combined_of(device, _loop_of(device, sweep, entries)).weights
     except (ValueError, ExperimentError):
         return TRACKING.weights
-    return combined_of(device, [(entry.index, entry.sub) for entry in entries]).weights
 
 
 # --- the TOML ---------------------------------------------------------------------------------------------------------

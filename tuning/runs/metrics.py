@@ -6,7 +6,7 @@ settles) is nan.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from drive_env.trials import response
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.devices.gain_set import Key
+    from drive_env.devices.gain_set import ClosedLoop
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,17 +38,22 @@ class MoveRecording(NamedTuple):
     current_limit: Floats  # A, shape (p,)
     t_step: float  # s
     t_load: float  # s
-    # Of a stepper: demand less encoder [full steps], shape (n, p). In open loop, where no torque current is measured
-    # (the two above are nan), the mean square of the run current that is set over the motor's rated one, shape (p,);
-    # in closed loop the full steps of a revolution, shape (p,).
+    # Of a stepper: demand less encoder [full steps], shape (n, p). In open loop the mean square of the run current that
+    # is set over the motor's rated one, shape (p,); in closed loop the full steps of a revolution, shape (p,). In open
+    # loop and by a PID no torque current is measured: current and its limit are nan.
     lag: Floats | None = None
     effort: Floats | None = None
     full_steps: Floats | None = None
 
     @property
     def is_open_loop(self) -> bool:
-        """Whether no torque current is measured."""
+        """Whether no loop is closed around the motor."""
         return self.effort is not None
+
+    @property
+    def measures_current(self) -> bool:
+        """Whether the torque current is measured."""
+        return bool(np.isfinite(self.current_limit).all())
 
     def point(self, k: int) -> MoveRecording:
         """Return the recording of point k alone."""
@@ -68,7 +73,7 @@ class Figures(NamedTuple):
     recording: MoveRecording
     step: response.StepMetrics
     disturbance: response.DisturbanceMetrics
-    current: response.CurrentMetrics | None  # None in open loop
+    current: response.CurrentMetrics | None  # None where no torque current is measured
     step_error: Floats  # shape (samples, p), from the step to the load step
     load_error: Floats  # shape (samples, p), from the load step on
 
@@ -93,7 +98,7 @@ def figures(recording: MoveRecording) -> Figures:
         step=response.step_metrics(t, speed, reference, t_step=recording.t_step, t_end=recording.t_load, initial=0.0),
         disturbance=response.disturbance_metrics(t, speed, reference, t_load=recording.t_load, band=RECOVERY_BAND),
         current=None
-        if recording.is_open_loop
+        if not recording.measures_current
         else response.current_metrics(recording.current[first:], i_max=recording.current_limit),
         step_error=error[first : load + 1],
         load_error=error[load:],
@@ -103,7 +108,7 @@ def figures(recording: MoveRecording) -> Figures:
 def oscillates(found: Figures) -> Mask:
     """Return which points ring without decaying, in the velocity or in the current, shape (p,)."""
     recording = found.recording
-    if recording.is_open_loop:  # there is no current to swing
+    if not recording.measures_current:  # there is no current to swing
         return np.asarray(found.step.oscillating)
     window = slice(_index(recording.t, recording.t_step), _index(recording.t, recording.t_load) + 1)
     ringing, _ = response.oscillation(
@@ -135,15 +140,17 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
     two are seconds of full error; the weight of the third [s] is what a ripple of the whole current limit would cost:
     with 0.2 s, one percent of it is worth 2 ms. In open loop the third term is
     effort * (i/i_rated)^2 of the run current. In closed loop the first two are the means of |demand - encoder| in the
-    same times over the height: by how many seconds the axis is behind.
+    same times over the height: by how many seconds the axis is behind. A PID of a stepper measures no torque current:
+    its third term is vibration * the RMS change of demand - encoder per sample [full steps].
     """
     height = abs(float(found.recording.reference_rpm[-1]))
     if found.recording.full_steps is not None:
-        return (
-            weights["step"] * _behind(found, slice(None, len(found.step_error)))
-            + weights["disturbance"] * _behind(found, slice(len(found.step_error) - 1, None))
-            + weights["ripple"] * ripple(found) / found.recording.current_limit
-        )
+        behind = weights["step"] * _behind(found, slice(None, len(found.step_error))) + weights[
+            "disturbance"
+        ] * _behind(found, slice(len(found.step_error) - 1, None))
+        if found.recording.measures_current:
+            return behind + weights["ripple"] * ripple(found) / found.recording.current_limit
+        return behind + weights["vibration"] * _vibration(found)
     if found.recording.effort is not None:
         return (
             weights["step"] * _iae(found) / height
@@ -228,7 +235,7 @@ OPEN_LOOP_METRICS: dict[str, Metric] = {
         Metric("load_angle", "full steps", "largest |demand - encoder| from the step on; 1 is the pull-out",
                lambda f: np.abs(_lag(f)).max(axis=0)),
         Metric("vibration", "full steps", "RMS change of it per sample, once the step is over",
-               lambda f: response.rms(np.diff(_lag(f)[_index(f.recording.t, f.recording.t_load) // 2 :], axis=0))),
+               lambda f: _vibration(f)),
         Metric("effort", "%", "mean square of the run current that is set, of the rated one",
                lambda f: 100.0 * np.asarray(f.recording.effort)),
     )
@@ -245,6 +252,18 @@ CLOSED_LOOP_METRICS: dict[str, Metric] = METRICS | {
                lambda f: _behind(f, slice(None))),
     )
 }  # fmt: skip
+
+
+# Of one whose position a PID regulates: no torque current is measured.
+PID_METRICS: dict[str, Metric] = {
+    name: row for name, row in CLOSED_LOOP_METRICS.items() if name not in ("peak_current", "rms_current", "ripple")
+} | {"vibration": OPEN_LOOP_METRICS["vibration"]._replace(
+    meaning="RMS change of |demand - encoder| per sample, once the step is over")}  # fmt: skip
+
+
+def _vibration(found: Figures) -> Floats:
+    recording = found.recording
+    return response.rms(np.diff(_lag(found)[_index(recording.t, recording.t_load) // 2 :], axis=0))
 
 
 def _lag(found: Figures) -> Floats:
@@ -283,22 +302,24 @@ CLOSED_LOOP_TRACKING = TRACKING._replace(
 )
 
 
-def closes_loop(device: Device, swept: Collection[Key]) -> bool:
-    """Return whether a sweep of objects has gains among them that act in a closed loop alone."""
-    return any(row.key in swept for row in device.gains.closed_rows)
+PID_TRACKING = TRACKING._replace(
+    meaning="of a stepper's position PID: the same two, plus the vibration in full steps in place of the ripple of a "
+    "torque current, which is not measured; weighted",
+    weights={"step": 1.0, "disturbance": 1.0, "vibration": 0.01},
+)
 
 
-def metrics_of(device: Device, swept: Collection[Key] = ()) -> dict[str, Metric]:
-    """Return the metrics that a device's drives can show in a sweep of objects."""
-    if closes_loop(device, swept):
-        return CLOSED_LOOP_METRICS
+def metrics_of(device: Device, loop: ClosedLoop | None = None) -> dict[str, Metric]:
+    """Return the metrics that a device's drives can show in a sweep with a loop closed that a stepper may close."""
+    if loop is not None:
+        return PID_METRICS if loop.is_pid else CLOSED_LOOP_METRICS
     return OPEN_LOOP_METRICS if device.gains.is_open_loop else METRICS
 
 
-def combined_of(device: Device, swept: Collection[Key] = ()) -> Combined:
-    """Return the combined metric of a sweep of objects of a device."""
-    if closes_loop(device, swept):
-        return CLOSED_LOOP_TRACKING
+def combined_of(device: Device, loop: ClosedLoop | None = None) -> Combined:
+    """Return the combined metric of such a sweep."""
+    if loop is not None:
+        return PID_TRACKING if loop.is_pid else CLOSED_LOOP_TRACKING
     return OPEN_LOOP_TRACKING if device.gains.is_open_loop else TRACKING
 
 
@@ -307,6 +328,6 @@ def unit_of(name: str) -> str:
     return TRACKING.unit if name == TRACKING.name else (METRICS | OPEN_LOOP_METRICS | CLOSED_LOOP_METRICS)[name].unit
 
 
-def metric_names(device: Device, swept: Collection[Key] = ()) -> list[str]:
-    """Return the names of all metrics of a sweep of objects of a device, the combined one first."""
-    return [TRACKING.name, *metrics_of(device, swept)]
+def metric_names(device: Device, loop: ClosedLoop | None = None) -> list[str]:
+    """Return the names of all metrics of such a sweep, the combined one first."""
+    return [TRACKING.name, *metrics_of(device, loop)]

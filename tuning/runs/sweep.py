@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, cia402, motion
+from drive_env.devices.gain_set import PID_ON_RAMP, ClosedLoop
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
@@ -265,13 +266,13 @@ _RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")
 
 def _recorded(experiment: Experiment) -> tuple[str, ...]:
     resolved = resolve(experiment)
-    if resolved.closes_loop:
+    if resolved.loop is not None:
         return (*_RECORDED, "lag", "full_steps")
     return (*_RECORDED, "lag", "effort") if resolved.device.gains.is_open_loop else _RECORDED
 
 
 def _column_names(resolved: Resolved) -> list[str]:
-    return ["score", *metrics.metrics_of(resolved.device, resolved.swept), *FLAGS]
+    return ["score", *metrics.metrics_of(resolved.device, resolved.loop), *FLAGS]
 
 
 def _best(found: list[Arrays], experiment: Experiment) -> MoveRecording:
@@ -291,7 +292,7 @@ def _compile(experiment: Experiment) -> None:
 
 def _signals(resolved: Resolved) -> list[ObjectName]:
     """Return what is recorded: velocity and current, or what an open loop has in place of a measured current."""
-    if resolved.closes_loop:
+    if resolved.loop is not None:
         return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL]
     if resolved.device.gains.is_open_loop:
         return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL]
@@ -324,8 +325,8 @@ def _record(
         drives.write(cia402.SENSOR_SELECTION, ENCODER)
     # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
     motion.enable(drives, mode="pv")
-    if resolved.closes_loop:
-        unclosed = _close_loop(drives)
+    if resolved.loop is not None:
+        unclosed = _close_loop(drives, resolved.loop)
     drives.write((cia402.PROFILE_ACCELERATION, 0), resolved.acceleration)
     for column, entry in enumerate(resolved.entries):
         drives.write((entry.index, entry.sub), np.repeat(points[:, column], drives.num_axes // len(points)))
@@ -345,7 +346,7 @@ def _record(
     rpm = 60.0 / scaler / per_increment_of(velocity_unit, scaler, resolved.velocity_ratio)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
     if is_open_loop:
-        signals = _stepper_signals(drives, traces, period, resolved.closes_loop)
+        signals = _stepper_signals(drives, traces, period, resolved.loop)
     else:
         signals = {
             "speed_rpm": np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
@@ -362,30 +363,33 @@ def _record(
     tripped = unclosed | cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     for message in drives.emergencies():
         tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
-    if recording.lag is not None and recording.is_open_loop:  # steps were lost
+    # The field runs ahead of a rotor that has lost steps; a PID alone is behind its demand in any case.
+    on_ramp = resolved.loop is not None and resolved.loop.kind == PID_ON_RAMP
+    if recording.lag is not None and (recording.is_open_loop or on_ramp):
         tripped |= (np.abs(recording.lag) > LOST).any(axis=0)
     return recording, tripped
 
 
-def _close_loop(drives: EmulatedDrives) -> NDArray[np.bool_]:
-    """Close the loops of enabled axes with the preset's gains; return of which axes they stay open.
+def _close_loop(drives: EmulatedDrives, loop: ClosedLoop) -> NDArray[np.bool_]:
+    """Close the loops of enabled axes with the first gains, or the preset's; return of which axes they stay open.
 
     The following error window is off: an axis that is overloaded falls behind, and shows by what it catches up with.
     """
-    closed = drives.device.gains.closed_loop
-    assert closed is not None, "a gain of a closed loop is swept"
+    known = drives.device.gains
+    for name, value in loop.first.items():
+        drives.write(known.keys[known.columns([name])[0]], value)
     drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
-    drives.write(Role.LOOP_MODE, closed.mode)
+    drives.write(Role.LOOP_MODE, loop.mode)
     drives.advance(CLOSING_TIME)
-    return np.asarray(drives.read(Role.LOOP_INITIALISED) == 0)
+    return np.asarray((drives.read(Role.LOOP_INITIALISED) == 0) & (not loop.is_pid))
 
 
 def _stepper_signals(
-    drives: EmulatedDrives, traces: list[Trace], period: float, closes_loop: bool
+    drives: EmulatedDrives, traces: list[Trace], period: float, loop: ClosedLoop | None
 ) -> dict[str, NDArray[np.float64]]:
     """Return speed by the encoder, lag and effort of the points, and nan for a current that nothing measures.
 
-    In closed loop the torque current is measured, and its limit is the run current.
+    Where the encoder commutates the torque current is measured, and its limit is the run current.
 
     606Ch of these drives is the speed of the steps, whatever the rotor does.
     """
@@ -396,11 +400,12 @@ def _stepper_signals(
     full_step = scale / (TOOTH * drives.motor.n_p)
     run, _ = run_and_standby(drives.device, drives.device.gains.read(drives))
     way = wrapped(actual - actual[0])
-    if closes_loop:
+    if loop is not None:
+        current = np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * ampere_per_count(drives)
         return {
             "speed_rpm": np.gradient(way, period, axis=0) * 60.0 / scale,
-            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * ampere_per_count(drives),
-            "current_limit": np.asarray(run),
+            "current": np.full(demand.shape, np.nan) if loop.is_pid else current,
+            "current_limit": np.full(drives.num_axes, np.nan) if loop.is_pid else np.asarray(run),
             "lag": wrapped(demand - actual) / full_step,
             "full_steps": np.full(drives.num_axes, TOOTH * drives.motor.n_p),
         }
@@ -433,7 +438,7 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
     choice = experiment.metric
     columns: dict[str, NDArray[Any]] = {"score": metrics.score(choice.name, choice.weights, found)}
     resolved = resolve(experiment)
-    for row in metrics.metrics_of(resolved.device, resolved.swept).values():
+    for row in metrics.metrics_of(resolved.device, resolved.loop).values():
         columns[row.name] = np.asarray(row.function(found), np.float64)
     columns["diverged"] = np.asarray(~np.isfinite(recording.speed_rpm).all(axis=0))
     columns["oscillates"] = metrics.oscillates(found)
@@ -463,7 +468,7 @@ def _ranked(
     columns: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate(objects)}
     columns["rank"] = rank
     columns[f"score [{metrics.unit_of(experiment.metric.name)}]"] = score
-    for row in metrics.metrics_of(resolved.device, resolved.swept).values():
+    for row in metrics.metrics_of(resolved.device, resolved.loop).values():
         columns[f"{row.name} [{row.unit}]"] = found[row.name]
     for flag in FLAGS:
         columns[flag] = found[flag]

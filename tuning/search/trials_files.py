@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drive_env.devices import find_device
-from drive_env.trials.method import closes_loop
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_toml
 from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
@@ -38,6 +37,13 @@ OPEN_LOOP_TITLES = TITLES | {"current": "current [%]"}
 OPEN_LOOP_MEANINGS = MEANINGS | {
     COST: "J by measured terms, without load step and ripple of the current",
     "current": "RMS of the currents that are set [% of rated]",
+}
+
+# Of a stepper's position PID, which does not commutate: no torque current is measured, and the encoder vibrates.
+PID_TITLES = TITLES | {"current": "vibration [%]"}
+PID_MEANINGS = MEANINGS | {
+    COST: "J by measured terms, without load step and ripple of the current",
+    "current": "vibration of the encoder, as J counts a ripple of so much [%]",
 }
 
 HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
@@ -89,20 +95,27 @@ def save(
     lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
     write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
     picture = io.BytesIO()
-    is_open_loop = is_tried_open(machine["device"], settings.gains)
-    trials_figure(found, settings, is_open_loop=is_open_loop).savefig(picture, dpi=120)
+    trials_figure(found, settings, machine["device"]).savefig(picture, dpi=120)
     write_whole(folder / "trials.png", picture.getvalue())
 
 
 def titles(device: str, gains: tuple[str, ...] | None) -> dict[str, str]:
     """Return the title of each objective, for gains of a device."""
-    return OPEN_LOOP_TITLES if is_tried_open(device, gains) else TITLES
+    if is_tried_open(device, gains):
+        return OPEN_LOOP_TITLES
+    return PID_TITLES if is_tried_by_pid(device, gains) else TITLES
 
 
 def is_tried_open(device: str, gains: tuple[str, ...] | None) -> bool:
     """Return whether gains of a device are tried in open loop: a stepper's, but those of the loop that it closes."""
     known = find_device(device)
-    return known.gains.is_open_loop and not closes_loop(known, gains or ())
+    return known.gains.is_open_loop and known.gains.loop_of(gains or ()) is None
+
+
+def is_tried_by_pid(device: str, gains: tuple[str, ...] | None) -> bool:
+    """Return whether gains of a device are those of a stepper's position PID, which measures no torque current."""
+    loop = find_device(device).gains.loop_of(gains or ())
+    return loop is not None and loop.is_pid
 
 
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
@@ -147,12 +160,14 @@ def _text(value: Any) -> str:
     return f"[{', '.join(map(toml, value))}]" if isinstance(value, tuple | list) else toml(value)
 
 
-def trials_figure(found: Optimised, settings: Settings, *, is_open_loop: bool = False) -> Figure:
+def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
     """Return the searches as a picture: cost by trial, or the first two objectives of every trial with the front."""
-    meanings = OPEN_LOOP_MEANINGS if is_open_loop else MEANINGS
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    is_open_loop = is_tried_open(device, settings.gains)
+    meanings = PID_MEANINGS if is_tried_by_pid(device, settings.gains) else MEANINGS
+    meanings = OPEN_LOOP_MEANINGS if is_open_loop else meanings
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from tuning.search.optimise import Settings, optimise
@@ -37,7 +38,9 @@ def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[
         roles: The speeds of load detection and CoolStep.
     """
     drives, known = target.drives, target.device.gains
-    names = tuple(row.name for row in known.closed_rows)
+    loop = known.loop_of_kind(LOAD_ANGLE)
+    assert loop is not None, "a drive that closes such a loop"
+    names = tuple(loop.gains)
     columns = known.columns(names)
     speeds = {role: drives.read(role) for role in roles}
     try:

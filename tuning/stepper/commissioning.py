@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
@@ -108,7 +109,7 @@ def commission(
             say("proving", 0.8)
             detection.prove()
         proof_figures = _prove(watched, detection, moves, speed)
-        if target.device.gains.closed_loop is not None and found.going().any():
+        if target.device.gains.loop_of_kind(LOAD_ANGLE) is not None and found.going().any():
             say("tuning the closed loop", 0.9)
             proof_figures |= tune_loop(watched, detection, roles)
         say("writing", 0.95)

@@ -25,6 +25,7 @@ PARAMETERS = (
     Field("encoder_line_phase", "f8", "rad", "phase of that error"),
     Field("encoder_gain", "f8", "1", "counts per true count: below 1 some are lost, 0 stuck", 1.0),
     Field("encoder_noise", "f8", "rad", "rms noise of the encoder's angle"),
+    Field("index_angle", "f8", "rad", "of the rotor, at which the encoder's index begins; it is one count wide"),
 )
 
 STATE = (
@@ -35,6 +36,7 @@ STATE = (
     Field("encoder_shake", "f8", "rad", "noise of the encoder in this window"),
     Field("encoder_random", "f8", "", "state of that noise's generator, an unsigned 32-bit integer", 1.0),
     Field("velocity_filter_z", "f8", "rad/s", "state of the velocity filter", depth=2),
+    Field("true_edges", "f8", "", "edges of the encoder's disc at its angle of the last window"),
     Field("turns_per_count", "f8", "rev", "1 / encoder_steps, signed by the encoder's direction"),
     Field("counts_per_rad", "f8", "1/rad", "encoder_counts / 2 pi"),
 )

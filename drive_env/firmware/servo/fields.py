@@ -82,6 +82,7 @@ STATE = (
     Field("open_load_time_a", "f8", "s", "time for which phase A carried no current although it should"),
     Field("open_load_time_b", "f8", "s", "the same of phase B"),
     Field("block_uses_halls", "i4", "", "lane 0: 1 if a lane of this block commutates by halls"),
+    Field("block_looks_for_index", "i4", "", "lane 0: 1 if a lane of this block is homing"),
     Field("block_has_open_phase", "i4", "", "lane 0: 1 if a lane of this block has a broken phase"),
     # --- state: sensors and loops ---------------------------------------------------------------------------------
     Field("angle_zero", "f8", "rad", "electrical angle that alignment found at count_zero"),

@@ -10,6 +10,7 @@ from drive_env.firmware.cycle import FirmwareStages, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment, causes, fields, thermal
 from drive_env.firmware.servo.derived import derive
+from drive_env.firmware.servo.index import find_whether_index_is_needed, watch_index
 from drive_env.firmware.servo.loops import current_loop, motion_loops
 from drive_env.firmware.servo.power_stage import convert_energy, open_phases, power_stage, refresh_winding
 from drive_env.firmware.servo.sensors import (
@@ -60,6 +61,8 @@ def read_motion(drive, rates):
     if drive.block_has_noisy_encoder[0]:
         shake_encoders(drive)
     measure_motion(drive, rates.window)
+    if drive.block_looks_for_index[0]:
+        watch_index(drive)
 
 
 @stage
@@ -96,6 +99,7 @@ def prepare_quotients(drive, rates):
 @stage
 def find_what_is_needed(drive, rates):
     """Leave what few drives need out of the ticks of a block where none does."""
+    find_whether_index_is_needed(drive)
     drive.block_uses_halls[0] = 0
     drive.block_has_open_phase[0] = 0
     drive.block_has_noisy_encoder[0] = 0

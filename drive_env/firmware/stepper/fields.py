@@ -65,7 +65,6 @@ PARAMETERS = (
     Field("n_p", "f8", "", "pole pairs: a quarter of the full steps", 50.0),
     Field("saturation", "f8", "1/A^2", "of the torque: psi = psi_m / sqrt(1 + saturation i^2)"),
     Field("detent_torque", "f8", "N*m", "amplitude, four periods in each electrical one"),
-    Field("index_angle", "f8", "rad", "of the rotor, at which the encoder's index begins; it is one count wide"),
     Field("index_inverted", "f8", "", "1: N and its complement are exchanged"),
     Field("short_a", "f8", "S", "short to ground at the output of bridge A"),
     Field("short_b", "f8", "S", "the same of bridge B"),
@@ -155,7 +154,6 @@ STATE = (
     # --- what is told ---------------------------------------------------------------------------------------------
     Field("theta_encoder", "f8", "rad", "position by the encoder"),
     Field("omega_encoder", "f8", "rad/s", "2122h: speed by the encoder, filtered"),
-    Field("true_edges", "f8", "", "edges of the encoder's disc at its angle of the last window"),
     Field("index_edge", "f8", "", "edge of the disc at which the index begins"),
     Field("step_seen", "f8", "rad", "step_position at the last window"),
     Field("step_shift", "f8", "rad", "by which the steps are ahead of the position that the encoder gave the axis"),

@@ -1,4 +1,4 @@
-"""Homing mode (manual, section 8): methods 1, 2, 3, 5, 17, 18, 19, 21, 33, 34, 35 and 37; 0 does nothing.
+"""Homing mode (CiA 402-2): methods 1 to 14, 17 to 30, 33 to 35 and 37; 0 does nothing.
 
 A switch is searched fast; once it is touched the axis brakes, and looks for the edge slowly, always in the same
 direction, until the switch changes; that edge is home. Then the axis returns to the edge and rests there. Search and
@@ -6,11 +6,17 @@ edge as the methods have them:
 
     17  search left until the left limit switch is active, edge to the right where it becomes inactive
     18  search right until the right limit switch is active, edge to the left
-    19  search right until the home switch is active, edge to the left; a limit switch turns the search round
-    21  search left until the home switch is active, edge to the right; a limit switch turns the search round
-    1, 2, 3, 5  as 17, 18, 19, 21; from the edge on, the same way, to the encoder's next index, which is home
+    19, 23  search right until the home switch is active, edge to the left where it becomes inactive
+    21, 27  search left until the home switch is active, edge to the right where it becomes inactive
+    26  search right, the right edge where the home switch becomes inactive;  30  search left, its left edge
+    20, 24, 29  the left edge, to the right where the home switch becomes active; 29 searches left, the others right
+    22, 25, 28  the right edge, to the left where the home switch becomes active; 25 searches right, the others left
+    1 to 14  as 17 to 30; from the edge on, the same way, to the encoder's next index, which is home
     33, 34  to the next index, left or right, slowly
     35, 37  here
+
+A limit switch turns the search for a home switch round. The edge where a switch becomes active is found from the same
+edge where it was left: slowly off it, and back.
 
 A way of more than a turn without an index is one on which none comes: homing fails, rather than run into a stop.
 """
@@ -25,10 +31,13 @@ from mechanics.compiled import stage
 LEFT, RIGHT, HOME = 0, 1, 2
 
 # States of a homing run.
-IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_INDEX = range(11)
+IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_INDEX, BACK_ON = range(12)
 
 BY_SWITCH = 16  # from a method with an index to the one that ends at the switch's edge
 INDEX_LEFT, INDEX_RIGHT = 33, 34
+SEARCH_LEFT = (17, 21, 22, 27, 28, 29, 30)  # the others of 17 to 30 search to the right
+RIGHT_EDGE = (17, 21, 22, 25, 26, 27, 28)  # the others end at the left one
+WHERE_ACTIVE = (20, 22, 24, 25, 28, 29)  # the others end where the switch becomes inactive
 HERE = (35, 37)  # CiA 402 has 35 as the older number of 37
 INDEX_WAY = 1.05 * TWO_PI  # rad in which an index must come
 
@@ -70,7 +79,20 @@ def _has_switch(drive, lane, method):
 @stage
 def _search_sign(method):
     """Return the direction in which a method searches its switch."""
-    return -1.0 if method in (17, 21) else 1.0
+    return -1.0 if method in SEARCH_LEFT else 1.0
+
+
+@stage
+def _edge_side(method):
+    """Return on which side of the switch the edge is that a method without an index ends at: -1 left, 1 right."""
+    return 1.0 if method in RIGHT_EDGE else -1.0
+
+
+@stage
+def is_running(drive, lane):
+    """Return whether a homing run is under way."""
+    state = drive.homing_state[lane]
+    return SEARCH <= state <= RETURN or state in (TO_INDEX, BACK_ON)
 
 
 @stage
@@ -110,9 +132,7 @@ def start_or_stop(drive, lane, word_before):
             if alone and not unable:
                 drive.homing_state[lane] = _look_for_index(drive, lane, 1.0 if method == INDEX_RIGHT else -1.0)
             drive.target_reached[lane] = 1 if drive.homing_state[lane] == FAILED else 0
-    elif not word & cia402.NEW_SET_POINT and (
-        SEARCH <= drive.homing_state[lane] <= RETURN or drive.homing_state[lane] == TO_INDEX
-    ):
+    elif not word & cia402.NEW_SET_POINT and is_running(drive, lane):
         drive.homing_state[lane] = STOPPED
 
 
@@ -156,7 +176,7 @@ def _search(drive, lane, state, active, dt):
         # An axis that still comes from the other way leaves a narrow switch on that side.
         v = drive.velocity_demand[lane]
         drive.homing_direction[lane] = direction if v == 0.0 else (1.0 if v > 0.0 else -1.0)
-    elif method in (19, 21) and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
+    elif _switch(method) == HOME and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
         # The search led away from the switch: it lies on the other side, or nowhere.
         state = TURNED if state == SEARCH else FAILED
     if state in (SEARCH, TURNED):
@@ -175,27 +195,44 @@ def _come_to_rest(drive, lane, active, dt):
 
 
 @stage
-def _come_back(drive, lane, sign, active, dt):
+def _come_back(drive, lane, edge, active, dt):
     """Go back onto a narrow switch that braking carried the axis across, slowly; return the state after it."""
     back = -drive.homing_direction[lane]
     if not active:
         _run(drive, lane, back * drive.homing_slow[lane], dt)
         return AWAY
-    return TO_EDGE if back * sign < 0.0 else BRAKE
+    return TO_EDGE if back * edge > 0.0 else BRAKE
 
 
 @stage
-def _leave_switch(drive, lane, sign, active, dt):
-    """Look for the edge, slowly; return the state after it."""
-    if not active and drive.velocity_demand[lane] * sign < 0.0:
-        if _ends_at_index(drive.homing_method[lane]):
-            return _look_for_index(drive, lane, -sign)
-        set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
-        return RETURN
-    if inputs.is_active(drive, lane, LEFT if sign > 0.0 else RIGHT):
+def _leave_switch(drive, lane, edge, active, dt):
+    """Look for the edge on a side (-1, 1), slowly; return the state after it."""
+    if not active and drive.velocity_demand[lane] * edge > 0.0:
+        return BACK_ON if _by_switch(drive.homing_method[lane]) in WHERE_ACTIVE else _take_edge(drive, lane, edge)
+    if inputs.is_active(drive, lane, RIGHT if edge > 0.0 else LEFT):
         return FAILED
-    _run(drive, lane, -sign * drive.homing_slow[lane], dt)
+    _run(drive, lane, edge * drive.homing_slow[lane], dt)
     return TO_EDGE
+
+
+@stage
+def _enter_switch(drive, lane, edge, active, dt):
+    """Look for the edge from outside, slowly; return the state after it."""
+    if active and drive.velocity_demand[lane] * edge < 0.0:
+        return _take_edge(drive, lane, -edge)
+    if inputs.is_active(drive, lane, LEFT if edge > 0.0 else RIGHT):
+        return FAILED
+    _run(drive, lane, -edge * drive.homing_slow[lane], dt)
+    return BACK_ON
+
+
+@stage
+def _take_edge(drive, lane, direction):
+    """Take the edge that the axis passes now for home, or go on to the next index; return the state after it."""
+    if _ends_at_index(drive.homing_method[lane]):
+        return _look_for_index(drive, lane, direction)
+    set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
+    return RETURN
 
 
 @stage
@@ -240,16 +277,18 @@ def generate(drive, lane, dt):
     drive.loop_level[lane] = 2
     state = drive.homing_state[lane]
     method = _by_switch(drive.homing_method[lane])
-    sign = _search_sign(method)
+    edge = _edge_side(method)
     active = inputs.is_active(drive, lane, _switch(method))
     if state in (SEARCH, TURNED):
         state = _search(drive, lane, state, active, dt)
     if state == BRAKE:
         state = _come_to_rest(drive, lane, active, dt)
     elif state == AWAY:
-        state = _come_back(drive, lane, sign, active, dt)
+        state = _come_back(drive, lane, edge, active, dt)
     elif state == TO_EDGE:
-        state = _leave_switch(drive, lane, sign, active, dt)
+        state = _leave_switch(drive, lane, edge, active, dt)
+    elif state == BACK_ON:
+        state = _enter_switch(drive, lane, edge, active, dt)
     elif state == TO_INDEX:
         state = _go_to_index(drive, lane, dt)
     elif state == RETURN:

@@ -7,6 +7,8 @@ from drive_env.firmware.common import fsa, profiles, s_ramp, shaped, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
+FAR = 1e6  # rad: where a trapezoid aims that is not to brake
+
 
 @stage
 def new_set_point(drive, lane, word_before):
@@ -14,7 +16,9 @@ def new_set_point(drive, lane, word_before):
 
     Without a buffer a new edge plans anew from where the axis is, "change set immediately" (bit 5) or not. With one, an
     edge without bit 5 during a motion puts the set-point into it, and bit 12 stays until it is taken out; one more edge
-    without bit 5 does nothing then (CiA 402-2, profile position mode).
+    without bit 5 does nothing then (CiA 402-2, profile position mode). With bit 9 (change on set-point) the axis does
+    not stop at the set-point before: it passes it with the profile's velocity, and goes on to the one that waited.
+    Ramps other than trapezoids end at each set-point.
     """
     word = drive.controlword[lane]
     if not word & cia402.NEW_SET_POINT:
@@ -40,6 +44,35 @@ def _is_under_way(drive, lane):
     return drive.set_point_valid[lane] == 1 and (
         drive.position_demand[lane] != drive.profile_target[lane] or drive.velocity_demand[lane] != 0.0
     )
+
+
+@stage
+def _passes(drive, lane):
+    """Return whether the profile goes through its set-point to the one that waits."""
+    waits = drive.set_point_waiting[lane] == 1
+    return waits and drive.waiting_word[lane] & cia402.CHANGE_ON_SET_POINT != 0
+
+
+@stage
+def _follow_trapezoid(drive, lane, v_max, up, down, dt):
+    """Move the demand along a trapezoid to the set-point, or through it to the one that waits."""
+    x, v, target = drive.position_demand[lane], drive.velocity_demand[lane], drive.profile_target[lane]
+    through = _passes(drive, lane)
+    aim = target
+    if through:
+        aim += FAR if target > x or (target == x and v > 0.0) else -FAR
+    new_x, v = profiles.trapezoid(x, v, aim, v_max, up, down, dt)
+    drive.position_demand[lane] = new_x
+    drive.velocity_demand[lane] = v
+    if through and (x - target) * (new_x - target) <= 0.0:
+        _take_waiting(drive, lane)
+
+
+@stage
+def _take_waiting(drive, lane):
+    """Take the set-point out of the buffer."""
+    _take(drive, lane, drive.waiting_target[lane], drive.waiting_word[lane])
+    empty_buffer(drive, lane)
 
 
 @stage
@@ -83,8 +116,7 @@ def generate(drive, lane, ramp, dt):
         drive.velocity_demand[lane] = v
         return
     if drive.set_point_waiting[lane] == 1 and not _is_under_way(drive, lane):
-        _take(drive, lane, drive.waiting_target[lane], drive.waiting_word[lane])
-        empty_buffer(drive, lane)
+        _take_waiting(drive, lane)
     up = drive.acceleration[lane]
     v_max = profiles.limited(drive.max_velocity[lane], drive.velocity_limit[lane])
     target = drive.profile_target[lane]
@@ -98,9 +130,8 @@ def generate(drive, lane, ramp, dt):
         elif six_point.is_set(drive, lane):
             six_point.advance(drive, lane, target, v_max, up, down, dt)
         else:
-            x, v = profiles.trapezoid(x, v, target, v_max, up, down, dt)
-            drive.position_demand[lane] = x
-            drive.velocity_demand[lane] = v
+            _follow_trapezoid(drive, lane, v_max, up, down, dt)
+            target = drive.profile_target[lane]
         x, v = drive.position_demand[lane], drive.velocity_demand[lane]
     window = drive.position_window[lane]
     if window == 0.0 or window > 1e300:

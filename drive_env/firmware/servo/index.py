@@ -1,0 +1,53 @@
+"""The encoder's index (channel N) on a servo motor: it is looked for while homing runs, and at no other time.
+
+It is active for one count of each turn, at a true angle of the disc, and comes when N becomes active: upwards at its
+first edge, downwards at its second one. An absolute encoder's is where its turn begins.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drive_env.firmware.common.arithmetic import TWO_PI
+from drive_env.firmware.common.encoder import encoder_count
+from drive_env.firmware.common.modes import hm
+from drive_env.firmware.record import LANES
+from mechanics.compiled import inlined, stage
+
+
+@stage
+def find_whether_index_is_needed(drive):
+    """Write whether a lane of the block is homing, and where the discs stand as the first one begins."""
+    looks = 0
+    for lane in range(LANES):
+        looks = 1 if hm.is_running(drive, lane) else looks
+    if looks == 1 and drive.block_looks_for_index[0] == 0:
+        for lane in range(LANES):
+            angle = drive.theta_m[lane] + drive.encoder_error[lane]
+            drive.true_edges[lane] = angle * drive.encoder_counts[lane] * (1.0 / TWO_PI)
+    drive.block_looks_for_index[0] = looks
+
+
+@inlined
+def watch_index(drive):
+    """Look for the index in the window that has passed: writes index_seen and index_position [rad]."""
+    for lane in range(LANES):
+        counts = drive.encoder_counts[lane]
+        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * counts * (1.0 / TWO_PI)
+        before = drive.true_edges[lane]
+        up = 1.0 if edges >= before else 0.0
+        first = np.floor(drive.index_angle[lane] * counts * (1.0 / TWO_PI)) + 1.0 - up
+        turn = np.floor((edges - first) / counts)
+        turn_before = np.floor((before - first) / counts)
+        sees = drive.encoder_broken[lane] < 0.5 and drive.encoder_gain[lane] > 0.0
+        came = sees and turn != turn_before
+        at = first + counts * (turn if turn > turn_before else turn_before)
+        count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
+        per_count = (1.0 - 2.0 * drive.shaft_direction[lane]) * TWO_PI * drive.turns_per_count[lane]
+        by_encoder = (count - drive.count_zero[lane]) * per_count - drive.home_shift[lane]
+        # Under hall commutation the halls may be what tells the position.
+        by_hall = drive.angle_source[lane] == 2.0 and drive.always_use_encoder[lane] == 0.0
+        position = drive.theta_meas[lane] if by_hall else by_encoder
+        drive.index_seen[lane] = 1.0 if came else drive.index_seen[lane]
+        drive.index_position[lane] = position if came else drive.index_position[lane]
+        drive.true_edges[lane] = edges

@@ -1,0 +1,174 @@
+"""One trial of the gains of a stepper's position PID: a move that the motor follows, the reversal, the gain probe.
+
+A PID moves the field until the encoder is where the steps are; the encoder does not commutate. On the ramp's velocity
+it takes away what load and friction turn the rotor by in its field; alone it makes all of the motion. Within the
+motor's torque both show in every move, so that the move is a servo's; that of a PID alone is as short as its lag
+allows. No torque current is measured (6077h is the size of the current that is set): what vibrates is seen by the
+encoder. What a load step would do follows from the gains, as a servo's: see `load_step_error`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import cia402
+from drive_env.devices import Device
+from drive_env.devices.gain_set import PID_ALONE, ClosedLoop
+from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import device_of
+from drive_env.motors import Motor
+from drive_env.phase_current import holding_torque
+from drive_env.trials.closed_loop import ClosedLoopTrials, full_step
+from drive_env.trials.gain_trial import Identified
+from drive_env.trials.open_loop import LOST, TOOTH, open_loop_terms
+from drive_env.trials.positioning import (
+    BAND_COUNTS,
+    CYCLE,
+    QUIET,
+    SETTLED,
+    TRAVEL_SHARE,
+    TRIAL,
+    Move,
+    plan_move,
+    wrapped,
+)
+from drive_env.trials.score import LOAD_SHARE, NOISE
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+PID_P, PID_I = ("correction", "velocity"), ("correction", "velocity, integral")  # of the gain set: loop and part
+P_UNIT, I_UNIT, PRESCALER = 256.0, 65536.0, 128.0  # of 202Bh: 1/s; of 202Ch, 202Dh; of the clock
+CLOCK = 16e6  # Hz, of the motion controller
+MICROSTEPS, MODEL_STEP = 256.0, 1e-4  # of a full step, as commissioned; s
+PROBE = 1.5  # P of the probe over that of the trial
+ALONE = 8.0  # full steps of a move that a PID makes alone: it is behind by a third of them
+VIBRATION = 0.1  # full steps, by which the encoder changes from millisecond to millisecond: as 3 % of a servo's ripple
+# RMS of the change of that in a look [full steps]: a light rotor that swings as a ramp begins makes 0.2 of it, one that
+# oscillates or rolls over its teeth 0.33 and more.
+SHAKES = 0.3
+LONGEST_WAY_BACK, BACK, LOOK = 2.0, 0.5, 0.05  # s, full steps, s: what slipped is made up for before the next phase
+
+
+def load_step_error(device: Device, motor: Motor, loop: ClosedLoop, gains: Integers) -> Floats:
+    """Return the integral of |error| in the time of a load step [microsteps s], by the gains' model, (n,).
+
+    The field is an integrator, and a load of 0.3 of the rated torque turns the rotor in it by e at once (TMC4361 data
+    sheet; f is the clock, div 256 where 202Eh is 0):
+
+        de/dt (1 + 2021h 128 div / f) = -(202Bh / 256 e + 202Ch f / 2^23 int e), at most 202Fh
+
+    and nothing at all within 2022h. The rotor's own swing, which bounds the gains, is no part of it: trials have it.
+    """
+    columns = dict(zip(loop.gains.values(), device.gains.columns_of_loop(loop), strict=True))
+
+    def of(name: str) -> Floats:
+        return np.asarray(gains[:, columns[name]], float)
+
+    clock = CLOCK / PRESCALER  # Hz
+    p, i = of("correction_velocity_p") / P_UNIT, of("correction_velocity_i") * clock / I_UNIT
+    slower = 1.0 + of("correction_position_p") * np.where((d := of("derivative_divider")) > 0.0, d, 256.0) / clock
+    largest, most = of("correction_sum_limit") * I_UNIT / clock, of("correction_velocity_limit")
+    share = LOAD_SHARE * motor.rated_torque / float(holding_torque(motor, motor.rated_current))
+    e = np.full(len(gains), np.arcsin(share) / (0.5 * np.pi) * MICROSTEPS)
+    total, area = np.zeros(len(gains)), np.zeros(len(gains))
+    for _ in range(round((TRIAL - SETTLED) * CYCLE / MODEL_STEP)):
+        outside = np.abs(e) > of("correction_tolerance")
+        total = np.where(outside, np.clip(total + e * MODEL_STEP, -largest, largest), total)
+        speed = np.where(outside, np.clip((p * e + i * total) / slower, -most, most), 0.0)
+        e = e - speed * MODEL_STEP
+        area = area + np.abs(e) * MODEL_STEP
+    return np.asarray(area)
+
+
+def pid_time(loop: ClosedLoop) -> float:
+    """Return the time constant [s] of the P part that a search begins with."""
+    return P_UNIT / float(next(iter(loop.first.values())))
+
+
+def plan_pid(motor: Motor, loop: ClosedLoop, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
+    """Return a move of 60 ms as `plan_move` does, for a PID alone one of `ALONE` full steps at most."""
+    to = np.asarray(reach, float)
+    if loop.kind == PID_ALONE:
+        to = np.copysign(np.minimum(np.abs(to), ALONE * full_step(motor) / TRAVEL_SHARE), to)
+    return plan_move(motor, found.inertia, scaler, to)
+
+
+def pid_terms(
+    position: Floats, lag: Floats, move: Move, t_0: float | Floats, target: Integers, sign: Integers, step: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return t_s/t_0, vibration as J counts a ripple, and overshoot of a move; arguments as `open_loop_terms` has."""
+    settling, _, overshoot, _ = open_loop_terms(position, lag, move, t_0, target, sign, step)
+    change = wrapped(np.diff(position[QUIET:SETTLED], axis=0))
+    vibration = np.sqrt(np.mean(change**2, axis=0)) / step
+    return settling, vibration / VIBRATION * NOISE, overshoot
+
+
+def steps_of(move: Move, motor: Motor) -> Floats:
+    """Return the increments of a full step, (num_axes,)."""
+    return np.asarray(2.0 * np.pi * move.increments / (TOOTH * motor.n_p))
+
+
+def following_scale(move: Move, motor: Motor, loop: ClosedLoop) -> Floats:
+    """Return over what |demand - encoder| counts [inc]: a full step, of a PID alone the move."""
+    if loop.kind == PID_ALONE:
+        return np.maximum(np.abs(move.distance), 1).astype(float)
+    return steps_of(move, motor)
+
+
+class PidTrials(ClosedLoopTrials):
+    """Runs trials on steppers whose position a PID regulates, as `ClosedLoopTrials` does.
+
+    An axis whose rotor shakes, or rolls over its teeth, is stopped, and has made up for it when the next phase begins.
+    """
+
+    def _tried(self, gains: Integers, move: Move, *, is_probe: bool) -> Integers:
+        known = device_of(self._drives).gains
+        column = known.column(*PID_P)
+        assert column is not None, "a PID has a P part"
+        return known.scaled(gains, PROBE, [column]) if is_probe else gains
+
+    def _terms(
+        self, position: Floats, current: Floats, move: Move, target: Integers, sign: Integers
+    ) -> tuple[Floats, Floats, Floats]:
+        # The load angle that these terms have beside them is no term of a PID.
+        step = steps_of(move, self._motor)
+        return pid_terms(position, np.zeros_like(position), move, self._t_0, target, sign, step)
+
+    def _following_scale(self, move: Move) -> Floats:
+        return following_scale(move, self._motor, self._closed)
+
+    def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
+        """Return whose speed changes from ms to ms as no ramp makes it, or who falls behind a ramp by lost steps."""
+        scale = np.asarray(self._drives.read(Role.POSITION_SCALE), float)
+        step = scale / (TOOTH * self._motor.n_p)
+        change = np.diff(wrapped(np.diff(trace[cia402.POSITION_ACTUAL], axis=0)), axis=0)
+        most = np.maximum(SHAKES * step, BAND_COUNTS * scale / self._motor.encoder_counts)
+        shakes = np.sqrt(np.mean(change**2, axis=0)) > most
+        if self._closed.kind == PID_ALONE:  # is behind its demand in any case
+            return np.asarray(shakes)
+        lag = np.abs(wrapped(trace[cia402.POSITION_DEMAND] - trace[cia402.POSITION_ACTUAL]))
+        return np.asarray(shakes | (lag > LOST * step).any(axis=0))
+
+    def _phase(
+        self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
+    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+        found = super()._phase(target, incumbent, stopped, where)
+        if (slipped := found[3] & ~stopped & where).any():
+            self._make_up(slipped)
+        return found
+
+    def _make_up(self, where: Mask) -> None:
+        """Wait until axes are where their demand is, with the incumbent, or for as long as that may take."""
+        drives = self._drives
+        near = BACK * np.asarray(drives.read(Role.POSITION_SCALE), float) / (TOOTH * self._motor.n_p)
+        for _ in range(round(LONGEST_WAY_BACK / LOOK)):
+            behind = np.abs(wrapped(drives.read(cia402.POSITION_DEMAND) - drives.read(cia402.POSITION_ACTUAL)))
+            if np.all(behind[where] < near[where]):
+                return
+            drives.advance(LOOK)
