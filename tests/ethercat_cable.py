@@ -91,7 +91,7 @@ def move(interface: str) -> None:
     """Be the master: move to and fro; after each error begin anew."""
     while True:
         with (
-            suppress(BusError, SafetyError, ObjectAccessError, TimeoutError),
+            suppress(BusError, SafetyError, ObjectAccessError, RuntimeError, TimeoutError),
             EtherCatDrives("tmcm3313", channel=interface, safety=Limits(silence=SILENCE), timeout=5.0) as drives,
         ):
             motion.enable(drives, mode="csv")
