@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import ethercat_cable
 import numpy as np
 import pytest
 from test_ethercat_ways import needs_namespaces
@@ -107,3 +108,14 @@ def test_ethercat_drives_on_soem_give_the_integers_of_emulated_ones(spaces, devi
     np.testing.assert_array_equal(rows, expected)
     assert seen["words"] == [0x27] * drives.num_axes
     assert seen["disabled"] == [0x40] * drives.num_axes and seen["emergencies"] == 0
+
+
+@pytest.mark.slow
+@needs_namespaces
+def test_a_cable_that_is_pulled_in_motion_stops_the_drive_within_its_watchdog_and_it_comes_back():
+    """50 times of 50: python tests/ethercat_cable.py 50."""
+    pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
+    for pulled in ethercat_cable.main(2):
+        assert pulled["watchdog"] == ethercat_cable.SILENCE
+        assert pulled["left_op"] <= pulled["watchdog"] + 0.01  # s: a cycle, and what this computer is late by
+        assert pulled["at_rest"] <= pulled["left_op"] + 0.1, "the ramp of the fault reaction"
