@@ -108,6 +108,17 @@ def test_the_scope_s_time_is_the_environment_s(kind):
     lanes.close()
 
 
+def test_what_is_looked_at_first_after_60_steps_are_those_steps():
+    lanes = Tracking(2, num_threads=1, render_mode="rgb_array", load="belt", duration=0.5)
+    lanes.reset(seed=0)
+    for _ in range(60):
+        lanes.step(lanes.action_space.high * 0.1)
+    for lane in range(2):
+        shown = lanes._pictures._recorders[lane].recording()
+        assert shown.t[-1] == pytest.approx(0.060) and len(shown.t) >= 60
+    lanes.close()
+
+
 def test_on_a_bus_nobody_sees_the_machine():
     with pytest.raises(ValueError, match="pictures need emulated machines; leave render_mode out on a bus"):
         Pictures(SimpleNamespace(machine=None), "rgb_array")
