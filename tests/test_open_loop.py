@@ -389,7 +389,8 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
     with pytest.raises(ValueError, match="coolstep_up: a trial of an open-loop stepper shows what the phase currents"):
         check_tried(STEPPER, ("run_current", "coolstep_up"))
     none = SimpleNamespace(
-        name="none", gains=SimpleNamespace(outer=(), columns=lambda names: (), closed_rows=(), is_open_loop=False)
+        name="none",
+        gains=SimpleNamespace(outer=(), columns=lambda names: (), loop_of=lambda names: None, is_open_loop=False),
     )
     with pytest.raises(ValueError, match="none has no gains of a velocity or position loop and no phase currents"):
         check_tried(none, ())
