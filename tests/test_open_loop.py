@@ -390,7 +390,9 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
         check_tried(STEPPER, ("run_current", "coolstep_up"))
     none = SimpleNamespace(
         name="none",
-        gains=SimpleNamespace(outer=(), columns=lambda names: (), loop_of=lambda names: None, is_open_loop=False),
+        gains=SimpleNamespace(
+            outer=(), columns=lambda names: (), loop_of=lambda names: None, closed_loops=(), is_open_loop=False
+        ),
     )
     with pytest.raises(ValueError, match="none has no gains of a velocity or position loop and no phase currents"):
         check_tried(none, ())
