@@ -13,7 +13,6 @@ import typer
 
 from drive_env.commands.progress import progress_on
 from drive_env.commands.tables import Column, print_lines, print_names, print_table
-from drive_env.devices.gain_set import LOAD_ANGLE, PID_ON_RAMP
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -69,6 +68,8 @@ def sweep(
         if closed_loop and pid:
             raise ValueError("--closed-loop and --pid choose different experiments; give one of them")
         if closed_loop or pid:
+            from drive_env.devices.gain_set import LOAD_ANGLE, PID_ON_RAMP
+
             overrides["closed_loop"] = PID_ON_RAMP if pid else LOAD_ANGLE
         if list_names:
             _list_names()
