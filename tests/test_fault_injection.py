@@ -157,8 +157,11 @@ def run_and_signal(emulated, programs, name, number, frame, times, safety="limit
 
 
 def is_stopped(pid):
-    """Whether a process is stopped (the third field of its status, after the name in brackets)."""
-    return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] == "T"
+    """Whether a process is stopped (the third field of its status, after the name in brackets), not gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] == "T"
+    except FileNotFoundError:
+        return False
 
 
 def cases(emulated, name, numbers, each, seed):

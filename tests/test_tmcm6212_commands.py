@@ -102,7 +102,7 @@ def test_one_axis_is_watched(bus, tmp_path):
 @pytest.mark.slow
 def test_it_is_found_backed_up_and_watched(bus, tmp_path):
     run, _ = bus
-    found = CliRunner().invoke(drive_env.commands.cli.app, ["scan", "--first", "1", "--last", "2"])
+    found = CliRunner().invoke(drive_env.commands.cli.app, ["scan", "--last", "1", "--timeout", "20"])
     assert found.stdout.startswith("node 1  tmcm6212  TMCM-6212"), found.output
     assert run("backup", tmp_path / "all.toml").exit_code == 0
     changed = run("set", "6081", "1000", "--axis", 2)
