@@ -131,7 +131,7 @@ def test_an_axis_whose_drive_time_runs_out_has_bounds_and_is_amber(load, tmp_pat
 @pytest.mark.slow
 def test_an_axis_without_a_model_that_fits_is_amber_and_says_so(tmp_path):
     with emulated(load="geared_joint", num_threads=1) as target:
-        result = auto(target, tmp_path / "before.toml", budget=SPENT)
+        result = auto(target, tmp_path / "before.toml", budget=SPENT + 1.4)  # its first gains fail in the reversal
         paper = certificate(target, result, seed=0)
     (axis,) = result.axes
     assert axis.verdict == "accepted with reservations" and not axis.at_least
