@@ -24,6 +24,11 @@ def test_the_gain_error_of_a_current_covers_95_percent_of_the_sensors(kind, turn
     assert np.mean(np.abs(drawn) <= bound) == pytest.approx(0.95, abs=0.001)
 
 
+def test_a_field_turns_unless_it_is_said_to_stand():
+    motor = SimpleNamespace(kind="bldc")
+    assert gain_error(DEVICE, motor) == gain_error(DEVICE, motor, turns=True) < gain_error(DEVICE, motor, turns=False)
+
+
 def test_the_larger_side_of_a_gain_error_counts():
     lopsided = SimpleNamespace(stage={"adc_gain_error_a": SimpleNamespace(low=-0.03, high=0.01)})
     assert gain_error(lopsided, SimpleNamespace(kind="dc")) == pytest.approx(0.95 * 0.03)
