@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from canopen_wire import Wire
+from closed_loop_rig import PID_RECIPE
 from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion
@@ -194,3 +195,82 @@ def cia402_settings():
         cia402.PROFILE_VELOCITY, cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.FOLLOWING_WINDOW,
         cia402.SENSOR_SELECTION, 0x2020,
     )  # fmt: skip
+
+
+# --- the index --------------------------------------------------------------------------------------------------------
+LOOPS = (OPEN, CLOSED, 2, 3)
+COUNT = 2.0 * np.pi / MOTOR.encoder_counts
+
+
+def slipped(drives):
+    """Enable axes and have a load pull each rotor some full steps away from its steps; return how far [microsteps]."""
+    drives.write(cia402.SENSOR_SELECTION, 0)
+    drives.write(cia402.FOLLOWING_WINDOW, 0)
+    for index, value in PID_RECIPE.items():
+        drives.write(index, value, where=np.array(LOOPS) > CLOSED)
+    motion.enable(drives, mode="hm")
+    held = float(holding_torque(MOTOR, run_and_standby(drives.device, read_gains(drives))[0])[0])
+    drives.machine.load_torque = -1.5 * held
+    drives.advance(0.02)
+    drives.machine.load_torque = 0.0
+    drives.advance(0.5)
+    return drives.machine.rotor_angle * TURN / (2.0 * np.pi)
+
+
+def position_less_rotor(drives):
+    """Return what 6064h shows beyond the rotor's true angle [rad]."""
+    return drives.read(cia402.POSITION_ACTUAL) * 2.0 * np.pi / TURN - drives.machine.rotor_angle
+
+
+@pytest.mark.parametrize("method", [33, 34])
+def test_home_is_at_the_index_in_a_loop_and_out_of_it(method):
+    """2028h, which is not 0 after lost steps, is left out of no position: 0 is where the disc has its index."""
+    with drives_of(len(LOOPS)) as drives:
+        slip = slipped(drives)
+        assert np.all(np.abs(slip) > 500.0)
+        drives.write(Role.LOOP_MODE, LOOPS)
+        drives.advance(0.8)
+        angle = 2.0
+        drives.machine.set("motor.index_angle", angle)
+        drives.write(cia402.HOMING_METHOD, method)
+        drives.write((cia402.HOMING_SPEEDS, 2), 20_000)
+        drives.write(cia402.CONTROLWORD, 0x1F)
+        drives.advance(6.0)
+        assert np.all(drives.read(cia402.STATUSWORD) & 0x3400 == 0x1400)
+        turn = (-position_less_rotor(drives) - angle) / (2.0 * np.pi)
+        np.testing.assert_allclose(turn, np.round(turn), atol=2.0 * COUNT / (2.0 * np.pi))
+
+
+def test_the_latch_holds_what_6064h_shows_at_the_index_in_a_loop_and_out_of_it():
+    with drives_of(len(LOOPS)) as drives:
+        slipped(drives)
+        drives.write(Role.LOOP_MODE, LOOPS)
+        drives.advance(0.8)
+        drives.machine.set("motor.index_angle", 4.8)
+        drives.write((0x200F, 1), 1)
+        motion.enable(drives, mode="pv")
+        drives.write(cia402.PROFILE_ACCELERATION, 10 * TURN)
+        drives.write(cia402.TARGET_VELOCITY, TURN // 8)
+        drives.advance(3.0)
+        assert not drives.read((0x200F, 1)).any()
+        motion.quick_stop(drives)
+        drives.advance(0.5)
+        shown = drives.read((0x200F, 3)) * 2.0 * np.pi / TURN - position_less_rotor(drives)
+        turn = (shown - 4.8) / (2.0 * np.pi)
+        np.testing.assert_allclose(turn, np.round(turn), atol=2.0 * COUNT / (2.0 * np.pi))
+
+
+def test_an_axis_turned_by_hand_while_it_is_off_is_seen_once():
+    """200Bh:03 is of the open loop: in a loop the axis is where the encoder sees it already."""
+    with drives_of(len(LOOPS)) as drives:
+        drives.write((0x200B, 3), 1)
+        slipped(drives)
+        drives.write(Role.LOOP_MODE, LOOPS)
+        drives.advance(0.8)
+        motion.disable(drives)
+        before = position_less_rotor(drives)
+        drives.machine.load_torque = 0.05
+        drives.advance(0.1)
+        drives.machine.load_torque = 0.0
+        drives.advance(1.0)
+        np.testing.assert_allclose(position_less_rotor(drives), before, atol=2.0 * COUNT)

@@ -157,6 +157,8 @@ STATE = (
     Field("index_edge", "f8", "", "edge of the disc at which the index begins"),
     Field("step_seen", "f8", "rad", "step_position at the last window"),
     Field("step_shift", "f8", "rad", "by which the steps are ahead of the position that the encoder gave the axis"),
+    Field("loop_closed", "f8", "", "mode of 2020h that acts now; 0: none, as in a drive without a loop"),
+    Field("encoder_shift", "f8", "rad", "from the encoder's position to that of an axis in a loop; 0 without one"),
     Field("latch_armed", "f8", "", "200Fh:01: 1: the next index is latched"),
     Field("latch_steps", "f8", "rad", "200Fh:02: position by the steps at that index"),
     Field("latch_encoder", "f8", "rad", "200Fh:03: position by the encoder at that index"),

@@ -50,7 +50,8 @@ def watch_index(drive):
         steps = seen + part * (drive.step_position[lane] - seen) - drive.step_shift[lane] - drive.home_shift[lane]
         count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
         per_count = TWO_PI * drive.turns_per_count[lane]
-        encoder = (count - drive.count_zero[lane]) * per_count - drive.home_shift[lane]
+        turned = (count - drive.count_zero[lane]) * per_count
+        encoder = turned + drive.encoder_shift[lane] - drive.home_shift[lane]
         position = encoder if drive.position_sensor[lane] > -0.5 else steps
         drive.index_seen[lane] = 1.0 if came else drive.index_seen[lane]
         drive.index_position[lane] = position if came else drive.index_position[lane]
@@ -79,9 +80,10 @@ def measure_motion(drive, h):
         count = before if drive.encoder_broken[lane] > 0.5 else count
         per_count = TWO_PI * drive.turns_per_count[lane]
         turned = (count - drive.count_zero[lane]) * per_count
-        # Without current the rotor may be turned by hand: what the encoder sees then is where the axis is.
-        is_off = drive.drive_function[lane] < 0.5 and drive.position_sensor[lane] > -0.5
-        takes = is_off and drive.takes_encoder_position[lane] > 0.5
+        # Without current the rotor may be turned by hand: then the axis is where the encoder sees it. In a loop
+        # it is anyway.
+        is_off = drive.drive_function[lane] < 0.5 and drive.loop_closed[lane] < 0.5
+        takes = is_off and drive.position_sensor[lane] > -0.5 and drive.takes_encoder_position[lane] > 0.5
         shift = drive.step_position[lane] - turned if takes else drive.step_shift[lane]
         steps = drive.step_position[lane] - shift - drive.home_shift[lane]
         encoder = turned - drive.home_shift[lane]

@@ -167,6 +167,8 @@ def power_on(drive, lane):
     drive.true_edges[lane] = edges
     drive.step_seen[lane] = 0.0
     drive.step_shift[lane] = 0.0
+    drive.loop_closed[lane] = 0.0
+    drive.encoder_shift[lane] = 0.0
     drive.index_seen[lane] = 0.0
     drive.latch_armed[lane] = 0.0
     drive.latch_steps[lane] = 0.0

@@ -20,13 +20,15 @@ def encoder_position(drive, lane):
 def see_axis(drive):
     """Let an axis in a loop be where the encoder sees it.
 
-    Writes loop_deviation; in a loop theta_meas, omega_meas, theta_encoder and position_actual.
+    Writes loop_deviation and encoder_shift; in a loop theta_meas, omega_meas, theta_encoder and position_actual.
     """
     for lane in range(LANES):
-        encoder = encoder_position(drive, lane) + drive.loop_offset[lane]
-        shown = encoder - drive.step_shift[lane] - drive.home_shift[lane]
+        turned = encoder_position(drive, lane)
         closed = drive.loop_closed[lane] > 0.5
-        drive.loop_deviation[lane] = drive.step_position[lane] - encoder
+        shift = drive.loop_offset[lane] - drive.step_shift[lane]
+        shown = turned + shift - drive.home_shift[lane]
+        drive.encoder_shift[lane] = shift if closed else 0.0
+        drive.loop_deviation[lane] = drive.step_position[lane] - (turned + drive.loop_offset[lane])
         drive.theta_meas[lane] = shown if closed else drive.theta_meas[lane]
         drive.omega_meas[lane] = drive.omega_encoder[lane] if closed else drive.omega_meas[lane]
         drive.theta_encoder[lane] = shown if closed else drive.theta_encoder[lane]

@@ -41,7 +41,6 @@ STATE = (
     Field("loop_initialised", "i4", "", "2120h: 1 once load angle control works"),
     Field("torque_current", "f8", "A", "6077h: current that makes torque"),
     # --- how the loop stands --------------------------------------------------------------------------------------
-    Field("loop_closed", "f8", "", "mode of 2020h that acts now"),
     Field("corrects", "f8", "", "1: a PID may move the field"),
     Field("settle_time", "f8", "s", "for which the initialisation has held the rotor"),
     Field("loop_deviation", "f8", "rad", "of the encoder from the steps"),
