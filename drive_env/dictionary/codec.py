@@ -54,12 +54,12 @@ class Code(NamedTuple):
     @property
     def least(self) -> int:
         """Least integer that stands for what the factor gives."""
-        return self.low + any(raw == self.low for raw, _ in self.specials)
+        return self.low + any(raw == self.low for raw, _ in self.specials) if self.specials else self.low
 
     @property
     def greatest(self) -> int:
         """Greatest integer that stands for what the factor gives."""
-        return self.high - any(raw == self.high for raw, _ in self.specials)
+        return self.high - any(raw == self.high for raw, _ in self.specials) if self.specials else self.high
 
 
 def code_of(entry: Entry, binding: Binding) -> Code:

@@ -6,7 +6,7 @@ the way from an object to its place in the record is worked out once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -169,7 +169,7 @@ class Axis:
     def _unbound_reader(self, entry: Entry) -> Callable[[], int | str]:
         objects, number = self._objects, self.number
         if (entry.index, entry.sub) in self._device.parts:
-            return lambda: int(objects.part(entry)[number])
+            return self._part_reader(entry)
 
         def read() -> int | str:
             values = objects.unbound(entry)
@@ -177,10 +177,26 @@ class Axis:
 
         return read
 
+    def _part_reader(self, entry: Entry) -> Callable[[], int | str]:
+        """Return how a part of another object is read, as `LiveDictionary.part` reads it of all axes."""
+        part, within = self._device.parts[entry.index, entry.sub], self.number % self._device.num_axes
+        source = self.number if part.axis is None else self.number - within + part.axis
+        if source >= self._objects.num_axes or (part.axis or 0) >= self._device.num_axes:
+            return lambda: entry.default  # of an axis that is not there
+        axis = self if source == self.number else Axis(self._objects, source)
+        whole = axis.port(self._objects.entries.find(part.source(within)))
+        return lambda: int(part.shown(whole.read()))
+
     def _unbound_writer(self, entry: Entry) -> Callable[[int], None]:
         objects, number = self._objects, self.number
         if (entry.index, entry.sub) in {*self._device.parts, *self._device.shared_values}:
-            return lambda raw: objects.write_checked(entry, raw, number)
+            read = self._unbound_reader(entry)
+
+            def write_if_new(raw: int) -> None:  # an image brings the same in each cycle
+                if raw != read():
+                    objects.write_checked(entry, raw, number)
+
+            return write_if_new
 
         def write(raw: int) -> None:
             values = objects.unbound(entry)
@@ -197,15 +213,31 @@ class Axis:
         context = Context(self._reals[self._scaler], lsb, rated_current=device.rated_current, **others)
         return float(code.factor(context))
 
+    def _factor_now(self, code: Code) -> Callable[[], float]:
+        """Return what gives a code's factor as the scales are now, which seldom change."""
+        if not code.follows_scale:
+            fixed = self._factor(code)
+            return lambda: fixed
+        reals, places = self._reals, (self._scaler, *self._other_scales.values())
+        known: Sequence[float] = ()
+        factor = 0.0
+
+        def now() -> float:
+            nonlocal known, factor
+            scales = [reals[place] for place in places]
+            if scales != known:
+                known, factor = scales, self._factor(code)
+            return factor
+
+        return now
+
     def _reader(self, code: Code) -> Callable[[], int]:
         memory, place = self._place(code.field, code.part)
         low, high = code.low, code.high
         if memory is self._integers and code.unit == "raw":
             return lambda: min(max(memory[place], low), high)
-        if code.follows_scale:
-            return lambda: encode_one(code, memory[place], self._factor(code))
-        factor = self._factor(code)
-        return lambda: encode_one(code, memory[place], factor)
+        factor = self._factor_now(code)
+        return lambda: encode_one(code, memory[place], factor())
 
     def _writer(self, entry: Entry, code: Code) -> Callable[[int], None]:
         memory, place = self._place(code.field, code.part)
@@ -217,11 +249,11 @@ class Axis:
         if memory is self._integers:
             assert code.unit == "raw", "whole numbers of the record are bound as they are"
             return lambda raw: memory.__setitem__(place, raw)
-        fixed = self._factor(code)
+        factor = self._factor_now(code)
         fresh = code.event == "set_point"
 
         def write(raw: int) -> None:
-            memory[place] = decode_one(code, raw, self._factor(code) if code.follows_scale else fixed)
+            memory[place] = decode_one(code, raw, factor())
             if fresh:
                 self._integers[self._fresh] = 1
 
