@@ -16,6 +16,7 @@ from drive_env import cia402, motion
 from drive_env.devices import find_device
 from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.master.pace import Timing
+from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import WATCH
 from tuning.auto import moves as auto_moves
 from tuning.auto import one_button as auto_module
@@ -116,32 +117,66 @@ def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch,
 
 
 @pytest.mark.slow
-def test_where_one_more_move_fails_the_second_best_of_the_trials_is_taken(axes, monkeypatch, tmp_path):
+def test_where_one_more_move_fails_lesser_gains_are_taken_not_the_same_of_another_trial(axes, monkeypatch, tmp_path):
     target, good = axes
     finds(monkeypatch, np.stack([faster(target.device.gains, good, 0.8), good]))
     run, show, tried, shown = ProvingGround.run, ProvingGround.show, [], []
 
     def seen(self, gains, where):
         proof = run(self, gains, where)
-        tried.append((proof.cost[0], gains[0].copy(), proof.passed[0] and where[0]))
+        tried.append((gains[0].tolist(), bool(proof.passed[0] and where[0])))
         return proof
 
     def fails_once(self, gains, where):
-        shown.append(gains[0].copy())
+        shown.append(gains[0].tolist())
         found = show(self, gains, where)
         return found._replace(reason=("it shook", "")) if len(shown) == 1 else found
 
     monkeypatch.setattr(ProvingGround, "run", seen)
     monkeypatch.setattr(ProvingGround, "show", fails_once)
     result = auto(target, tmp_path / "before.toml", experiments=standing_in)
-    passed = sorted((cost, gains.tolist()) for cost, gains, ok in tried if ok)
-    assert len(passed) >= 2
-    assert [gains.tolist() for gains in shown[:2]] == [gains for _, gains in passed[:2]]
-    assert list(result.axes[0].after) == passed[1][1]
-    assert any(
-        "the second best gains of the trial are kept: with the best, in another move, it shook" in n
-        for n in result.axes[0].notes
-    )
+    assert tried[:2] == [(shown[0], True)] * 2, "two trials of the same gains passed"
+    assert shown[1] == list(faster(target.device.gains, np.array(shown[0]), 0.6))
+    assert any("gains lowered to 60 % after the trial: in another move, it shook" in n for n in result.axes[0].notes)
+
+
+@pytest.mark.parametrize(("spare", "then", "says"), [
+    ([3000, 900, 700, 500, 400], [3000, 900, 700, 500, 400], "the second best gains of the trial are kept"),
+    ([0, 0, 0, 0, 0], [4000, 1500, 720, 600, 480], "gains lowered to 60 %"),
+])  # fmt: skip
+def test_after_a_move_that_fails_the_second_best_gains_are_taken_or_lesser_ones(spare, then, says):
+    device, own = find_device("tmcm1636"), [4000, 1500, 1200, 1000, 800]
+    bench = SimpleNamespace(journals=[Journal()], target=SimpleNamespace(device=device))
+    found = auto_moves._after_failure(bench, basis([own]), recorded([own], spare=spare), 0, "it shook")
+    assert found.gains.tolist() == [then]
+    assert says in bench.journals[0].notes[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stops", "accepted"), [(1, True), (3, False)])
+def test_where_the_envelope_stops_the_move_lesser_gains_are_moved_with(stops, accepted, axes, monkeypatch, tmp_path):
+    """It stops all axes, whichever it was: all take lesser gains; an axis is given up after the third time."""
+    target, good = axes
+    finds(monkeypatch, np.stack([faster(target.device.gains, good, 0.8), good]))
+    show, shown = ProvingGround.show, []
+
+    def stopped(self, gains, where):
+        shown.append(gains.copy())
+        if len(shown) <= stops:
+            raise SafetyError("axis 1 oscillates: its current swung 8 times")
+        return show(self, gains, where)
+
+    monkeypatch.setattr(ProvingGround, "show", stopped)
+    before = gains(target.drives)
+    result = auto(target, tmp_path / "before.toml", experiments=standing_in)
+    assert result.accepted.tolist() == [accepted] * 2
+    assert not (shown[1] == shown[0]).all(axis=1).any()
+    if accepted:
+        assert (gains(target.drives) != shown[0]).any(axis=1).all()
+        assert all(any("axis 1 oscillates" in note for note in axis.notes) for axis in result.axes)
+    else:
+        np.testing.assert_array_equal(gains(target.drives), before)
+        assert all("the envelope stopped the move with the new gains: axis 1" in axis.reason for axis in result.axes)
 
 
 def test_a_machine_of_several_axes_is_as_good_as_its_worst():

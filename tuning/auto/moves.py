@@ -47,8 +47,16 @@ def show(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask | 
             with bench.spending(going):
                 shown = bench.ground.show(recorded.gains, going)
         except SafetyError as error:
-            bench.stop(going, f"the envelope stopped the move with the new gains: {error}")
-            return recorded
+            stopped_by = f"the envelope stopped the move with the new gains: {error}"
+            if attempt == SHOWINGS - 1 or not bench.affordable(MOVE_TIME)[going].all():
+                bench.stop(going, stopped_by)
+                return recorded
+            # It stops all axes, whichever it was.
+            with bench.spending(going):
+                bench.ground.recover(going)
+            for k in map(int, np.flatnonzero(going)):
+                recorded = _after_failure(bench, basis, recorded, k, stopped_by)
+            continue
         recorded = recorded.with_move(shown)
         failed = going & np.array([bool(reason) for reason in shown.reason])
         # Time for a response, and for what may follow from it, is kept; what was calmed by one is not eased, too.
@@ -74,7 +82,7 @@ def show(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask | 
 def _after_failure(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, why: str) -> RecordedGains:
     """Take other gains for an axis whose move failed: what passed once and fails now is at its edge."""
     journal, gains = bench.journals[k], recorded.gains[k]
-    if recorded.spare[k].any():
+    if recorded.spare[k].any() and not np.array_equal(recorded.spare[k], gains):
         journal.note(f"the second best gains of the trial are kept: with the best, in another move, {why}")
         return recorded.with_gains(k, recorded.spare[k])
     if recorded.eased[k] and not np.array_equal(gains, basis.reference[k]):

@@ -56,6 +56,7 @@ def prove(bench: AutoBench, basis: Basis, candidates: Candidates) -> TriedGains:
         better = open_ & proof.passed & (proof.cost < cost)
         # What was the best is the second best now; or what was tried is.
         next_ = open_ & proof.passed & (better & (cost < np.inf) | ~better & (proof.cost < second))
+        next_ &= (tried != best).any(axis=1)  # two ways may lead to the same gains
         second = np.where(next_, np.where(better, cost, proof.cost), second)
         spare = np.where(next_[:, None], np.where(better[:, None], best, tried), spare)
         best, cost = np.where(better[:, None], tried, best), np.where(better, proof.cost, cost)

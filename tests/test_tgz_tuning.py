@@ -1,0 +1,79 @@
+"""Both axes of a TGZ-D, each with a load of its own, are tuned: over its bus, and in a sweep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fault_injection import ObservedWorld, eds_read_once
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
+from drive_env.devices import find_device
+from drive_env.motors import find_motor
+from tuning.auto.certify import certificate
+from tuning.auto.one_button import auto
+from tuning.runs import sweep
+from tuning.runs.experiment import SweptObject, load_experiment
+from tuning.snapshot import load_snapshot, restore
+from tuning.target import Target
+
+DEVICE = find_device("tgz_d")
+MOTOR = find_motor("am3041_e")
+AXES = 2
+WAY = np.full(AXES, 120.0)  # rad
+
+
+def gains(drives):
+    """Return the gains that a drive has, (num_axes, count)."""
+    return np.stack([drives.read(name) for name in DEVICE.gains.keys], axis=1)
+
+
+@pytest.mark.slow
+def test_auto_over_a_bus_certifies_both_axes_and_undoes_itself(tmp_path):
+    """What the certificate says is in the emulator's dictionary, and so is what was there before, afterwards."""
+    before_file = tmp_path / "before.toml"
+    with eds_read_once(), EmulatedDrives("tgz_d", "inertia", num_machines=AXES, num_threads=1) as inside:
+        inside.inside.connect_axes(0, AXES)  # as on the node
+        before = gains(inside)
+        bus = WorldBus(ObservedWorld(inside, lockstep=True))
+        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=5.0, safety=Limits(silence=5.0)) as drives:
+            volts = np.full(AXES, float(MOTOR.voltage))
+            where = {"channel": "here", "nodes": [1]}
+            target = Target(drives, DEVICE, MOTOR, volts, -WAY, WAY, MOTOR.rated_speed, MOTOR.rated_current, bus=where)
+            result = auto(target, before_file)
+            told = certificate(target, result, seed=0)
+            assert [axis.verdict != "rejected" for axis in told.axes] == [True] * AXES, told.axes
+            found = gains(inside)
+            np.testing.assert_array_equal(found, [axis.after for axis in told.axes])
+            assert (found != before).any(axis=1).all()
+            assert not cia402.is_live(inside.read(cia402.STATUSWORD)).any()
+            restore(drives, load_snapshot(before_file), whole=False)
+            np.testing.assert_array_equal(gains(inside), before)
+            motion.disable(drives)
+        bus.shutdown()
+
+
+def test_a_sweep_moves_both_axes_of_each_machine_with_a_points_gains():
+    """Two motors on a gantry: the best point's recording is that of a machine by itself, in the TGZ's own units."""
+    swept = tuple(
+        SweptObject(f"23{number:02X}h:00", *ends, 2, "log") for number, ends in ((0xD2, (400, 800)), (0xD3, (30, 60)))
+    )
+    given = replace(load_experiment(), device="tgz_d", load="gantry", motor="am3041_e", sweep=swept)
+    found = sweep.run(given)
+    assert found.usable.any()
+    best = found.best(1)[0]
+    excitation = given.excitation
+    with EmulatedDrives("tgz_d", "gantry", seed=given.seed) as drives:
+        motion.enable(drives, mode="pv")
+        drives.write("Profile acceleration", f"{excitation.acceleration_rpm_per_s} rpm/s")
+        for row in swept:
+            drives.write(int(row.object[:4], 16), best[row.object])
+        lead = drives.record([cia402.VELOCITY_ACTUAL], excitation.velocity_time)
+        drives.write(cia402.TARGET_VELOCITY, f"{excitation.velocity_rpm} rpm")
+        step = drives.record([cia402.VELOCITY_ACTUAL], excitation.load_time - excitation.velocity_time)
+        speed = np.concatenate([part[cia402.VELOCITY_ACTUAL, "rpm"] for part in (lead, step)])
+    same = np.isclose(found.response.speed_rpm[: len(speed)], speed, rtol=0, atol=1e-6).all(axis=0)
+    assert same.any(), "a point is as good as its worst axis, whose recording it has"
+    assert (np.ptp(speed, axis=0) > excitation.velocity_rpm).all(), "both axes turn"
