@@ -280,6 +280,27 @@ def test_lost_and_damaged_frames_change_nothing_but_time():
     assert count > 200
 
 
+def test_the_row_of_a_lost_frame_is_taken_by_the_next_one():
+    """Rows are as many as cycles; what stays out is said, and taken as soon as frames come back again."""
+    with linked(safety=False) as (drives, segment):
+        drives.record([0x6041], 0.005)  # Op
+        images = drives.link.process
+        rows = images.samples()
+        found = []
+        for is_connected in (True, False, False, True, True):
+            segment.is_connected = is_connected
+            drives.link.sync()
+            found.append((rows.complete(), images.owed))
+        assert found == [(1, 0), (1, 1), (1, 2), (4, 0), (5, 0)]
+        assert images.settle(0.01), "nothing stays out"
+        segment.is_connected = False
+        drives.link.sync()
+        assert not images.settle(0.01), "a row stays out"
+        segment.is_connected = True
+        assert images.settle(0.01) and rows.complete() == 6
+        rows.close()
+
+
 def test_a_slave_that_is_not_where_this_program_took_it_is_told():
     with linked(safety=False) as (drives, segment):
         others = drives.link.other_masters()

@@ -324,6 +324,16 @@ def test_a_node_that_is_not_seen_any_more_is_woken_five_times_a_second_and_given
     assert not bench.runner.judged().any()
 
 
+def test_an_axis_that_stays_in_its_phase_does_not_hide_the_next_that_is_lost(caplog):
+    bench = runner_of()
+    bench.runner.begin(np.array([True, True]), holds=True)
+    for _ in range(1200):
+        bench.axes.mean_current[0] = 400  # the first stands, held under a weight; nothing comes of the second
+        see(bench, STOPPING, axis=0)
+    assert bench.axes.lost == {1} and bench.ceased == [1]
+    assert "axis 1 does not answer, and is left to its watchdog" in caplog.text
+
+
 def test_who_enables_an_axis_again_has_it_judged_again():
     bench = runner_of(count=1)
     assert bench.runner.judged().all()
