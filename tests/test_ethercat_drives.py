@@ -6,7 +6,9 @@ import inspect
 import logging
 import re
 import struct
+import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,10 +24,11 @@ from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.ways import UdpSocket
 from drive_env.master import link
 from drive_env.master.errors import BusError, NoAnswerError, OpenError, RefusedError
+from drive_env.master.ethercat import frame_ways
 from drive_env.master.ethercat.ethercat_link import EtherCatLink, OtherEtherCatMasters
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster
 from drive_env.master.ethercat.frame_master import FrameMaster
-from drive_env.master.ethercat.frame_ways import CallWay
+from drive_env.master.ethercat.frame_ways import CallWay, UdpWay
 from drive_env.master.ethercat.image_data import EtherCatProcessData, ImageRows, ImageSamples
 from drive_env.master.ethercat.process_watchdog import ProcessWatchdog
 from drive_env.master.ethercat.slave_objects import SlaveObjects
@@ -278,6 +281,38 @@ def test_lost_and_damaged_frames_change_nothing_but_time():
             assert len(drives.record(SAMPLED, 0.05).t) == 50
             assert len(drives.read(0x1008)[0]) > 4
     assert count > 200
+
+
+def test_the_row_of_a_lost_frame_is_taken_by_the_next_one():
+    """Rows are as many as cycles; what stays out is said, and taken as soon as frames come back again."""
+    with linked(safety=False) as (drives, segment):
+        drives.record([0x6041], 0.005)  # Op
+        images = drives.link.process
+        rows = images.samples()
+        found = []
+        for is_connected in (True, False, False, True, True):
+            segment.is_connected = is_connected
+            drives.link.sync()
+            found.append((rows.complete(), images.owed))
+        assert found == [(1, 0), (1, 1), (1, 2), (4, 0), (5, 0)]
+        assert images.settle(0.01), "nothing stays out"
+        segment.is_connected = False
+        drives.link.sync()
+        assert not images.settle(0.01), "a row stays out"
+        segment.is_connected = True
+        assert images.settle(0.01) and rows.complete() == 6
+        rows.close()
+
+
+def test_a_datagram_that_is_announced_and_never_comes_is_not_waited_for(monkeypatch):
+    """The kernel may say that there is one, and then drop it for its check sum (select(2), BUGS)."""
+    way, found = UdpWay(29999), []
+    monkeypatch.setattr(frame_ways, "select", SimpleNamespace(select=lambda *_: ([way], [], [])))
+    taker = threading.Thread(target=lambda: found.append(way.receive(0.001)), daemon=True)
+    taker.start()
+    taker.join(10.0)
+    assert found == [None]
+    way.close()
 
 
 def test_a_slave_that_is_not_where_this_program_took_it_is_told():

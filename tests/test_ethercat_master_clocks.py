@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import time
 
 import numpy as np
@@ -14,7 +15,7 @@ from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.segment import HOP
 from drive_env.ethercat.ways import UdpSocket
 from drive_env.master.errors import BusError
-from drive_env.master.ethercat.clocks import FramePhase, delays_in_a_line
+from drive_env.master.ethercat.clocks import FramePhase, delays_in_a_line, set_offsets
 from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.master.pace import RealTimePace
 
@@ -108,6 +109,27 @@ def test_a_slave_without_clocks_is_told():
         segment.slaves[0].controller.memory[8] &= ~0x04  # features
         with pytest.raises(BusError, match="position 0 has no distributed clocks; open it without sync0"):
             EtherCatDrives(master=segment.master(), pace="lockstep", sync0=True)
+
+
+@pytest.mark.parametrize("local", [(5, 1005), (10**18, 7), (7, 10**18), (3 << 60, 2**64 - 1)])
+def test_an_offset_makes_a_local_time_that_of_the_first_slave_and_the_frames_way(local):
+    """System time is local time plus 0920h, in 64 bits (ETG.1000.4): a clock counts nanoseconds, for centuries."""
+    written = {}
+
+    class Registers:
+        """A master of two slaves through which a frame has just gone: 0900h to 091Fh, and what is written."""
+
+        def register(self, position, address, size):
+            out, back = (100, 1300) if position == 0 else (900, 0)  # the way is 600 ns
+            return struct.pack("<IIIIQQ", out, back, 0, 0, 0, local[position])
+
+        def write_register(self, position, address, data):
+            written[position, address] = int.from_bytes(data, "little")
+
+    set_offsets(Registers(), 2)
+    system = [(local[k] + written[k, 0x0920]) % 2**64 for k in (0, 1)]
+    assert system == [local[0], local[0] + 600]
+    assert [written[k, 0x0928] for k in (0, 1)] == [0, 600]
 
 
 # --- when frames go ---------------------------------------------------------------------------------------------------

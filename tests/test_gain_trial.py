@@ -49,6 +49,15 @@ GAINS = np.array([[1000, 200, 800, 100, 50]] * 4)
 SAFE = np.array([[900, 200, 300, 40, 20]] * 4)
 
 
+# --- moves ---
+def test_the_least_error_of_a_load_step_is_half_a_count_all_the_time():
+    """From 150 ms, when the load comes, to the end of the trial at 250 ms; 65,536 counts are a turn."""
+    move = plan_move(MOTOR, np.array([1e-5]), np.array([65536]), np.array([10.0]))
+    counts_of_a_turn = 2.0 * np.pi * move.counts
+    assert counts_of_a_turn == pytest.approx(MOTOR.encoder_counts)
+    assert move.least_error == pytest.approx(0.5 * 2.0 * np.pi / MOTOR.encoder_counts * 0.1)
+
+
 # --- cost -------------------------------------------------------------------------------------------------------------
 def test_softness_is_one_over_the_product_of_the_gains_that_give_way_to_a_load():
     """i T_i / (P k_v): P, 1 / T_i and k_v are raw integers, and the current loop has no part in it."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from drive_env import cia402
 from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State
 from drive_env.safety.model.drive import Drive
+from drive_env.safety.model.frames import transfers
 from drive_env.safety.model.program import PLAYS, WORDS, program_steps
 from drive_env.safety.model.rules import (
     DISABLED,
@@ -186,3 +188,13 @@ def test_a_node_that_could_not_be_proved_off_is_asked_once_more():
 def test_the_states_that_count_as_off():
     assert State.READY_TO_SWITCH_ON not in DISABLED and State.SWITCHED_ON not in DISABLED
     assert {State.READY_TO_SWITCH_ON, State.SWITCHED_ON} == NO_POWER - DISABLED
+
+
+@pytest.mark.parametrize(("keeps_order", "waiting"), [(True, []), (False, [Held("request", ENABLE)])])
+def test_a_request_that_was_held_back_comes_before_the_next_where_a_bus_keeps_order(keeps_order, waiting):
+    """An enabling that is late, then a shutdown on the same identifier: the shutdown is the last on CAN."""
+    drive = Drive(fsa=State.SWITCHED_ON, nmt=NmtState.OPERATIONAL)
+    made = Situation(drive=drive, held=(Held("request", ENABLE),))
+    first = next(transfers(made, cia402.CONTROLWORD, SHUTDOWN, Assumptions(keeps_order=keeps_order)))
+    assert [frame for frame in first.after.held if frame.kind == "request"] == waiting
+    assert first.after.drive.fsa is State.READY_TO_SWITCH_ON

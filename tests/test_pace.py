@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from drive_env.master import pace as module
@@ -68,6 +70,17 @@ def test_within_a_run_a_sync_more_than_a_cycle_late_shifts_the_others(clock):
     assert pace.timing == Timing(5, 1, pytest.approx(0.0015))
     pace.begin()
     assert pace.timing.cycles == 0 and pace.total.cycles == 5
+
+
+@pytest.mark.parametrize(("ahead", "gap"), [(0.4, 1.02), (0.6, 0.98), (0.01, 1.01), (0.99, 0.99), (0.0, 1.0)])
+def test_a_sync_is_moved_to_suit_the_drives_clocks_by_a_fiftieth_of_a_cycle_at_most(clock, ahead, gap):
+    """`ahead` of a cycle later would suit them: what is more than half a cycle is made up by going earlier."""
+    pace, times = RealTimePace(CYCLE, lambda due: ahead * CYCLE), []
+    pace.begin()
+    for _ in range(5):
+        pace.wait(lambda timeout: clock.receive(timeout + 1e-12))  # else what is left may be too little to count
+        times.append(clock.now)
+    assert [b - a for a, b in pairwise(times)] == pytest.approx([gap * CYCLE] * 4, abs=1e-9)
 
 
 def test_the_first_set_points_do_not_wait_for_the_sync_they_belong_to(clock):

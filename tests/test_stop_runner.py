@@ -9,6 +9,7 @@ import pytest
 from held_objects import HeldObjects
 
 from drive_env import SafetyError, cia402
+from drive_env.dictionary.roles import Role
 from drive_env.safety.axes import Axes
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
@@ -19,6 +20,7 @@ STATUS, POSITION, VELOCITY, WORD = (0x6041, 0), (0x6064, 0), (0x606C, 0), (0x604
 QUICK, DISABLE, HALT, FAULT = (0x605A, 0), (0x605C, 0), (0x605D, 0), (0x605E, 0)
 SLOW, FAST, HOMING = (0x6084, 0), (0x6083, 0), (0x609A, 0)
 PP, PV, HM = 1, 3, 6
+MODE, GATE, REMOTE = (0x6060, 0), (0x2303, 0), 0x0200
 OFF, ENABLED, STOPPING = 0x0240, 0x0637, 0x0617
 OPTIONS = {QUICK: 2, DISABLE: 1, HALT: 1, FAULT: 2}
 
@@ -324,6 +326,16 @@ def test_a_node_that_is_not_seen_any_more_is_woken_five_times_a_second_and_given
     assert not bench.runner.judged().any()
 
 
+def test_an_axis_that_stays_in_its_phase_does_not_hide_the_next_that_is_lost(caplog):
+    bench = runner_of()
+    bench.runner.begin(np.array([True, True]), holds=True)
+    for _ in range(1200):
+        bench.axes.mean_current[0] = 400  # the first stands, held under a weight; nothing comes of the second
+        see(bench, STOPPING, axis=0)
+    assert bench.axes.lost == {1} and bench.ceased == [1]
+    assert "axis 1 does not answer, and is left to its watchdog" in caplog.text
+
+
 def test_who_enables_an_axis_again_has_it_judged_again():
     bench = runner_of(count=1)
     assert bench.runner.judged().all()
@@ -335,3 +347,26 @@ def test_who_enables_an_axis_again_has_it_judged_again():
     assert bench.runner.judged().all()
     bench.axes.live[:] = False
     assert not bench.runner.judged().any()
+
+
+def test_the_mode_that_an_axis_is_asked_for_says_which_own_mode_lets_it_hear_a_stop():
+    """Another master has taken an axis from pp to csp, and its D-Mode fits neither: that of csp is written."""
+    bench = runner_of({MODE: (8, 99), GATE: 0})
+    known = bench.drives.description.dictionary
+    known.find = lambda key: bench.drives.entries[GATE if key is Role.MODE_GATE else key]
+    bench.drives.device = SimpleNamespace(mode_gate={PP: 3, 8: 5})
+    bench.drives.sdo = lambda node, sdo=bench.drives.sdo: SimpleNamespace(
+        ask=sdo(node).ask,
+        command=lambda index, sub, data: bench.drives.sent.append((node, index, int.from_bytes(data, "little"))),
+    )
+    bench.axes.status[:] = ENABLED & ~REMOTE
+    bench.runner.begin(np.array([True, True]), holds=False)
+    assert {sent for sent in bench.drives.sent if sent[1] == GATE[0]} == {(0, GATE[0], 3), (1, GATE[0], 3)}
+    bench.runner.hold()
+    assert (0, MODE[0]) in bench.drives.asked and (1, MODE[0]) in bench.drives.asked
+    bench.drives.sent.clear()
+    for _ in range(100):
+        see(bench, ENABLED & ~REMOTE)
+    own = {sent for sent in bench.drives.sent if sent[1] == GATE[0]}
+    assert own == {(0, GATE[0], 5), (1, GATE[0], 3)}, "the second does not answer: as it was seen last"
+    assert {sent[1] for sent in bench.drives.sent} == {GATE[0], WORD[0]}, "by turns with the controlword"

@@ -391,6 +391,23 @@ def test_what_a_load_step_costs_a_pid_follows_from_its_gains():
     assert next(field.initial for field in PARAMETERS if field.name == "motion_clock") == CLOCK
 
 
+def test_what_a_load_step_costs_a_pi_is_that_of_a_second_order():
+    """e'' + P e' + I e = 0 from e and -P e; P is 202Bh / 256, I is 202Ch f / 2^23 (TMC4361 data sheet)."""
+    loop, columns = pid_loop(), dict(zip(pid_loop().gains, DEVICE.gains.columns_of_loop(pid_loop()), strict=True))
+    gains = np.tile(DEVICE.gains.highest, (1, 1))
+    for name, value in {"pid_p": 20_000, "pid_i": 500, "pid_tolerance": 0, "pid_d": 0, "pid_divider": 1}.items():
+        gains[:, columns[name]] = value
+    p, i = 20_000 / 256.0, 500 * 16e6 / 2.0**23
+    fast, slow = np.roots([1.0, p, i])
+    t = np.arange(0.0, 0.1, 1e-6)
+    share = (p + slow) / (slow - fast)  # of the fast part, by e' = -P e at first
+    e = share * np.exp(fast * t) + (1.0 - share) * np.exp(slow * t)
+    assert e[0] == pytest.approx(1.0) and (e[1] - e[0]) / 1e-6 == pytest.approx(-p, rel=0.01)
+    held = float(holding_torque(MOTOR, MOTOR.rated_current))
+    away = np.arcsin(0.3 * MOTOR.rated_torque / held) / (np.pi / 2.0) * 256.0
+    assert load_step_error(DEVICE, MOTOR, loop, gains) == pytest.approx([away * np.abs(e).sum() * 1e-6], rel=0.02)
+
+
 def test_optimise_finds_gains_of_the_pid_and_leaves_the_loop_as_it_was():
     with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
         found = optimise(target, Settings(trials=6, seed=1, gains=("pid_p", "pid_i")), anew=True)

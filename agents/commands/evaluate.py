@@ -231,6 +231,8 @@ def _check_side(context: typer.Context, lockstep: bool, gap: int | None, replay:
         raise ValueError(
             f"--{away[0]} is for episodes on the emulator; leave it out on a bus, with --gap and with --replay"
         )
+    if replay is not None and (extra := _typed(context, (*BUS_OPTIONS, *OF_A_BUS_ALONE))):
+        raise ValueError(f"--replay acts on no drives; leave --{extra[0]} out")
     if gap is not None and (extra := _typed(context, NOT_OF_A_GAP)):
         raise ValueError(f"--gap serves its own machines, one episode each; leave --{extra[0]} out")
 

@@ -93,6 +93,12 @@ def names_a_bus(context: typer.Context) -> bool:
     return any(was_typed(context, name) for name in OF_A_BUS)
 
 
+def file_names_a_bus(context: typer.Context) -> bool:
+    """Return whether a file of options names a bus or a node of it, and the command line does not replace that."""
+    sources = (context.get_parameter_source(name) for name in OF_A_BUS)
+    return any(source is not None and source.name == "DEFAULT_MAP" for source in sources)
+
+
 def object_name(text: str) -> ObjectName:
     """Return how the dictionary is asked for an object written as 6041, 607D:1 (hexadecimal) or name."""
     found = _INDEX.match(text.strip())

@@ -30,6 +30,7 @@ from drive_env.commands.options import (
     errors_as_exit_codes,
     fail,
     look_first,
+    names_a_bus,
     print_json,
     scales_of,
 )
@@ -91,6 +92,7 @@ def backup(
 
 
 def diff(
+    context: typer.Context,
     file: File,
     other: Annotated[Path | None, typer.Argument(help="Another file to compare with, instead of the drive.")] = None,
     interface: Interface = None,
@@ -109,6 +111,8 @@ def diff(
 
     with errors_as_exit_codes():
         if other is not None:
+            if names_a_bus(context):
+                raise ValueError(f"{file} is compared with {other}, and with no drive; leave the bus out, or {other}")
             dictionary = describe(device, eds).dictionary
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             _tell_of_changes(file)

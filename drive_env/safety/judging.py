@@ -124,13 +124,13 @@ class Judging:
         # An axis that was enabled outside may come back, though not go further out.
         self._axes.outside = np.where(self._axes.outside < 0, outside[0], self._axes.outside)
         slack = np.where(will_be > outside.max(axis=0), bounds.slack, bounds.settled)
-        allowed = np.maximum(self._axes.outside, 0) + slack
+        allowed = self._axes.outside + slack
         farthest = np.maximum(outside.max(axis=0), will_be)
         self._axes.outside = np.minimum(self._axes.outside, outside[-1])
         wrong = (farthest > allowed) & judged
         if wrong.any() and np.any(wrong & (bounds.given | (self._modes() != HM))):
             axis = int(np.flatnonzero(wrong & (bounds.given | (self._axes.mode != HM)))[0])
-            there = outside.max(axis=0)[axis] > bounds.settled[axis] + max(self._axes.outside[axis], 0)
+            there = outside.max(axis=0)[axis] > bounds.settled[axis] + self._axes.outside[axis]
             what = "the position is" if there else "its stop would end"
             by = outside.max(axis=0)[axis] if there else farthest[axis]
             self._stop_for(

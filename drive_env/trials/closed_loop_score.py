@@ -114,10 +114,9 @@ class ClosedLoopScore(RobustScore):
         enabled = cia402.matches(pushed[-1][cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
         tripped = ~enabled | ~is_closed | np.repeat(drives.machine.diverged, self._axes[2])
         error = np.abs(wrapped(target - position)).sum(axis=0) * CYCLE / move.increments
-        least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
         return (
             terms.each(lambda value: value.reshape(self._axes)),
-            np.maximum(error, least).reshape(self._axes),
+            np.maximum(error, move.least_error).reshape(self._axes),
             swings(np.asarray(current, float), drives.motor.rated_current, self._axes),
         )

@@ -69,13 +69,12 @@ class OpenLoopScore(RobustScore):
             | lost
         )
         error = np.abs(wrapped(move.distance - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
-        least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         terms = OpenLoopTerms(
             settling, np.ones_like(settling), vibration, overshoot, tripped, angle, effort(drives.device, motor, used)
         )
         return (
             terms.each(lambda value: value.reshape(self._axes)),
-            np.maximum(error, least).reshape(self._axes),
+            np.maximum(error, move.least_error).reshape(self._axes),
             CurrentSwings(np.full(self._axes, np.nan), np.full(self._axes, np.nan)),
         )
 

@@ -80,11 +80,10 @@ class PidScore(RobustScore):
         enabled = cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
         tripped = ~enabled | np.repeat(drives.machine.diverged, self._axes[2])
         error = np.abs(wrapped(target - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
-        least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
         nothing = np.full(self._axes, np.nan)
         return (
             terms.each(lambda value: value.reshape(self._axes)),
-            np.maximum(error, least).reshape(self._axes),
+            np.maximum(error, move.least_error).reshape(self._axes),
             CurrentSwings(nothing, nothing),
         )

@@ -48,6 +48,11 @@ class Move(NamedTuple):
     counts: float  # of the encoder per radian
     share: Floats | float = 1.0
 
+    @property
+    def least_error(self) -> float:
+        """Integral of |error| in a load step, of an axis that stays half a count away: less cannot be seen [rad s]."""
+        return 0.5 / self.counts * (TRIAL - SETTLED) * CYCLE
+
 
 def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayLike) -> Move:
     """Return a triangular move of 60 ms with 0.4 of the rated torque, or less where speed or travel end before.

@@ -326,14 +326,12 @@ class RobustScore:
             drives.machine.diverged, self._axes[2]
         )
         error = np.abs(wrapped(move.distance - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
-        # Half a count is the least that there is to see.
-        least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         shape = self._axes
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
         measured = free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives)
         return (
             terms.each(lambda value: value.reshape(shape)),
-            np.maximum(error, least).reshape(shape),
+            np.maximum(error, move.least_error).reshape(shape),
             swings(measured, drives.motor.rated_current, shape),
         )
 

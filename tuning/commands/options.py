@@ -25,7 +25,7 @@ from drive_env.commands.options import Json as Json
 from drive_env.commands.options import Nodes as Nodes
 from drive_env.commands.options import Yes as Yes
 from drive_env.commands.options import ask as ask
-from drive_env.commands.options import ending_by, names_a_bus
+from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus
 from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
 
@@ -196,6 +196,8 @@ def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callab
         @wraps(command)
         def run(context: typer.Context, **given: Any) -> None:
             given["bus"] |= names_a_bus(context)
+            if file_names_a_bus(context) and not given["bus"]:
+                fail("--config names drives on a bus; add --bus to use them, and their motors turn")
             chosen = options(**{p.name: given.pop(p.name) for p in shared})
             command(drive=chosen, **given)
 
