@@ -307,6 +307,43 @@ def test_the_error_history_has_code_axis_and_number_the_newest_first(wire):
     assert wire.value(0x1003, 0) == 0
 
 
+def test_each_error_bit_makes_one_entry_also_those_of_an_axis_in_fault(wire):
+    """M, 1003h: each error bit generates one entry; 1001h has the kinds of all of them."""
+    motion.enable(wire.drives, mode="pp")
+    for bits in (1 << 3, 1 << 3 | 1 << 9, 1 << 9, 1 << 3 | 1 << 9):
+        wire.drives.machine.error_bits = [bits, 0]
+        wire.wait(5)
+    assert [wire.value(0x1003, sub) for sub in range(3)] == [2, 9 << 24 | 0x4310, 3 << 24 | 0x3110]
+    assert wire.value(0x33C1, 0) == 1 << 3 | 1 << 9
+    assert wire.value(0x1001, 0) == 0x01 | 0x04 | 0x08
+    wire.drives.machine.error_bits = 0
+    wire.wait(5)
+    motion.reset_fault(wire.drives)
+    assert (wire.value(0x1001, 0), wire.value(0x33C1, 0)) == (0, 0)
+
+
+def test_an_axis_whose_mains_are_cut_tells_of_them_and_of_the_link_that_empties(wire):
+    motion.enable(wire.drives, mode="pp")
+    wire.drives.machine.supply = 0.0
+    wire.wait(5000)
+    told = [wire.value(0x1003, sub) for sub in range(1, 1 + wire.value(0x1003, 0))]
+    for axis in (0, 1):
+        bits = wire.value(0x33C1 + 0x100 * axis, 0)
+        of_axis = sorted(entry >> 24 for entry in told if entry >> 16 & 0xFF == axis)
+        assert of_axis == [bit for bit in range(32) if bits >> bit & 1] == [1, 4], axis
+
+
+def test_a_lost_network_is_an_error_of_each_axis(wire):
+    """Bit 17 of the manual's table, host communication (8100h), whatever the emergency's code is by CiA 301."""
+    motion.enable(wire.drives, mode="pp")
+    wire.start()
+    wire.receive(0, "02 05")  # NMT: stop
+    wire.wait(5)
+    assert [wire.value(0x33C1, 0) >> 17 & 1, wire.value(0x34C1, 0) >> 17 & 1] == [1, 1]
+    wire.receive(0, "01 05")
+    assert [wire.value(0x1003, sub) for sub in range(3)] == [2, 17 << 24 | 1 << 16 | 0x8100, 17 << 24 | 0x8100]
+
+
 def test_the_history_holds_sixty_four():
     from drive_env.node.error_history import ErrorHistory
 

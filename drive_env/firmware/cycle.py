@@ -104,6 +104,7 @@ class FirmwareStages:
         halt: Stages (drive, lane) that take its own fields of a machine that left physics back to finite numbers.
         remote: Stage (drive, lane) -> whether the axis takes commands; one that does not ignores the controlword, and
             statusword bit 9 is 0. None: always.
+        tells_all: Whether a drive in fault tells of further errors, see `protection_of`.
     """
 
     name: str
@@ -120,6 +121,7 @@ class FirmwareStages:
     power_on: Sequence[Stage]
     halt: Sequence[Stage]
     remote: Stage | None = None
+    tells_all: bool = False
 
 
 class Firmware(NamedTuple):
@@ -599,7 +601,7 @@ def compose(stages: FirmwareStages, source: str) -> Firmware:
     """
     layout = RecordLayout((*fields.PARAMETERS, *stages.parameters), (*fields.STATE, *stages.state))
     machinery = _machinery(stages.name, layout, source)
-    guard = protection_of(stages.causes)
+    guard = protection_of(stages.causes, tells_all=stages.tells_all)
     events = _events(guard.causes_gone, guard.statusword_bits, stages.remote or _always)
     supervise = _supervise(stages, guard.protect, events.tell_state)
     start_window, tick = in_turn(stages.window, 2), in_turn(stages.tick, 3)

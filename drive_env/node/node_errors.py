@@ -17,6 +17,7 @@ from drive_env.node.error_history import CONDITIONS, OPTIONAL_CONDITIONS, ErrorC
 from drive_env.node.node_objects import ERROR_HISTORY, ERROR_REGISTER, NodeObjects
 
 FAULT_RESET = 0  # row of the firmware's causes
+NETWORK_LOST = ("communication_error", "heartbeat_lost")  # conditions that take axes into fault
 
 
 class EmergencySink(Protocol):
@@ -111,7 +112,10 @@ class NodeErrors:
         emergency = self._device.emergencies[name].of_axis(0)
         self._told_last = 0
         self._sink.push(emergency, self.register() | condition.error_register)
-        self.history.add(emergency.code, 0, self._number_of(emergency))
+        if name in NETWORK_LOST and self._device.canopen.quirks.history_tells_number:
+            self._note_lost_network()
+        else:
+            self.history.add(emergency.code, 0, self._number_of(emergency))
         self._flush(now)
 
     def condition_if_known(self, name: str, now: float) -> None:
@@ -143,6 +147,14 @@ class NodeErrors:
         if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
             self._flush(now)
             self._react()
+
+    def _note_lost_network(self) -> None:
+        """Note the error that each axis has of it, where the history has the device's own number of errors."""
+        firmware = self._device.firmware
+        cause = firmware.causes[firmware.communication_lost].name
+        for axis in range(len(self._axes)):
+            emergency = self._device.emergencies[cause].of_axis(axis)
+            self.history.add(emergency.code, axis, self._number_of(emergency))
 
     def _number_of(self, emergency: EmergencyCode) -> int:
         """Return the device's own number of an error, as 1003h has it."""

@@ -173,7 +173,7 @@ def _masks(causes: Sequence[Cause]) -> _Masks:
     )
 
 
-def _look(masks: _Masks, conditions: Any, told_when_left: int) -> Any:
+def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool) -> Any:
     """Return the stage (drive, lane) -> the causes that have appeared."""
     faults, stops, at_limits, warns = masks.faults, masks.stops, masks.at_limits, masks.warns
     positive, negative, software = masks.positive, masks.negative, masks.software
@@ -190,12 +190,16 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int) -> Any:
     def look(drive, lane):
         present = conditions(drive, lane)
         drive.present[lane] = present
-        if drive.fsa[lane] < fsa.SWITCHED or drive.fsa[lane] == fsa.FAULTED:
+        faulted = drive.fsa[lane] == fsa.FAULTED
+        if drive.fsa[lane] < fsa.SWITCHED or (faulted and not tells_all):
             # A drive whose supply or enable is missing is in no fault before anybody switches it on.
             present &= ~faults
         appeared = present & ~drive.active[lane]
-        # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again.
+        # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again; where
+        # every error is told, none is until the reset.
         told = drive.active[lane] & stops if drive.fsa[lane] == fsa.REACTING else 0
+        if tells_all and (faulted or drive.fsa[lane] == fsa.REACTING):
+            told = drive.active[lane] & faults
         drive.active[lane] = present | told
         drive.warning[lane] = 1 if present & warns else 0
         # A position demand that is within the limits leads an axis back that was pushed past them.
@@ -214,7 +218,7 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int) -> Any:
     return look
 
 
-def _react(masks: _Masks, register: tuple[int, ...]) -> Any:
+def _react(masks: _Masks, register: tuple[int, ...], tells_all: bool) -> Any:
     """Return the stage (drive, lane, causes that have appeared): emergencies and reactions."""
     faults, cuts, silent, rows = masks.faults, masks.cuts, masks.silent, len(register)
 
@@ -227,10 +231,12 @@ def _react(masks: _Masks, register: tuple[int, ...]) -> Any:
             if faults & (1 << cause):
                 cut = cuts & (1 << cause) != 0
                 # The stage that is cut has answered: what else it sees in the same moment follows from it.
-                push_emergency = drive.fsa[lane] != fsa.FAULTED
+                is_first = drive.fsa[lane] != fsa.FAULTED
+                push_emergency = is_first or tells_all
                 if push_emergency:
-                    drive.fault[lane] = cause + 1
                     drive.error_register[lane] |= GENERIC_ERROR | register[cause]
+                if is_first:
+                    drive.fault[lane] = cause + 1
                     fsa.fault(drive, lane, cut)
             if push_emergency:
                 fsa.push_emergency(drive, lane, cause)
@@ -238,7 +244,7 @@ def _react(masks: _Masks, register: tuple[int, ...]) -> Any:
     return react
 
 
-def _cause_flags(held: int, flags: tuple[int, ...]) -> Any:
+def _cause_flags(held: int, flags: tuple[int, ...], tells_all: bool) -> Any:
     """Return the stage (drive, lane) -> status flags."""
     rows = len(flags)
 
@@ -248,6 +254,8 @@ def _cause_flags(held: int, flags: tuple[int, ...]) -> Any:
         shown = drive.present[lane]
         if drive.fault[lane] > 0:
             shown |= 1 << (drive.fault[lane] - 1) & held
+            if tells_all:
+                shown |= drive.active[lane] & held
         found = 0
         for cause in range(1, rows):
             if shown & 1 << cause:
@@ -257,18 +265,20 @@ def _cause_flags(held: int, flags: tuple[int, ...]) -> Any:
     return cause_flags
 
 
-def protection_of(causes: Sequence[Cause]) -> Protection:
+def protection_of(causes: Sequence[Cause], *, tells_all: bool = False) -> Protection:
     """Return the stages of a table of causes.
 
     Args:
         causes: Row 0 is the answer to a fault reset; the last one tells that the axis has left its limits. Causes that
             appear together are told, and act, in the order of the rows.
+        tells_all: Whether a drive in fault tells of further errors, each once until the reset; otherwise what else the
+            stage that is cut sees follows from it, and is not told.
     """
     masks = _masks(causes)
     register = tuple(cause.error_register for cause in causes)
     conditions = _conditions(causes)
-    look, react = _look(masks, conditions, len(causes) - 1), _react(masks, register)
-    cause_flags = _cause_flags(masks.held, tuple(cause.status_flag for cause in causes))
+    look, react = _look(masks, conditions, len(causes) - 1, tells_all), _react(masks, register, tells_all)
+    cause_flags = _cause_flags(masks.held, tuple(cause.status_flag for cause in causes), tells_all)
     faults, cuts, software, tried_again = masks.faults, masks.cuts, masks.software, masks.tried_again
     following_fault, csp, ip = row_of(causes, FOLLOWING_ERROR) + 1, cia402.CSP, cia402.IP
 

@@ -108,6 +108,7 @@ STAGES = FirmwareStages(
     power_on=(power_on, tell_counts, connect, forget_link),
     halt=(halt, forget_link),
     remote=d_mode.is_remote,
+    tells_all=True,  # TGZ manual, 1003h: each error bit generates one entry
 )
 
 FIRMWARE = compose(STAGES, __name__)
