@@ -380,6 +380,8 @@ class EmulatedDrives:
         records["mode_needs_halt"] = device.quirks.mode_change_needs_halt
         records["absent_status_bits"] = device.quirks.absent_status_bits
         records["set_point_buffer"] = device.quirks.set_point_buffer
+        records["pv_slows_down_by_6084h"] = device.quirks.pv_slows_down_by_6084h
+        records["pv_starts_and_stops"] = device.quirks.pv_starts_and_stops
         self._kind.set_constants(records, device, self.motor)
         if self._kind.connect is not None:
             self._kind.connect(records, device, np.full(self.num_axes, self.load.num_axes % device.num_axes == 0))

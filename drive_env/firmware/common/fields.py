@@ -72,6 +72,8 @@ PARAMETERS = (
     Field("mode_needs_halt", "i4", "", "1: an enabled axis changes its mode only at rest, with halt set"),
     Field("absent_status_bits", "i4", "", "bits of 6041h that are never set"),
     Field("set_point_buffer", "i4", "", "1: pp keeps a second set-point while it moves to the first"),
+    Field("pv_slows_down_by_6084h", "i4", "", "1: pv slows down with 6084h; 0: with 6083h, as it speeds up"),
+    Field("pv_starts_and_stops", "i4", "", "1: pv jumps to the start velocity, and from the end velocity"),
     # --- data of the device and of its power stage ----------------------------------------------------------------
     Field("undervoltage", "f8", "V", "limit below which the stage is cut"),
     Field("overvoltage", "f8", "V", "limit above which the stage is cut"),

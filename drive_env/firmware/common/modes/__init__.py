@@ -47,15 +47,15 @@ def acts_as(mode):
 def slow_down_ramp(drive, lane):
     """Return the deceleration [rad/s^2] of the mode in use; 0 where it is not set, which stops at once.
 
-    pv has one ramp for both ways (manual, 6083h), and so has hm (609Ah); cst and no mode have none of their own and
-    take 6084h.
+    pv has one ramp for both ways (TMCM-1636 manual, 6083h) but on drives that slow down with 6084h in it, and so has hm
+    (609Ah); cst and no mode have none of their own and take 6084h.
     """
     rate = drive.homing_acceleration[lane] if drive.mode_display[lane] == HM else 0.0
     if rate == 0.0:
         rate = drive.deceleration[lane]
-    if drive.mode_display[lane] == PV or rate == 0.0:
-        rate = drive.acceleration[lane]
-    return rate
+    if drive.mode_display[lane] == PV:
+        return pv.slow_down_ramp(drive, lane)
+    return rate if rate > 0.0 else drive.acceleration[lane]
 
 
 @stage
