@@ -347,13 +347,16 @@ def made_of(tmp_path, text, **options):
     return made, {note.what: note.why for note in made.fill_in}
 
 
-BASE = (FOLDER / "alpina_ax40.eds").read_text(encoding="utf-8")  # 608Fh, 6091h, 60A8h to 60AAh
+BASE = (FOLDER / "alpina_ax40.eds").read_text(encoding="utf-8")  # 6091h, 60A8h to 60AAh; no 608Fh, no 6092h
 FEED_36000 = (
     entry("6092", "Feed constant", kind="0x8", data_type=None, access=None, SubNumber=3)
     + entry("6092sub0", "Entries", data_type="0x5", access="ro", DefaultValue=2)
     + entry("6092sub1", "Feed", DefaultValue=36000)
     + entry("6092sub2", "Revolutions", DefaultValue=1)
 )
+
+
+RESOLUTION = FEED_36000.replace("6092", "608F").replace("36000", "1")
 
 
 def units_of(made):
@@ -426,8 +429,7 @@ def test_a_code_that_is_not_known_is_told(tmp_path):
 
 
 def test_a_resolution_that_no_position_could_be_held_by_is_told_and_not_taken(tmp_path):
-    text = put(put(BASE, "608Fsub1", DefaultValue=1), "608Fsub2", DefaultValue=1)
-    made, told = made_of(tmp_path, text)
+    made, told = made_of(tmp_path, BASE + RESOLUTION)
     assert told["608Fh"] == "1 : 1 is not taken: a position cannot be held by fewer than 100 units a turn"
     with emulated(str(made.folder)) as drives:
         assert drives.read(Role.POSITION_SCALE)[0] == 4096
@@ -448,7 +450,7 @@ def test_ip_follows_60c1h_and_is_refused_without_it(tmp_path):
     (tmp_path / "a").mkdir()
     made, _ = made_of(tmp_path / "a", text)
     assert cia402.IP not in find_device(str(made.folder)).allowed_values[0x6060, 0]
-    assert any(note.what == "mode 7" and "no 60C1h:01" in note.why for note in made.modes)
+    assert any(note.what == "mode 7, ip" and "no 60C1h:01" in note.why for note in made.modes)
     made, _ = made_of(tmp_path, text + INTERPOLATION)
     assert any(note.what == "ip" for note in made.modes)
     with emulated(str(made.folder)) as drives:
@@ -459,6 +461,13 @@ def test_ip_follows_60c1h_and_is_refused_without_it(tmp_path):
         drives.advance(0.3)
         assert abs(int((drives.read(0x6064) - here)[0]) - way[-1]) < 82
         assert "60C1h" not in {note.what for note in made.without_effect}
+
+
+def test_a_mode_without_its_target_is_told_and_refused(tmp_path):
+    made, _ = made_of(tmp_path, without(BASE, "60FF"))
+    assert not {cia402.PV, cia402.CSV} & set(find_device(str(made.folder)).allowed_values[0x6060, 0])
+    told = {note.what: note.why for note in made.modes}
+    assert "no 60FFh:00" in told["mode 3, pv"] and "no 60FFh:00" in told["mode 9, csv"]
 
 
 def test_a_drive_without_a_position_window_has_arrived_when_it_has(tmp_path):

@@ -68,6 +68,17 @@ MODE_NEEDS = {
     cia402.CST: cia402.TARGET_TORQUE,
 }
 
+# What a mode follows; homing has an object of the emulator's own where the drive has none.
+MODE_TARGETS = {
+    cia402.PP: (cia402.TARGET_POSITION, 0),
+    cia402.PV: (cia402.TARGET_VELOCITY, 0),
+    cia402.TQ: (cia402.TARGET_TORQUE, 0),
+    cia402.IP: (cia402.INTERPOLATION_DATA, 1),
+    cia402.CSP: (cia402.TARGET_POSITION, 0),
+    cia402.CSV: (cia402.TARGET_VELOCITY, 0),
+    cia402.CST: (cia402.TARGET_TORQUE, 0),
+}
+
 
 class Note(NamedTuple):
     """A line of the list: what, and why."""
@@ -217,8 +228,7 @@ class _Draft:
         else:
             found = [mode for mode in here if mode.supported_bit is not None and bits >> mode.supported_bit & 1]
             known = {mode.supported_bit for mode in here}
-            if any(mode.number == cia402.IP for mode in found):
-                found = self._with_interpolation(found)
+            found = [mode for mode in found if self._has_target(mode)]
             others = [bit for bit in range(16) if bits >> bit & 1 and bit not in known]
             self._told_of_modes += [
                 Note(f"mode {bit + 1}", "6502h has it, and the emulator does not: 6060h refuses it") for bit in others
@@ -240,16 +250,18 @@ class _Draft:
             ]
         return numbers
 
-    def _with_interpolation(self, found: list[Mode]) -> list[Mode]:
-        """Return the modes without ip where the drive has no 60C1h:01 that could be its target; tell of it."""
-        data = self._types.get((cia402.INTERPOLATION_DATA, 1))
-        if data is not None and data.data_type in INTEGER_TYPES:
+    def _has_target(self, mode: Mode) -> bool:
+        """Return whether the drive has the object that a mode of 6502h follows; tell of one that has not."""
+        key = MODE_TARGETS.get(mode.number)
+        variable = None if key is None else self._types.get(key)
+        if key is not None and (variable is None or variable.data_type not in INTEGER_TYPES):
+            why = f"6502h has it, and the EDS no {key[0]:04X}h:{key[1]:02X} that is an integer: 6060h refuses it"
+            self._told_of_modes.append(Note(f"mode {mode.number}, {mode.abbreviation}", why))
+            return False
+        if mode.number == cia402.IP:
             why = "60C1h:01 is followed as csp follows 607Ah, without waiting for bit 4 of the controlword"
             self._told_of_modes.append(Note("ip", why))
-            return found
-        why = "6502h has it, and the EDS no 60C1h:01 that is an integer: 6060h refuses it"
-        self._told_of_modes.append(Note("mode 7", why))
-        return [mode for mode in found if mode.number != cia402.IP]
+        return True
 
     def _homing_methods(self) -> list[int]:
         """Return the methods of homing that both have: within 6098h's limits, and in 60E3h where that lists any."""

@@ -239,7 +239,7 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
                 notes.append(("60A8h", f"6092h counts, {units / turns:g} units a turn; {said}"))
             source = "6092h over 6091h" if has_gear else "6092h"
             return feed | (gear if has_gear else {}), 0, Feed(units / turns, source)
-        notes.append(("6092h", _too_coarse(units, turns)))
+        notes.append(("6092h", _too_coarse(units * shaft, turns * motor)))
     if round(angle * geared) >= COARSEST:
         if has_gear:
             notes.append(("6091h", f"its factory's ratio is in the scale that 60A8h gives, {angle:g} units a turn of "
@@ -247,22 +247,23 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
         if not math.isclose(round(angle * geared), angle * geared, rel_tol=1e-9):
             notes.append(("60A8h", f"{angle * geared:.9g} units a turn are taken as {round(angle * geared)}"))
         return {}, round(angle * geared), Feed(angle, "60A8h")
+    if angle:
+        notes.append(("60A8h", _too_coarse(f"{angle * geared:g}", 1)))
     if position is not None and not angle and position.numerator not in (INCREMENTS, DIMENSIONLESS):
         why = "is no angle: how many of it a turn has only 6092h tells"
         notes.append(("60A8h", f"{_shown(types, cia402.POSITION_UNIT)} {why}"))
+    if has_gear:
+        why = "without a feed in 6092h positions are counts of the encoder at the motor: a gear changes nothing"
+        notes.append(("6091h", why))
     if all(key in types for key in encoder.values()):
         counts, per = _factory(types, encoder)
-        if has_gear:
-            notes.append(
-                ("6091h", "without a feed in 6092h positions are counts of 608Fh at the motor: a gear changes nothing")
-            )
         if counts <= 0 or per <= 0 or counts / per >= COARSEST:
             return encoder, 0, Feed(0.0, "608Fh")
         notes.append(("608Fh", _too_coarse(counts, per)))
     return {}, 0, Feed(0.0, "")
 
 
-def _too_coarse(units: int, turns: int) -> str:
+def _too_coarse(units: int | str, turns: int) -> str:
     return f"{units} : {turns} is not taken: a position cannot be held by fewer than {COARSEST:g} units a turn"
 
 
