@@ -109,7 +109,7 @@ def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", accelerati
     )
 
 
-class Code(NamedTuple):
+class UnitCode(NamedTuple):
     """What an object of 60A8h to 60AAh says."""
 
     prefix: float
@@ -122,17 +122,17 @@ class Code(NamedTuple):
         return self.numerator in ANGLES and self.denominator == DIMENSIONLESS
 
 
-def _code(types: Mapping[Key, ODVariable], index: int) -> Code | None:
+def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
     """Return what an object says; None where there is none, or it is 0."""
     variable = types.get((index, 0))
     if variable is None or not isinstance(variable.default, int) or variable.default & 0xFFFFFFFF == 0:
         return None
     raw = variable.default & 0xFFFFFFFF
     power = raw >> 24
-    return Code(10.0 ** (power - 256 if power > 127 else power), raw >> 16 & 0xFF, raw >> 8 & 0xFF)
+    return UnitCode(10.0 ** (power - 256 if power > 127 else power), raw >> 16 & 0xFF, raw >> 8 & 0xFF)
 
 
-def _rate(code: Code, bases: tuple[str, ...], feed: Feed, position: Code | None) -> str:
+def _rate(code: UnitCode, bases: tuple[str, ...], feed: Feed, position: UnitCode | None) -> str:
     """Return the unit that a code of a speed or an acceleration is; "" of one not known."""
     by_minute, counted = bases
     is_speed = by_minute == "rpm"
