@@ -606,7 +606,7 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
     assert run("export", tmp_path / "a.txt", "--device", folder).exit_code == 2
 
 
-def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path):
+def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path, monkeypatch):
     from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
 
     folder, source = str(folders["fjord_ft2"].folder), FOLDER / "fjord_ft2.eds"
@@ -617,6 +617,10 @@ def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path):
         with CanDrives(eds=source, bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
             drives.write(0x6081, [1111, 2222])
             values = commissioned_values(drives)
+        again = {"bus": bus, "nodes": (NODE,), "pace": "lockstep", "safety": False}
+        monkeypatch.setattr("drive_env.commands.export.connect", lambda *_, **__: CanDrives(eds=source, **again))
+        done = run("export", tmp_path / "named.eds", "--eds", source, "--node", NODE)
+        assert done.stdout.endswith(f"{len(values)} parameters of {source.stem}\n"), done.output
     finally:
         bus.shutdown()
         world.close()
