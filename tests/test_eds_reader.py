@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import canopen
@@ -57,6 +58,22 @@ def test_a_number_is_one_however_it_is_written(text, number):
 def test_a_sum_with_the_node_id_is_calculated(tmp_path, text, of_node_5):
     dictionary, _ = read(tmp_path, entry("1014", "COB-ID EMCY", DefaultValue=text))
     assert dictionary.find(0x1014).default == of_node_5
+
+
+@pytest.mark.parametrize(
+    ("text", "number", "told"),
+    [
+        ("25.5", 25.5, ""), ("25,5", 25.5, "DefaultValue=25,5 is read as 25.5"), ("-1e-3", -1e-3, ""),
+        ("0x10", 16.0, "DefaultValue=0x10 is read as 16.0"), ("7", 7.0, ""),
+        ("1.234,5", 0.0, "DefaultValue=1.234,5 is no value of its type, and was left out"),
+        ("inf", 0.0, "DefaultValue=inf is no value of its type, and was left out"),
+    ],
+)  # fmt: skip
+def test_a_real_number_may_have_a_comma(tmp_path, text, number, told):
+    dictionary, repairs = read(tmp_path, entry("2000", data_type="0x0008", DefaultValue=text))
+    content = str(dictionary.find(0x2000).default).encode("latin-1")
+    assert struct.unpack("<f", content)[0] == pytest.approx(number)
+    assert [one for one in repairs if "DefaultValue" in one] == ([told] if told else [])
 
 
 @pytest.mark.parametrize("text", ["0x180", "NODE+1", "$NODEID*$NODEID", "$NODEID+x y"])

@@ -7,18 +7,20 @@ the vendor's EDS alone, and by python-canopen, which knows the EDS of the folder
 from __future__ import annotations
 
 import math
+import re
 import time
 import uuid
 
 import canopen
 import numpy as np
 import pytest
+from canopen_wire import Wire
 from test_canopen_master import NODE, PATIENCE, BootUps, Pump, until
 from test_eds_reader import FOLDER, entry
 from test_parity import WorldBus
 from typer.testing import CliRunner
 
-from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env import CanDrives, EmulatedDrives, cia402, motion
 from drive_env.bus.world import World
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
@@ -321,6 +323,213 @@ def test_texts_and_floats_are_served_as_they_are(folders):
             pump.close()
 
 
+# --- what a file tells in another way, or not at all ------------------------------------------------------------------
+def put(text, section, **values):
+    """Return an EDS with values of a section changed."""
+    head, rest = text.split(f"[{section}]\n", 1)
+    body, mark, tail = rest.partition("\n[")
+    for key, value in values.items():
+        body, done = re.subn(rf"(?m)^{key}=.*$", f"{key}={value}", body)
+        body = body if done else f"{key}={value}\n{body}"
+    return f"{head}[{section}]\n{body}{mark}{tail}"
+
+
+def without(text, *indices):
+    """Return an EDS without objects."""
+    return re.sub(rf"(?m)^\[({'|'.join(indices)})(sub\w+)?\]\n(?:(?!\[).*\n?)*", "", text)
+
+
+def made_of(tmp_path, text, **options):
+    """Return what became of a changed EDS, and the notes of what to fill in."""
+    path = tmp_path / "vendor.eds"
+    path.write_text(text, encoding="utf-8")
+    made = new_device(path, tmp_path / "device", find_motor(MOTOR), **options)
+    return made, {note.what: note.why for note in made.fill_in}
+
+
+BASE = (FOLDER / "alpina_ax40.eds").read_text(encoding="utf-8")  # 6091h, 60A8h to 60AAh; no 608Fh, no 6092h
+FEED_36000 = (
+    entry("6092", "Feed constant", kind="0x8", data_type=None, access=None, SubNumber=3)
+    + entry("6092sub0", "Entries", data_type="0x5", access="ro", DefaultValue=2)
+    + entry("6092sub1", "Feed", DefaultValue=36000)
+    + entry("6092sub2", "Revolutions", DefaultValue=1)
+)
+
+
+RESOLUTION = FEED_36000.replace("6092", "608F").replace("36000", "1")
+
+
+def units_of(made):
+    bindings = find_device(str(made.folder)).bindings
+    return bindings[0x606C, 0].unit, bindings[0x6083, 0].unit
+
+
+def test_a_drive_without_1005h_is_served_and_takes_sync_as_080h(tmp_path):
+    made, told = made_of(tmp_path, without(BASE, "1005"))
+    assert told["1005h"] == "the EDS has none: SYNC is taken as 080h, as CiA 301 has it"
+    world = World(lockstep=True)
+    world.add(emulated(str(made.folder)), [NODE])
+    bus = WorldBus(world)
+    try:
+        with CanDrives(str(made.folder), bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
+            motion.enable(drives, mode="csp")
+            here = drives.read(0x6064)
+            way = (1000 * np.linspace(0.0, 1.0, 200)).astype(int)
+            drives.record([0x6064], 0.2, play={0x607A: here + way[:, None]})
+            drives.advance(0.3)
+            assert np.all(np.abs(drives.read(0x6064) - here - 1000) < 100)
+    finally:
+        bus.shutdown()
+        world.close()
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "acceleration", "feed", "scale", "units"),
+    [
+        ("0xFE410000", "0xFF410300", "0xFE415700", True, 36000, ("10 pps", "pps^2")),  # 0.01 deg, 0.1 deg/s
+        ("0xFE410000", "0xFE410300", "0xFE415700", False, 36000, ("pps", "pps^2")),  # 60A8h alone
+        ("0x00B50000", "0x00414700", "0x00415700", False, 4096, ("0.00277777777778 rpm", "0.166666666667 rpm/s")),
+        ("0xFD100000", "0xFD100300", "0xFD105700", False, 6283, ("pps", "pps^2")),  # milliradians
+        ("0xFDB40000", "0xFFB40300", "0x00B45700", False, 1000, ("6 rpm", "60 rpm/s")),  # 0.001 revolutions
+        ("0x00B50000", "0x01B54700", "0x03B55700", False, 4096, ("0.166666666667 pps", "1000 pps^2")),
+        ("0xFA010000", "0xFD010300", "0xFD015700", True, 36000, ("1000 pps", "1000 pps^2")),  # um, mm/s
+    ],
+)
+def test_units_by_their_codes(tmp_path, position, velocity, acceleration, feed, scale, units):
+    text = without(BASE, "6091") + (FEED_36000 if feed else "")
+    for index, code in (("60A8", position), ("60A9", velocity), ("60AA", acceleration)):
+        text = put(text, index, DefaultValue=code)
+    made, told = made_of(tmp_path, text)
+    assert units_of(made) == units
+    assert scale_of(str(made.folder))[0] == scale
+    assert not any(what.startswith(("unit of velocity", "unit of acceleration")) for what in told)
+    if units[0].endswith("pps"):  # what was read is what the axis does: 72 degrees a second
+        with emulated(str(made.folder), ideal=True) as drives:
+            motion.enable(drives, mode="pv")
+            number = float(units[0].removesuffix("pps") or 1.0)
+            drives.write(0x60FF, round(0.2 * scale / number))
+            drives.advance(0.5)
+            assert drives.machine.rotor_speed[0] == pytest.approx(0.4 * math.pi, rel=0.05)
+
+
+def test_a_unit_beside_an_object_may_be_an_angle(tmp_path):
+    text = put(put(without(BASE, "60A9", "60AA"), "606C", Unit="0.1 deg/s"), "6083", Unit="rad/s^2")
+    made, told = made_of(tmp_path, text)
+    assert units_of(made) == ("0.0166666666667 rpm", "9.54929658551 rpm/s")
+    assert not any(what.startswith(("unit of velocity", "unit of acceleration")) for what in told)
+
+
+def test_a_code_that_is_not_known_is_told(tmp_path):
+    text = put(put(BASE, "60A9", DefaultValue="0xFD220300"), "60A8", DefaultValue="0xFD010000")
+    _, told = made_of(tmp_path, text)
+    assert told["60A9h"] == "FD220300h is a code of CiA 303-2 that is not known here"
+    assert told["60A8h"] == "FD010000h is no angle: how many of it a turn has only 6092h tells"
+    assert any(what.startswith("unit of velocity") for what in told)
+    assert "a gear changes nothing" in told["6091h"]
+
+
+def test_a_resolution_that_no_position_could_be_held_by_is_told_and_not_taken(tmp_path):
+    made, told = made_of(tmp_path, BASE + RESOLUTION)
+    assert told["608Fh"] == "1 : 1 is not taken: a position cannot be held by fewer than 100 units a turn"
+    with emulated(str(made.folder)) as drives:
+        assert drives.read(Role.POSITION_SCALE)[0] == 4096
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, 4096)
+        assert abs(drives.read(0x6064)[0] - 4096) < 82
+
+
+INTERPOLATION = (
+    entry("60C1", "Interpolation data", kind="0x8", data_type=None, access=None, SubNumber=2)
+    + entry("60C1sub0", "Entries", data_type="0x5", access="ro", DefaultValue=1)
+    + entry("60C1sub1", "Position", data_type="0x4", DefaultValue=0, PDOMapping=1)
+)
+
+
+def test_ip_follows_60c1h_and_is_refused_without_it(tmp_path):
+    text = put(without(BASE, "60C1"), "6502", DefaultValue="0x000000EB")
+    (tmp_path / "a").mkdir()
+    made, _ = made_of(tmp_path / "a", text)
+    assert cia402.IP not in find_device(str(made.folder)).allowed_values[0x6060, 0]
+    assert any(note.what == "mode 7, ip" and "no 60C1h:01" in note.why for note in made.modes)
+    made, _ = made_of(tmp_path, text + INTERPOLATION)
+    assert any(note.what == "ip" for note in made.modes)
+    with emulated(str(made.folder)) as drives:
+        motion.enable(drives, mode="ip")
+        here = drives.read(0x6064)
+        way = 10 * np.arange(300)
+        drives.record([0x6064], 0.3, play={(0x60C1, 1): here + way[:, None]})
+        drives.advance(0.3)
+        assert abs(int((drives.read(0x6064) - here)[0]) - way[-1]) < 82
+        assert "60C1h" not in {note.what for note in made.without_effect}
+
+
+def test_a_mode_without_its_target_is_told_and_refused(tmp_path):
+    made, _ = made_of(tmp_path, without(BASE, "60FF"))
+    assert not {cia402.PV, cia402.CSV} & set(find_device(str(made.folder)).allowed_values[0x6060, 0])
+    told = {note.what: note.why for note in made.modes}
+    assert "no 60FFh:00" in told["mode 3, pv"] and "no 60FFh:00" in told["mode 9, csv"]
+
+
+def test_a_drive_without_a_position_window_has_arrived_when_it_has(tmp_path):
+    made, told = made_of(tmp_path, without(BASE, "6067", "6068"))
+    assert any("no 6067h" in why for why in told.values())
+    with emulated(str(made.folder)) as drives:
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, 6144)
+        assert abs(drives.read(0x6064)[0] - 6144) < 41  # a hundredth of a turn
+
+
+def test_a_mapping_with_a_dummy_can_be_written_back(tmp_path):
+    text = put(put(BASE, "1600sub0", DefaultValue=3), "1600sub2", DefaultValue="0x00050008")
+    text = put(text, "1600sub3", DefaultValue="0x607A0020")
+    text = without(text, "DummyUsage") + "[DummyUsage]\nDummy0005=1\nDummy0006=0\n\n"
+    made, _ = made_of(tmp_path, text)
+    with emulated(str(made.folder)) as drives:
+        wire = Wire(drives, NODE)
+        mapping = [wire.value(0x1600, sub) for sub in range(4)]
+        assert mapping[0] == 3 and mapping[2] == 0x00050008
+        cob_id = wire.value(0x1400, 1)
+        assert wire.download(0x1400, 1, cob_id | 0x80000000, 4) == 0
+        assert wire.download(0x1600, 0, 0, 1) == 0
+        assert wire.download(0x1600, 2, 0x00060010, 4) == 0x06020000  # which the EDS does not allow
+        assert wire.download(0x1600, 2, 0x00050010, 4) == 0x06040041  # of another length
+        for sub in (1, 2, 3):
+            assert wire.download(0x1600, sub, mapping[sub], 4) == 0
+        assert wire.download(0x1600, 0, 3, 1) == 0
+        assert wire.download(0x1400, 1, cob_id, 4) == 0
+        wire.start()
+        wire.receive(cob_id & 0x7FF, "06 00 FF 10 27 00 00")
+        wire.receive(0x80)
+        wire.wait(2)
+        assert (wire.value(0x6040, 0), wire.value(0x607A, 0)) == (6, 10000)
+        # A frame to the master has no room to pass over.
+        wire.take()
+        transmit = wire.value(0x1800, 1)
+        assert wire.download(0x1800, 1, transmit | 0x80000000, 4) == 0
+        assert wire.download(0x1A00, 0, 0, 1) == 0
+        assert wire.download(0x1A00, 1, 0x00050008, 4) == 0x06040041
+
+
+def test_603fh_shows_what_holds_the_axis_in_fault(folders):
+    made = folders["deltron_dl750"]
+    assert "603Fh" not in {note.what for note in made.without_effect}
+    with emulated(str(made.folder)) as drives:
+        wire = Wire(drives, NODE)
+        assert drives.read(0x603F)[0] == wire.value(0x603F, 0) == 0
+        motion.enable(drives, mode="pp")
+        drives.machine.supply = 5.0
+        seen = drives.record([0x603F, 0x6041], 0.5)
+        in_fault = (seen[0x6041][:, 0] & 0x08) != 0
+        assert in_fault.any() and not in_fault.all()
+        np.testing.assert_array_equal(seen[0x603F][:, 0], np.where(in_fault, 0x3220, 0))
+        assert drives.read(0x603F)[0] == 0x3220
+        assert wire.value(0x603F, 0) == 0x3220
+        drives.machine.supply = 24.0
+        drives.advance(0.5)
+        motion.reset_fault(drives)
+        assert drives.read(0x603F)[0] == 0
+
+
 # --- the command ------------------------------------------------------------------------------------------------------
 def run(*line):
     return CliRunner().invoke(app, [str(word) for word in line])
@@ -389,12 +598,15 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
     assert eds[0x1400][1].default == 0x207  # what follows the node-ID goes on following it
     assert (dcf.node_id, dcf.bitrate, dcf[0x1400][1].value) == (1, 1_000_000, 0x201)
     assert "LastEDS=alpina_ax40.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")  # which it was made of
+    assert f"parameters of {folder}\n" in done.stdout and f"parameters of {folder}, as node 1\n" in done.stdout
+    done = run("export", tmp_path / "b.eds", "--eds", FOLDER / "alpina_ax40.eds")
+    assert done.exit_code == 2 and "is of a drive on a bus, and no bus is named" in done.stderr
     again = run("export", tmp_path / "a.eds", "--device", folder)
     assert again.exit_code == 2 and "files are not overwritten" in again.stderr
     assert run("export", tmp_path / "a.txt", "--device", folder).exit_code == 2
 
 
-def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path):
+def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path, monkeypatch):
     from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
 
     folder, source = str(folders["fjord_ft2"].folder), FOLDER / "fjord_ft2.eds"
@@ -405,6 +617,10 @@ def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path):
         with CanDrives(eds=source, bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
             drives.write(0x6081, [1111, 2222])
             values = commissioned_values(drives)
+        again = {"bus": bus, "nodes": (NODE,), "pace": "lockstep", "safety": False}
+        monkeypatch.setattr("drive_env.commands.export.connect", lambda *_, **__: CanDrives(eds=source, **again))
+        done = run("export", tmp_path / "named.eds", "--eds", source, "--node", NODE)
+        assert done.stdout.endswith(f"{len(values)} parameters of {source.stem}\n"), done.output
     finally:
         bus.shutdown()
         world.close()

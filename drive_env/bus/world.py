@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Protocol
 
 from drive_env.bus.wire import Transmission, Wire
-from drive_env.canopen.frames import IDENTIFIER, SYNC, Frame
+from drive_env.canopen.frames import SYNC, Frame
 from drive_env.canopen.lss import UNCONFIGURED
 from drive_env.canopen.node import Node
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.node.axis import ObjectPort
 
 CYCLE = 0.001  # s: the communication cycle
-SYNC_OBJECT = (0x1005, 0)
 # Frames of a node that wait for the bus, for each of its axes; ours, since no manual says. More are lost.
 TRANSMIT_BUFFER = 64
 MAX_NODE_ID = 127
@@ -80,7 +78,7 @@ class World:
         self.time = 0.0
         self.cycles = 0
         self._answering: list[Node] = []  # whose SDO answers take time
-        self._sync_objects: list[ObjectPort] = []  # 1005h of each node
+        self._synchronised: list[Node] = []  # by SYNC, of whose identifiers each has its own
         self._room: dict[int, int] = {}  # node identifier -> frames that may wait
         self._on: set[int] = set()
         self._overflowed: set[int] = set()
@@ -130,7 +128,7 @@ class World:
 
             self._room[node_id] = TRANSMIT_BUFFER * per_node
             (self._attach if is_new else self.attach)(node_id, make)
-            self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
+            self._synchronised.append(nodes[-1])
             axes = slice(k * per_node, (k + 1) * per_node)
             drives.machine.connect_lamps(axes, self._lamps_of(nodes[-1], node_id))
         self.drives += [drives] if spare is None else [drives, spare]
@@ -272,9 +270,9 @@ class World:
         """Return whether a frame is SYNC, with or without a counter, to the nodes (1005h can be changed)."""
         if frame.rtr or len(frame.data) > 1:
             return False
-        if not self._sync_objects:
+        if not self._synchronised:
             return frame.can_id == SYNC
-        return any(frame.can_id == int(port.read()) & IDENTIFIER for port in self._sync_objects)
+        return any(frame.can_id == node.sync_id for node in self._synchronised)
 
     def _settle(self) -> None:
         """Carry frames until none is ready at this time, and no segment of a block upload either."""

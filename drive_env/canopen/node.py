@@ -200,6 +200,13 @@ class Node:
             self.overrun(now, "receive")
 
     @property
+    def sync_id(self) -> int:
+        """Identifier of SYNC: 1005h, or that of CiA 301 on a drive without it."""
+        module = self._module
+        has_it = module.has(communication.SYNC_ID)
+        return module.value(communication.SYNC_ID) & frames.IDENTIFIER if has_it else frames.SYNC
+
+    @property
     def next_answer(self) -> float:
         """When its next SDO answer, or segment of one, is ready [s]; infinite while none is under way."""
         return min(self._answers[0][0], self._segment_at) if self._answers else self._segment_at
@@ -281,7 +288,7 @@ class Node:
             self._transmit(Frame(raw & frames.IDENTIFIER, time_of_day.encode(*self._clock.milliseconds(now))))
         data = self._sync_producer.take(now)
         if data is not None:
-            self._transmit(Frame(self._module.value(communication.SYNC_ID) & frames.IDENTIFIER, data))
+            self._transmit(Frame(self.sync_id, data))
             self._came = now
             self._on_sync(data, now)
 
@@ -492,8 +499,8 @@ class Node:
         }
         if self._lss is not None:
             table[lss.REQUEST] = [self._on_lss]
-        sync_id, time_id = self._module.value(communication.SYNC_ID), self._module.value(communication.TIME_ID)
-        table.setdefault(sync_id & frames.IDENTIFIER, []).append(self._on_sync)
+        table.setdefault(self.sync_id, []).append(self._on_sync)
+        time_id = self._module.value(communication.TIME_ID)
         if time_id & frames.CONSUME_TIME:
             table.setdefault(time_id & frames.IDENTIFIER, []).append(self._on_time)
         for consumer in self._consumers:

@@ -66,13 +66,18 @@ def export(
                 safety=False,
             ) as drives:
                 values = commissioned_values(drives)
-                source = drives.description.dictionary.path
+                source, whose = drives.description.dictionary.path, drives.description.name
         else:
+            if eds is not None:
+                raise ValueError(
+                    f"--eds {eds} is of a drive on a bus, and no bus is named; give --interface and --channel, or make "
+                    f"a device of it (drive-env new --eds {eds}) and name that as --device"
+                )
             from drive_env.devices import find_device
             from drive_env.emulator.emulated_drives import EmulatedDrives
 
             known = find_device(device)
-            source = known.eds
+            source, whose = known.eds, device
             with EmulatedDrives(device, "inertia", motor, num_machines=known.num_axes, num_threads=1) as emulated:
                 values = commissioned_values(emulated)
         for one in files:
@@ -80,4 +85,4 @@ def export(
             kbit = CAN_KBIT if bitrate is None else bitrate // KBIT
             text = commissioned_eds(source, values, one.name, node_id=(node or 1) if is_dcf else None, bit_rate=kbit)
             write_whole(one, text)
-            print(f"{one}: {len(values)} parameters of {f'node {node or 1}' if is_dcf else device}")
+            print(f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {node or 1}'}")

@@ -38,6 +38,7 @@ from drive_env.dictionary.units import find_unit
 from drive_env.whole_file import files_to_be
 
 if TYPE_CHECKING:
+    from drive_env.firmware.common.modes import Mode
     from drive_env.motors import Motor
 
 Key = tuple[int, int]
@@ -51,6 +52,7 @@ LIST_NAME, EDS_NAME = "to_fill_in.md", "drive.eds"
 OWN_BLOCKS = range(0x5F00, 0x1FFF, -0x100)
 OWN_PER_AXIS = 0x10
 STORE, RESTORE = 0x1010, 0x1011
+SYNC_ID = 0x1005
 ERROR_BEHAVIOUR = 0x1029
 STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); those above are the maker's
 TRANSMISSION_TYPES = ["0...240", 254, 255]
@@ -64,6 +66,17 @@ MODE_NEEDS = {
     cia402.CSP: cia402.TARGET_POSITION,
     cia402.CSV: cia402.TARGET_VELOCITY,
     cia402.CST: cia402.TARGET_TORQUE,
+}
+
+# What a mode follows; homing has an object of the emulator's own where the drive has none.
+MODE_TARGETS = {
+    cia402.PP: (cia402.TARGET_POSITION, 0),
+    cia402.PV: (cia402.TARGET_VELOCITY, 0),
+    cia402.TQ: (cia402.TARGET_TORQUE, 0),
+    cia402.IP: (cia402.INTERPOLATION_DATA, 1),
+    cia402.CSP: (cia402.TARGET_POSITION, 0),
+    cia402.CSV: (cia402.TARGET_VELOCITY, 0),
+    cia402.CST: (cia402.TARGET_TORQUE, 0),
 }
 
 
@@ -167,6 +180,7 @@ class _Draft:
         self._add_own_objects()
         self._correct_defaults()
         self._changes += [Note(*row) for row in repair_process_data(self._sections, self._types)]
+        self._tell_of_communication()
         self._tell_of_units()
         self._drop_twinless()
 
@@ -214,6 +228,7 @@ class _Draft:
         else:
             found = [mode for mode in here if mode.supported_bit is not None and bits >> mode.supported_bit & 1]
             known = {mode.supported_bit for mode in here}
+            found = [mode for mode in found if self._has_target(mode)]
             others = [bit for bit in range(16) if bits >> bit & 1 and bit not in known]
             self._told_of_modes += [
                 Note(f"mode {bit + 1}", "6502h has it, and the emulator does not: 6060h refuses it") for bit in others
@@ -234,6 +249,19 @@ class _Draft:
                 for one in sorted(self._listed_methods() - set(methods))
             ]
         return numbers
+
+    def _has_target(self, mode: Mode) -> bool:
+        """Return whether the drive has the object that a mode of 6502h follows; tell of one that has not."""
+        key = MODE_TARGETS.get(mode.number)
+        variable = None if key is None else self._types.get(key)
+        if key is not None and (variable is None or variable.data_type not in INTEGER_TYPES):
+            why = f"6502h has it, and the EDS no {key[0]:04X}h:{key[1]:02X} that is an integer: 6060h refuses it"
+            self._told_of_modes.append(Note(f"mode {mode.number}, {mode.abbreviation}", why))
+            return False
+        if mode.number == cia402.IP:
+            why = "60C1h:01 is followed as csp follows 607Ah, without waiting for bit 4 of the controlword"
+            self._told_of_modes.append(Note("ip", why))
+        return True
 
     def _homing_methods(self) -> list[int]:
         """Return the methods of homing that both have: within 6098h's limits, and in 60E3h where that lists any."""
@@ -301,13 +329,18 @@ class _Draft:
                 self._bindings[key] = Binding(*key, row.field, self._unit(row.unit))
             for axis in range(self._axes if rows else 0):
                 self._write_own(self._base + offset + axis * OWN_PER_AXIS, title, rows)
+        told = self._units.increments
         for key, row in self._own:
             role = {"position_scaler": "position_scale", "i_max": "current_limit"} | MOTOR_ROLES
             if row.field in role:
                 self._roles[role[row.field]] = key
-            if row.why:
+            if row.field == "position_scaler" and told:
+                why = f"{told} units a turn by {self._units.sources['position']}, which no object has"
+            else:
+                why = row.why
+            if why:
                 self._fill_in.append(
-                    Note(f"{_text(key)} {row.name}", f"the EDS has {row.why}: an object of the emulator's own")
+                    Note(f"{_text(key)} {row.name}", f"the EDS has {why}: an object of the emulator's own")
                 )
         own = f"{self._base:04X}h and {self._base + 1:04X}h"
         why = (
@@ -325,7 +358,8 @@ class _Draft:
             unit = self._unit(row.unit)
             section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw"}
             shown = {} if unit == "raw" else {"Unit": _shown(unit)}
-            self._sections[object_section(index, sub)] = section | {"DefaultValue": "0"} | shown
+            default = self._units.increments if row.field == "position_scaler" else 0
+            self._sections[object_section(index, sub)] = section | {"DefaultValue": str(default)} | shown
 
     def _correct_defaults(self) -> None:
         """Give objects whose factory value the emulator cannot have another, and units to what is bound."""
@@ -367,6 +401,10 @@ class _Draft:
                     Note(f"[{_text((index, sub))}]", "was left out: the first axis has no such object")
                 )
 
+    def _tell_of_communication(self) -> None:
+        if (SYNC_ID, 0) not in self._types:
+            self._fill_in.append(Note(f"{SYNC_ID:04X}h", "the EDS has none: SYNC is taken as 080h, as CiA 301 has it"))
+
     def _tell_of_units(self) -> None:
         units = self._units
         for quantity, unit in (
@@ -376,8 +414,9 @@ class _Draft:
         ):
             where = units.sources[quantity]
             if not where:
-                why = "the EDS tells no unit: the standard's, or what fits the others; read the manual"
+                why = "the EDS tells no unit known here: the standard's, or what fits the others; read the manual"
                 self._fill_in.append(Note(f"unit of {quantity} in bindings.toml, {_shown(unit)}", why))
+        self._fill_in += [Note(*row) for row in units.notes]
         if units.scale and min(self._default(*key) for key in units.scale.values()) <= 0:
             self._fill_in.append(
                 Note(units.sources["position"], "has no factory value: the counts of the motor's encoder")

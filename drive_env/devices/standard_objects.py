@@ -57,6 +57,7 @@ STANDARD = (
     Binding(cia402.POSITION_OFFSET, 0, "position_offset", "inc", event="set_point"),
     Binding(cia402.VELOCITY_OFFSET, 0, "velocity_offset", VELOCITY, event="set_point"),
     Binding(cia402.TORQUE_OFFSET, 0, "torque_offset", TORQUE),
+    Binding(cia402.INTERPOLATION_DATA, 1, "target_position", "inc", event="set_point"),
     Binding(cia402.INTERPOLATION_PERIOD, 1, "interpolation_value"),
     Binding(cia402.INTERPOLATION_PERIOD, 2, "interpolation_index"),
     Binding(cia402.POSITIONING_OPTIONS, 0, "positioning_option"),
@@ -66,12 +67,11 @@ STANDARD = (
 )
 
 # Objects whose value the emulator shows or obeys by itself, without a field of the record.
-BY_THEMSELVES = (cia402.SUPPORTED_MODES,)
+BY_THEMSELVES = (cia402.ERROR_CODE, cia402.SUPPORTED_MODES)
 
 # What a reader must know of objects that are stored and have no effect here.
 WITHOUT_EFFECT: Mapping[int, str] = {
     cia402.ABORT_CONNECTION_OPTION: "a lost master is answered by 1029h and a fault, whatever it says",
-    cia402.ERROR_CODE: "stays as it is: EMCY and 1003h report errors",
     cia402.SHUTDOWN_OPTION: "a shutdown takes the voltage away at once",
     cia402.DISABLE_OPERATION_OPTION: "disable operation brakes with the mode's ramp",
     cia402.HALT_OPTION: "halt brakes with the mode's ramp and holds the axis",
@@ -91,6 +91,14 @@ WITHOUT_EFFECT: Mapping[int, str] = {
     cia402.PROFILE_JERK: "ramps are linear",
     cia402.TOUCH_PROBE: "there is no touch probe",
     cia402.DIGITAL_OUTPUTS: "nothing is connected to the outputs",
+    **dict.fromkeys(
+        (cia402.POSITION_UNIT, cia402.VELOCITY_UNIT, cia402.ACCELERATION_UNIT),
+        "its factory value told units as the folder was made; a write changes nothing",
+    ),
+    **dict.fromkeys(
+        (cia402.ENCODER_RESOLUTION, cia402.GEAR_RATIO, cia402.FEED_CONSTANT),
+        "another object gives the scale of positions",
+    ),
     cia402.MOTOR_TYPE: "the motor is the machine's",
 }
 
@@ -132,7 +140,10 @@ MOTOR_ROLES = {
 }  # fmt: skip
 # Where the EDS lacks the standard's object for a field, and a mode of the drive needs it (None: every drive does).
 NEEDED: tuple[tuple[OwnObject, tuple[int, ...] | None], ...] = (
-    (OwnObject("Increments of a revolution", "u32", "position_scaler", "raw", "neither 608Fh nor 6092h"), None),
+    (
+        OwnObject("Increments of a revolution", "u32", "position_scaler", "raw", "no 608Fh, 6092h, 60A8h for it"),
+        None,
+    ),
     (OwnObject("Current limit", "u16", "i_max", TORQUE, "no 6073h"), None),
     (OwnObject("Lowest position", "i32", "position_min", "position limit", "no 607Dh"), None),
     (OwnObject("Highest position", "i32", "position_max", "position limit", "no 607Dh"), None),
@@ -143,4 +154,6 @@ NEEDED: tuple[tuple[OwnObject, tuple[int, ...] | None], ...] = (
     (OwnObject("Homing speed, switch", "u32", "homing_fast", VELOCITY, "no 6099h"), (cia402.HM,)),
     (OwnObject("Homing speed, zero", "u32", "homing_slow", VELOCITY, "no 6099h"), (cia402.HM,)),
     (OwnObject("Homing acceleration", "u32", "homing_acceleration", ACCELERATION, "no 609Ah"), (cia402.HM,)),
+    (OwnObject("Position window", "u32", "position_window", "position window", "no 6067h"), (cia402.PP,)),
+    (OwnObject("Position window time", "u16", "position_window_time", "ms", "no 6068h"), (cia402.PP,)),
 )

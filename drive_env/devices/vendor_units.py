@@ -1,12 +1,13 @@
 """The units that a drive counts in, as its EDS tells them: scale of positions, speeds, accelerations, torques.
 
-Positions follow 6092h over 6091h, or 608Fh; speeds and accelerations 60A9h and 60AAh, or the unit that the EDS writes
-beside an object. Where nothing tells a unit it is the standard's: units of position per second, thousandths of the
-rated torque.
+Positions follow 6092h over 6091h, an angle in 60A8h, or 608Fh; speeds and accelerations 60A9h and 60AAh, or the unit
+that the EDS writes beside an object. Where nothing tells a unit it is the standard's: units of position per second,
+thousandths of the rated torque. Angles are those of the shaft that 6092h counts, rpm those of the motor.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -19,18 +20,18 @@ Key = tuple[int, int]
 
 COARSEST = 100.0  # units of position in a turn: a scale below is none that a position could be held by
 # Codes of CiA 303-2 in 60A8h to 60AAh: powers of ten above, then numerator, denominator, and a byte that is 0.
-REVOLUTIONS, INCREMENTS, PER_MINUTE = 0xB4, 0xB5, 0xC0
-SECOND, MINUTE, SECOND_SQUARED = 0x03, 0x47, 0x57
-_SPEEDS = {
-    (REVOLUTIONS, MINUTE): (1.0, "rpm"),
-    (REVOLUTIONS, SECOND): (60.0, "rpm"),
-    (INCREMENTS, SECOND): (1.0, "pps"),
+RADIAN, GRADIAN, DEGREE, ARC_MINUTE, ARC_SECOND = 0x10, 0x40, 0x41, 0x42, 0x43
+DIMENSIONLESS, REVOLUTIONS, INCREMENTS, PER_MINUTE = 0x00, 0xB4, 0xB5, 0xC0
+SECOND, MINUTE, HOUR, SECOND_SQUARED = 0x03, 0x47, 0x48, 0x57
+ANGLES = {  # in revolutions
+    RADIAN: 0.5 / math.pi,
+    GRADIAN: 1.0 / 400.0,
+    DEGREE: 1.0 / 360.0,
+    ARC_MINUTE: 1.0 / 21_600.0,
+    ARC_SECOND: 1.0 / 1_296_000.0,
+    REVOLUTIONS: 1.0,
 }
-_ACCELERATIONS = {
-    (PER_MINUTE, SECOND): (1.0, "rpm/s"),
-    (REVOLUTIONS, SECOND_SQUARED): (60.0, "rpm/s"),
-    (INCREMENTS, SECOND_SQUARED): (1.0, "pps^2"),
-}
+TIMES = {SECOND: 1.0, MINUTE: 60.0, HOUR: 3600.0}  # in seconds
 # Units as EDS files write them beside an object, spaces left out, in lower case.
 _WRITTEN = {
     **dict.fromkeys(("rpm", "r/min", "rev/min", "1/min", "min-1", "min^-1", "u/min"), "rpm"),
@@ -43,6 +44,14 @@ _WRITTEN = {
     **dict.fromkeys(("1/1000", "permille", "0.1%", "perthousand", "1/1000rated"), "1/1000 rated"),
 }
 _PREFIXED = re.compile(r"(\d+(?:\.\d+)?)\*?([a-z(].*)$")
+_ANGLE = re.compile(r"(\d+(?:\.\d+)?)?\*?(m?)(deg|degree|degrees|\u00b0|rad)(/s|/min|/s\^?2|/s\u00b2)$")
+
+
+class Feed(NamedTuple):
+    """Units of position in a turn of the shaft that 6092h counts, and what says so; 0 and "" where nothing does."""
+
+    units: float
+    source: str
 
 
 class VendorUnits(NamedTuple):
@@ -51,14 +60,18 @@ class VendorUnits(NamedTuple):
     Attributes:
         velocity, acceleration, torque: Names of units (dictionary/units.py).
         scale: Name of a role -> object of the dictionary, of what makes the scale of positions; empty: nothing does.
+        increments: Units of position in a turn of the motor where they are known and no object has them, else 0.
         sources: Quantity -> where its unit stands; "" where it is the standard's.
+        notes: What stands in the file and is not taken: object, and why.
     """
 
     velocity: str
     acceleration: str
     torque: str
     scale: dict[str, Key]
+    increments: int
     sources: dict[str, str]
+    notes: tuple[tuple[str, str], ...]
 
 
 def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", acceleration: str = "") -> VendorUnits:
@@ -69,51 +82,124 @@ def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", accelerati
         velocity: Unit of speeds that a person gave, before all others.
         acceleration: The same of accelerations.
     """
-    sources = {}
+    notes: list[tuple[str, str]] = []
+    scale, increments, feed = _scale(types, notes)
+    sources = {"position": feed.source}
     if velocity:
         sources["velocity"] = "given"
     else:
         velocity, sources["velocity"] = _told(
-            types, cia402.VELOCITY_UNIT, _SPEEDS, ("rpm", "pps"),
+            types, cia402.VELOCITY_UNIT, ("rpm", "pps"), feed, notes,
             (cia402.VELOCITY_ACTUAL, cia402.TARGET_VELOCITY, cia402.PROFILE_VELOCITY),
         )  # fmt: skip
     if acceleration:
         sources["acceleration"] = "given"
     else:
         acceleration, sources["acceleration"] = _told(
-            types, cia402.ACCELERATION_UNIT, _ACCELERATIONS, ("rpm/s", "pps^2"),
+            types, cia402.ACCELERATION_UNIT, ("rpm/s", "pps^2"), feed, notes,
             (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION),
         )  # fmt: skip
     torque, sources["torque"] = _told(
-        types, 0, {}, ("mA", "1/1000 rated"), (cia402.TORQUE_ACTUAL, cia402.TARGET_TORQUE)
+        types, 0, ("mA", "1/1000 rated"), feed, notes, (cia402.TORQUE_ACTUAL, cia402.TARGET_TORQUE)
     )
     if not acceleration:
         acceleration = "rpm/s" if velocity.endswith("rpm") else "pps^2"
-    scale, sources["position"] = _scale(types)
-    return VendorUnits(velocity or "pps", acceleration, torque or "1/1000 rated", scale, sources)
+    return VendorUnits(
+        velocity or "pps", acceleration, torque or "1/1000 rated", scale, increments, sources, tuple(notes)
+    )
+
+
+class UnitCode(NamedTuple):
+    """What an object of 60A8h to 60AAh says."""
+
+    prefix: float
+    numerator: int
+    denominator: int
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether it is an angle by itself, which needs no encoder to be known."""
+        return self.numerator in ANGLES and self.denominator == DIMENSIONLESS
+
+
+def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
+    """Return what an object says; None where there is none, or it is 0."""
+    variable = types.get((index, 0))
+    if variable is None or not isinstance(variable.default, int) or variable.default & 0xFFFFFFFF == 0:
+        return None
+    raw = variable.default & 0xFFFFFFFF
+    power = raw >> 24
+    return UnitCode(10.0 ** (power - 256 if power > 127 else power), raw >> 16 & 0xFF, raw >> 8 & 0xFF)
+
+
+def _rate(code: UnitCode, bases: tuple[str, ...], feed: Feed, position: UnitCode | None) -> str:
+    """Return the unit that a code of a speed or an acceleration is; "" of one not known."""
+    by_minute, counted = bases
+    is_speed = by_minute == "rpm"
+    if not is_speed and code.numerator == PER_MINUTE and code.denominator == SECOND:
+        return _times(code.prefix, by_minute)
+    seconds = TIMES.get(code.denominator) if is_speed else 1.0 if code.denominator == SECOND_SQUARED else None
+    if seconds is None:
+        return ""
+    if code.numerator == REVOLUTIONS:
+        return _times(code.prefix * 60.0 / seconds, by_minute)
+    if code.numerator in ANGLES:
+        return _of_angle(code.prefix * ANGLES[code.numerator] / seconds, bases, feed)
+    if code.numerator in (INCREMENTS, DIMENSIONLESS):
+        return _times(code.prefix / seconds, counted)
+    if position is not None and code.numerator == position.numerator:
+        return _times(code.prefix / position.prefix / seconds, counted)  # metres: as many units as positions have
+    return ""
+
+
+def _of_angle(turns: float, bases: tuple[str, ...], feed: Feed) -> str:
+    """Return the unit that so many turns of the shaft a second (squared) are: counted, where a turn has a number."""
+    by_minute, counted = bases
+    return _times(turns * feed.units, counted) if feed.units else _times(60.0 * turns, by_minute)
 
 
 def _told(
     types: Mapping[Key, ODVariable],
     index: int,
-    codes: Mapping[tuple[int, int], tuple[float, str]],
     bases: tuple[str, ...],
+    feed: Feed,
+    notes: list[tuple[str, str]],
     objects: tuple[int, ...],
 ) -> tuple[str, str]:
     """Return a unit and where it stands: as an object's code, or beside an object; two empty texts for none."""
-    coded = types.get((index, 0))
-    if coded is not None and isinstance(coded.default, int):
-        raw = coded.default & 0xFFFFFFFF
-        power, parts = raw >> 24, (raw >> 16 & 0xFF, raw >> 8 & 0xFF)
-        if parts in codes:
-            number, base = codes[parts]
-            return _times(number * 10.0 ** (power - 256 if power > 127 else power), base), f"{index:04X}h"
+    code = _code(types, index)
+    if code is not None:
+        unit = _rate(code, bases, feed, _code(types, cia402.POSITION_UNIT))
+        if unit:
+            return unit, f"{index:04X}h"
+        notes.append((f"{index:04X}h", f"{_shown(types, index)} is a code of CiA 303-2 that is not known here"))
     for one in objects:
         variable = types.get((one, 0))
-        unit = written_unit("" if variable is None else variable.unit or "")
+        text = "" if variable is None else variable.unit or ""
+        unit = written_unit(text)
         if unit.rpartition(" ")[2] in bases or unit in bases:
             return unit, f"the unit of {one:04X}h"
+        turns, power = written_angle(text)
+        if power and bases[0] == ("rpm", "rpm/s")[power - 1]:
+            return _of_angle(turns, bases, feed), f"the unit of {one:04X}h"
     return "", ""
+
+
+def _shown(types: Mapping[Key, ODVariable], index: int) -> str:
+    return f"{int(types[index, 0].default) & 0xFFFFFFFF:08X}h"
+
+
+def written_angle(text: str) -> tuple[float, int]:
+    """Return what angle a second, or second squared, an EDS writes beside an object, in revolutions, and which it is.
+
+    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) of what is none.
+    """
+    found = _ANGLE.match(re.sub(r"[\s\[\]]", "", text.lower()))
+    if found is None:
+        return 0.0, 0
+    number, milli, angle, per = found.groups()
+    turns = ANGLES[RADIAN if angle == "rad" else DEGREE] * float(number or 1.0) * (1e-3 if milli else 1.0)
+    return (turns / 60.0, 1) if per == "/min" else (turns, 1 if per == "/s" else 2)
 
 
 def written_unit(text: str) -> str:
@@ -135,19 +221,50 @@ def _times(number: float, base: str) -> str:
     return base if number == 1.0 else f"{number:.12g} {base}"
 
 
-def _scale(types: Mapping[Key, ODVariable]) -> tuple[dict[str, Key], str]:
-    """Return the objects that say how many units of position a turn of the motor has, and which they are."""
+def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tuple[dict[str, Key], int, Feed]:
+    """Return the objects that say how many units of position a turn of the motor has, or the number; and the feed."""
     feed = {"feed": (cia402.FEED_CONSTANT, 1), "feed_turns": (cia402.FEED_CONSTANT, 2)}
     gear = {"gear_motor": (cia402.GEAR_RATIO, 1), "gear_shaft": (cia402.GEAR_RATIO, 2)}
     encoder = {"encoder_increments": (cia402.ENCODER_RESOLUTION, 1), "encoder_turns": (cia402.ENCODER_RESOLUTION, 2)}
+    has_gear = all(key in types for key in gear.values())
     units, turns = _factory(types, feed)
-    motor, shaft = _factory(types, gear) if all(key in types for key in gear.values()) else (1, 1)
-    if units > 0 and turns > 0 and motor > 0 and shaft > 0 and units / turns * shaft / motor >= COARSEST:
-        has_gear = all(key in types for key in gear.values())
-        return feed | (gear if has_gear else {}), "6092h over 6091h" if has_gear else "6092h"
+    motor, shaft = _factory(types, gear) if has_gear else (1, 1)
+    geared = shaft / motor if motor > 0 and shaft > 0 else 0.0
+    position = _code(types, cia402.POSITION_UNIT)
+    angle = 1.0 / (position.prefix * ANGLES[position.numerator]) if position is not None and position.is_angle else 0.0
+    if units > 0 and turns > 0:
+        if units / turns * geared >= COARSEST:
+            if angle and not math.isclose(angle, units / turns, rel_tol=1e-3):
+                said = f"{_shown(types, cia402.POSITION_UNIT)} says {angle:g}"
+                notes.append(("60A8h", f"6092h counts, {units / turns:g} units a turn; {said}"))
+            source = "6092h over 6091h" if has_gear else "6092h"
+            return feed | (gear if has_gear else {}), 0, Feed(units / turns, source)
+        notes.append(("6092h", _too_coarse(units * shaft, turns * motor)))
+    if round(angle * geared) >= COARSEST:
+        if has_gear:
+            notes.append(("6091h", f"its factory's ratio is in the scale that 60A8h gives, {angle:g} units a turn of "
+                                   "the shaft; another ratio that is written changes nothing"))  # fmt: skip
+        if not math.isclose(round(angle * geared), angle * geared, rel_tol=1e-9):
+            notes.append(("60A8h", f"{angle * geared:.9g} units a turn are taken as {round(angle * geared)}"))
+        return {}, round(angle * geared), Feed(angle, "60A8h")
+    if angle:
+        notes.append(("60A8h", _too_coarse(f"{angle * geared:g}", 1)))
+    if position is not None and not angle and position.numerator not in (INCREMENTS, DIMENSIONLESS):
+        why = "is no angle: how many of it a turn has only 6092h tells"
+        notes.append(("60A8h", f"{_shown(types, cia402.POSITION_UNIT)} {why}"))
+    if has_gear:
+        why = "without a feed in 6092h positions are counts of the encoder at the motor: a gear changes nothing"
+        notes.append(("6091h", why))
     if all(key in types for key in encoder.values()):
-        return encoder, "608Fh"
-    return {}, ""
+        counts, per = _factory(types, encoder)
+        if counts <= 0 or per <= 0 or counts / per >= COARSEST:
+            return encoder, 0, Feed(0.0, "608Fh")
+        notes.append(("608Fh", _too_coarse(counts, per)))
+    return {}, 0, Feed(0.0, "")
+
+
+def _too_coarse(units: int | str, turns: int) -> str:
+    return f"{units} : {turns} is not taken: a position cannot be held by fewer than {COARSEST:g} units a turn"
 
 
 def _factory(types: Mapping[Key, ODVariable], roles: Mapping[str, Key]) -> tuple[int, int]:

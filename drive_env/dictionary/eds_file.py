@@ -21,7 +21,9 @@ from drive_env.dictionary.eds_values import (
     NODE_ID,
     OBJECT_TYPES,
     TYPE_NAMES,
+    float_of,
     is_plain,
+    is_plain_float,
     node_id_sum,
     number_of,
 )
@@ -32,6 +34,7 @@ VAR, RECORD = 7, 9
 SIGNED = {getattr(datatypes, f"INTEGER{bits}"): bits for bits in (8, 16, 24, 32, 40, 48, 56, 64)}
 UNSIGNED = {getattr(datatypes, f"UNSIGNED{bits}"): bits for bits in (8, 16, 24, 32, 40, 48, 56, 64)}
 UNSIGNED |= {datatypes.BOOLEAN: 1}
+FLOATS = (datatypes.REAL32, datatypes.REAL64)
 USER_TYPES = 0x1B  # data types above are those of the file itself (CiA 301)
 HEADERS = ("FileInfo", "DeviceInfo", "DeviceComissioning", "DummyUsage", "Comments", "MandatoryObjects",
            "OptionalObjects", "ManufacturerObjects")  # fmt: skip
@@ -254,6 +257,8 @@ class _Repairer:
         if data_type in SIGNED or data_type in UNSIGNED:
             assert data_type is not None, "None is no type"
             self._repair_numbers(name, row, data_type)
+        elif data_type in FLOATS:
+            self._repair_floats(name, row)
         for key in ("DefaultValue", "LowLimit", "HighLimit", "ParameterValue"):
             if row.get(key) == "":
                 del row[key]
@@ -311,6 +316,19 @@ class _Repairer:
                 self._tell(f"[{name}]", f"{key}={text} is read as {value}")
             row[key] = str(value)
         self._check_limits(name, row)
+
+    def _repair_floats(self, name: str, row: Section) -> None:
+        for key in ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit"):
+            text = row.get(key, "")
+            if text == "":
+                continue
+            value = float_of(text)
+            if value is None:
+                self._tell(f"[{name}]", f"{key}={text} is no value of its type, and was left out")
+                del row[key]
+            elif not is_plain_float(text):
+                self._tell(f"[{name}]", f"{key}={text} is read as {value!r}")
+                row[key] = repr(value)
 
     def _check_limits(self, name: str, row: Section) -> None:
         lowest, highest = (number_of(row[key]) if key in row else None for key in ("LowLimit", "HighLimit"))

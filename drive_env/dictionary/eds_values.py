@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from canopen.objectdictionary import datatypes
@@ -55,6 +56,24 @@ def number_of(text: str) -> int | None:
 def is_plain(text: str) -> bool:
     """Return whether a number is written as CiA 306 has it: decimal without leading zeros, or 0x and digits."""
     return re.fullmatch(r"[+-]?(0x[0-9a-fA-F]+|0|[1-9][0-9]*)", text.strip(), re.IGNORECASE) is not None
+
+
+def float_of(text: str) -> float | None:
+    """Return the real number that a text is, None for none: 25.5, 25,5 (one comma and no point), 1e-3."""
+    text = text.strip().strip('"').replace(" ", "")
+    if text.count(",") == 1 and "." not in text:
+        text = text.replace(",", ".")
+    try:
+        value = float(text)
+    except ValueError:
+        number = number_of(text)
+        return None if number is None else float(number)
+    return value if math.isfinite(value) else None
+
+
+def is_plain_float(text: str) -> bool:
+    """Return whether a real number is written as python reads it: an optional point and exponent."""
+    return re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", text.strip()) is not None
 
 
 class NodeIdSum:

@@ -17,6 +17,7 @@ from drive_env.devices import Device
 from drive_env.dictionary import units
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_in_range, check_readable, check_writable, checked_values
+from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
@@ -43,6 +44,8 @@ Key = tuple[int, int]
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 MODE_OF_OPERATION, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
+ERROR_CODE = (cia402.ERROR_CODE, 0)
+FAULT_FIELD = "fault"  # row of the cause that holds an axis in fault, plus 1
 
 
 class LiveDictionary:
@@ -136,6 +139,8 @@ class LiveDictionary:
 
     def unbound(self, entry: Entry) -> Integers | str:
         """Return the values of an object that no field of the record is, one per axis, not a copy; or its text."""
+        if self._is_error_code(entry):
+            return self._error_codes(np.asarray(get_lanes(self._records, FAULT_FIELD, self.num_axes), np.int64))
         return self._values[entry.index, entry.sub]
 
     def stored(self, axis: int) -> dict[tuple[int, int], int]:
@@ -215,11 +220,15 @@ class LiveDictionary:
         key = (entry.index, entry.sub)
         if key in self.device.parts:
             key = self.device.parts[key].of[0]
+        if self._is_error_code(entry):
+            return code_of(entry, Binding(*key, FAULT_FIELD))
         return self.codes.get(key)
 
     def recorded(self, entry: Entry, code: Code, values: Floats) -> Integers:
         """Return what an object was, of SI values of where `recordable` has it, axes last."""
         raw = self.to_od(code, values)
+        if self._is_error_code(entry):
+            return self._error_codes(raw)
         return self.part(entry, lambda _: raw) if (entry.index, entry.sub) in self.device.parts else raw
 
     def plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
@@ -351,8 +360,22 @@ class LiveDictionary:
             return self.to_od(code, get_lanes(self._records, code.field, self.num_axes, code.part).astype(float))
         if (entry.index, entry.sub) in self.device.parts:
             return self.part(entry)
+        if self._is_error_code(entry):
+            return self._error_codes(np.asarray(get_lanes(self._records, FAULT_FIELD, self.num_axes), np.int64))
         stored = self._values[entry.index, entry.sub]
         return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
+
+    def _is_error_code(self, entry: Entry) -> bool:
+        return (entry.index, entry.sub) == ERROR_CODE and not self._is_bound(entry)
+
+    def _error_codes(self, faults: Integers) -> Integers:
+        """Return 603Fh: the emergency code of what holds an axis in fault, 0 of one in none; axes last."""
+        codes = np.zeros(faults.shape, np.int64)
+        for row in np.unique(faults[faults > 0]):
+            emergency = self.device.emergencies[self.device.firmware.causes[int(row) - 1].name]
+            of_axis = [emergency.of_axis(axis % self.device.num_axes).code for axis in range(self.num_axes)]
+            codes = np.where(faults == row, of_axis, codes)
+        return codes
 
     def to_od(self, code: Code, value: Floats) -> Integers:
         """Return integers on the wire of SI values; axes are the last dimension."""
