@@ -99,8 +99,9 @@ def studio(
                 webbrowser.open(url)
 
         server.serve_studio(session, pages, sock, listen, ticket, ready)
-        if session.state == "failed":
+        if session.failure:
             raise RuntimeError(session.failure)
+        print("drive-env: stopped", flush=True)
 
 
 def check_extra() -> None:

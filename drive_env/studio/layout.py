@@ -13,6 +13,7 @@ from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
+SCRIPTS = ("studio", "scope", "dictionary")
 REFRESH = 0.2  # s between two looks at the session
 # Of a state: the class of its colour and a sign, for who sees no colours.
 LOOKS = {
@@ -39,9 +40,8 @@ def state_name(state: State | None) -> str:
 def frame(session: Session, visitor: Visitor, pages: Sequence[StudioPage], page: StudioPage) -> None:
     """Make a page: its frame, and its content once the drives are open."""
     ui.colors(**COLOURS)
-    ui.add_head_html(
-        '<link rel="stylesheet" href="/studio/assets/studio.css"><script src="/studio/assets/studio.js"></script>'
-    )
+    scripts = "".join(f'<script src="/studio/assets/{name}.js"></script>' for name in SCRIPTS)
+    ui.add_head_html(f'<link rel="stylesheet" href="/studio/assets/studio.css">{scripts}')
     ui.run_javascript(f"studio.start({visitor.id!r})")
     drawer = _navigation(visitor, pages, page)
     _header(session, visitor, drawer, page)
@@ -111,7 +111,10 @@ def _header(session: Session, visitor: Visitor, drawer: ui.left_drawer, page: St
         theme.on("click", js_handler="() => studio.theme()").tooltip("Light, dark, or as the computer has it")
 
     def show() -> None:
-        _show_state(visitor.state, chip, sign, text, mode)
+        if session.state == "open":
+            _show_state(visitor.state, chip, sign, text, mode)
+        else:
+            text.set_text({"opening": "opening", "failed": "no drives"}.get(session.state, "closed"))
 
     ui.timer(REFRESH, show)
 
@@ -147,8 +150,8 @@ def _job_chip(session: Session) -> None:
 
     def show() -> None:
         job = session.job
-        row.set_visibility(job is not None)
-        if job is not None:
+        row.set_visibility(job is not None and not job.quiet)
+        if job is not None and not job.quiet:
             share = "" if job.progress is None else f" {100 * job.progress:.0f} %"
             text.set_text(f"{job.title}{share}{': ' + job.told if job.told else ''}")
 

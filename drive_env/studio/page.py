@@ -45,9 +45,10 @@ class StudioPage:
 def studio_pages(*, emulated: bool) -> list[StudioPage]:
     """Return the pages in their order; one that cannot be loaded is left out, and logged."""
     from drive_env.studio.axes_page import page as axes
+    from drive_env.studio.dictionary_page import page as dictionary
     from drive_env.studio.scope_page import page as scope
 
-    found = [axes, scope]
+    found = [axes, scope, dictionary]
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         try:
             found.append(entry.load())

@@ -99,7 +99,6 @@ class ScopePanel:
 
     def build(self) -> None:
         """Make it."""
-        ui.add_head_html('<script src="/studio/assets/scope.js"></script>')
         _views[self._visitor.id] = self._view
         self._visitor.client.on_delete(self._leave)
         self._want()

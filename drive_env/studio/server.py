@@ -7,6 +7,7 @@ import errno
 import json
 import logging
 import os
+import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
@@ -200,6 +201,10 @@ def serve_studio(
     web = web_app(studio, host, port, token)
     config = uvicorn.Config(web, log_level="warning", timeout_graceful_shutdown=GRACE, lifespan="on")
     server = StudioServer(config, session.stop_now)
+    hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed ends it as Ctrl-C does
+    before = None if hang_up is None else signal.getsignal(hang_up)
+    if hang_up is not None and before is not signal.SIG_IGN:
+        signal.signal(hang_up, server.handle_exit)
     session.start()
     try:
         ready()
@@ -208,3 +213,5 @@ def serve_studio(
     finally:
         session.close()
         sock.close()
+        if hang_up is not None:
+            signal.signal(hang_up, before)

@@ -23,6 +23,7 @@ from drive_env import cia402
 from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
+from drive_env.master.parameters import read_parameters
 from drive_env.master.quantities import Scale
 from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
@@ -30,6 +31,7 @@ from drive_env.studio.presence import Presence
 from drive_env.studio.recorder import Key, ScopeRecorder
 from drive_env.studio.sentences import sentence
 from drive_env.studio.shared_drives import PIECE, SharedDrives
+from drive_env.studio.single_axes import SingleAxes
 
 if TYPE_CHECKING:
     from drive_env.master.description import Description
@@ -42,6 +44,7 @@ Mask = NDArray[np.bool_]
 RETRY = 0.5  # s after which a bus that failed is asked again
 STOP_WAIT = 3.0  # s that axes get to come to rest before their voltage is taken away
 KEPT = 200  # events
+TOLD_ONCE = 0.5  # s within which one more wish to stop is the same one
 PATIENCE = 10.0  # s for the thread to end
 
 
@@ -62,6 +65,7 @@ class Job:
         title: What it does, in a few words.
         page: The page that wants it.
         paced: Whether emulated time passes in real time meanwhile.
+        quiet: Whether pages do not show it.
         progress: Share that is done, None where it is not known.
         told: What it says of itself.
         stopped: Why it shall end; empty while it may go on.
@@ -71,6 +75,7 @@ class Job:
     title: str
     page: str
     paced: bool
+    quiet: bool
     future: Future[Any] = field(default_factory=Future)
     progress: float | None = None
     told: str = ""
@@ -91,6 +96,7 @@ class Session:
         failure: Why it failed.
         presence: The pages there are.
         recorder: What is sampled.
+        stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
     """
 
     def __init__(self, open_drives: Callable[[], Drives], title: str, description: Description) -> None:
@@ -100,6 +106,7 @@ class Session:
         self.failure = ""
         self.presence = Presence()
         self.recorder = ScopeRecorder(1, description.cycle)
+        self.stored: dict[int, dict[Key, int]] = {}
         self.events: deque[SessionEvent] = deque(maxlen=KEPT)
         self.num_events = 0
         self._open = open_drives
@@ -111,7 +118,7 @@ class Session:
         self._current: Job | None = None
         self._stop_asked: str = ""
         self._is_closing = False
-        self._failed_at = 0.0
+        self._failed_at = self._told_at = -1e9
         self._sampled: dict[str, tuple[Key, ...]] = {}
         self._is_left = False  # whether an axis was switched off since no page is there
         self._thread = threading.Thread(target=self._run, name="drive studio", daemon=True)
@@ -132,7 +139,9 @@ class Session:
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
 
-    def do(self, function: Callable[[Drives], T], title: str, *, page: str = "", paced: bool = True) -> Future[T]:
+    def do(
+        self, function: Callable[[Drives], T], title: str, *, page: str = "", paced: bool = True, quiet: bool = False
+    ) -> Future[T]:
         """Have a function of the drives run in their thread, after those that were asked for before.
 
         Args:
@@ -140,11 +149,12 @@ class Session:
             title: What it does, in a few words: "Move axis 0".
             page: Who wants it.
             paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
+            quiet: Whether pages do not show it: one of many that only read.
 
         Returns:
             What it returns, or raises: `JobEndedError` if it was stopped.
         """
-        job = Job(function, title, page, paced)
+        job = Job(function, title, page, paced, quiet)
         with self._waiting:
             if self._is_closing or self.state in ("failed", "closed"):
                 job.future.set_exception(RuntimeError(self.failure or "the drives are closed; start the studio again"))
@@ -255,6 +265,7 @@ class Session:
             self._states = AxisStates(self._real, self.description)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
+            self._read_stored()
             self.state = "open"
             while not self._is_closing:
                 job = self._next()
@@ -267,6 +278,13 @@ class Session:
             logger.error("the session ends: %s", self.failure)
         finally:
             self._end()
+
+    def _read_stored(self) -> None:
+        """Read the parameters of every axis: after a start they are what the drive has stored."""
+        assert self._drives is not None
+        axes = SingleAxes(self._drives, self.description).as_bus()
+        for axis in range(self.num_axes):
+            self.stored[axis] = read_parameters(axes, axis)
 
     def _end(self) -> None:
         real = self._real
@@ -351,7 +369,10 @@ class Session:
         """Do what `stop_now` asks of this thread."""
         reason, self._stop_asked = self._stop_asked, ""
         self._stop(np.ones(self.num_axes, bool))
-        self.say("warning", f"quick stop: {reason}")
+        now = time.monotonic()
+        if now - self._told_at > TOLD_ONCE:  # a page has two ways to ask
+            self.say("warning", f"quick stop: {reason}")
+        self._told_at = now
 
     def _leave_alone(self, job: Job | None) -> None:
         """Stop and disable everything, since nobody looks at an axis that is enabled."""

@@ -45,9 +45,11 @@ class Visitor:
         axes = self.session.axes
         return axes[self.axis] if self.axis < len(axes) else None
 
-    async def do(self, function: Callable[[Drives], T], title: str, *, paced: bool = True) -> T | None:
+    async def do(
+        self, function: Callable[[Drives], T], title: str, *, paced: bool = True, quiet: bool = False
+    ) -> T | None:
         """Have a job run and return what it returns; None where it failed, which the page has been told then."""
-        future = self.session.do(function, title, page=self.id, paced=paced)
+        future = self.session.do(function, title, page=self.id, paced=paced, quiet=quiet)
         try:
             return await asyncio.wrap_future(future)
         except Exception as error:

@@ -41,7 +41,7 @@
 
   // --- quick stop -----------------------------------------------------------------------------------------------
   studio.stop = () => {
-    release();
+    forget();
     send({ k: "stop" });
     // A second way, which needs no open line.
     fetch("/studio/quick-stop", { method: "POST", keepalive: true }).catch(() => {});
@@ -95,6 +95,9 @@
   function release() {
     if (!studio.held) return;
     send({ k: "release", hold: studio.held });
+    forget();
+  }
+  function forget() {
     studio.held = 0;
     if (holder) holder.classList.remove("is-held");
     holder = null;
