@@ -340,8 +340,8 @@ def _choices(session: Session) -> dict[tuple[int, int], Entry]:
 
 
 def _response(labels: list[str]) -> str | None:
-    """Return the channel whose step is measured most: the velocity."""
-    return next((one for one in labels if "elocity actual" in one), labels[0] if labels else None)
+    """Return the channel whose step is measured most: the position, which a move leaves at another place."""
+    return next((one for one in labels if "osition actual" in one), labels[0] if labels else None)
 
 
 page = StudioPage("/scope", "Scope", "show_chart", 20, build, attach=attach)
