@@ -1,9 +1,7 @@
-"""The pages of the studio: rows of this package, and those that others register in `drive_env.studio_pages`."""
+"""A page of the studio, as a row: where it is, what it is called, and what makes it."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,10 +11,6 @@ if TYPE_CHECKING:
 
     from drive_env.studio.session import Session
     from drive_env.studio.visitor import Visitor
-
-logger = logging.getLogger(__name__)
-
-ENTRY_POINTS = "drive_env.studio_pages"
 
 
 @dataclass(frozen=True)
@@ -40,22 +34,3 @@ class StudioPage:
     build: Callable[[Session, Visitor], None]
     emulated_only: bool = False
     attach: Callable[[FastAPI, Session], None] | None = None
-
-
-def studio_pages(*, emulated: bool) -> list[StudioPage]:
-    """Return the pages in their order; one that cannot be loaded is left out, and logged."""
-    from drive_env.studio.axes_page import page as axes
-    from drive_env.studio.dictionary_page import page as dictionary
-    from drive_env.studio.scope_page import page as scope
-
-    found = [axes, scope, dictionary]
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        try:
-            found.append(entry.load())
-        except ImportError as error:
-            logger.warning("the page %s is left out: %s", entry.name, error)
-    paths = [page.path for page in found]
-    if twice := {path for path in paths if paths.count(path) > 1}:
-        raise ValueError(f"two pages register {', '.join(sorted(twice))}; uninstall one of them, or rename its path")
-    chosen = [page for page in found if emulated or not page.emulated_only]
-    return sorted(chosen, key=lambda page: (page.order, page.title))
