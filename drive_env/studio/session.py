@@ -265,7 +265,7 @@ class Session:
             if self._real.bus is not None:
                 self.description = self._real.bus.description  # which knows the time between two SYNCs
             self.recorder = ScopeRecorder(self._real.num_axes, self.description.cycle)
-            self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear)
+            self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear, self.presence.moves)
             self._states = AxisStates(self._real, self.description)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
