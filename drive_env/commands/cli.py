@@ -29,6 +29,7 @@ from drive_env.commands.scan import scan
 from drive_env.commands.scope import scope
 from drive_env.commands.serve import serve
 from drive_env.commands.signed_values import SignedValues
+from drive_env.commands.studio import studio
 
 app = typer.Typer(
     name="drive-env",
@@ -39,6 +40,7 @@ app = typer.Typer(
 )
 
 PANELS = {
+    "A page for drives": (("studio", studio),),
     "Drives on a bus": (
         ("scan", scan),
         ("get", get),

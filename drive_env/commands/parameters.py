@@ -80,7 +80,7 @@ def backup(
         with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
             _check_axis(drives, axis)
             values = read_parameters(drives, axis)
-            text = sealed(_toml(drives, axis, values))
+            text = sealed(parameters_text(drives, axis, values))
         if str(file) == "-":
             print(text, end="")
             return
@@ -163,7 +163,7 @@ def restore(
     with errors_as_exit_codes():
         known = describe(device, eds)
         wanted = load_parameters(file, known.dictionary)
-        written, axis_then = _check_file(file, unchecked=unchecked)
+        written, axis_then = checked_origin(file, unchecked=unchecked)
         check_no_commands(wanted, file, known.hints)
         bus = _Bus(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout)
 
@@ -300,7 +300,7 @@ def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, 
     print(f"{len(differences)} parameters would be written to node {node}{kept} (dry run: nothing was written)")
 
 
-def _check_file(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
+def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
     """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
     from drive_env.master.identity import load_identity
     from drive_env.whole_file import check_seal
@@ -319,7 +319,7 @@ def _tell_of_changes(file: Path) -> None:
     from drive_env.whole_file import FileChangedError
 
     try:
-        _check_file(file, unchecked=False)
+        checked_origin(file, unchecked=False)
     except FileChangedError as error:
         print(f"drive-env: note: {error}", file=sys.stderr)
 
@@ -342,7 +342,7 @@ def _check_axis(drives: BusDrives, axis: int) -> None:
         raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
 
 
-def _toml(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
+def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
     """Return parameters as TOML; the objects' names are comments, their index is what counts."""
     from drive_env.master.identity import read_identity
     from drive_env.whole_file import FORMAT

@@ -392,6 +392,17 @@ class Envelope:
                 self._stops.begin(self._axes.may_turn, holds=False)
             self._watch.await_stop(ends=True)
 
+    def stop_at_once(self, reason: str) -> None:
+        """Have what is live quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
+
+        Any thread may call it; it returns at once. The program gets a SafetyError at its next call, or in the one that
+        is under way. An axis that a weight pulls is held, as after a limit was passed.
+
+        Args:
+            reason: What the error says.
+        """
+        self._watch.ask_to_stop(reason)
+
     def close(self) -> None:
         """Stop what is live; give the drives back what they had, and their watchdogs, once they are proved off."""
         if self._is_ours():

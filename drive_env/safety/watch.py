@@ -89,6 +89,7 @@ class Watch:
         self._alive = time.monotonic()
         self._pending: SafetyError | None = None  # to be raised in the program's thread
         self._told_at = -math.inf  # when a signal told the program to end [s]
+        self._asked: str | None = None  # why another thread wants everything stopped
         self.booted: set[int] = set()
         self._is_restart_told = False
 
@@ -114,6 +115,7 @@ class Watch:
         self._stops.current = None
         self._watchdogs.end()
         self._told_at = -math.inf
+        self._asked = None
 
     def raise_pending(self) -> None:
         """Raise once what the supervisor had to do meanwhile."""
@@ -131,6 +133,13 @@ class Watch:
         self._told_at = time.monotonic()
         if self._supervisor is not None:
             self._supervisor.wake()
+
+    def ask_to_stop(self, reason: str) -> None:
+        """Have what is live stopped at the supervisor's next turn; callable from any thread."""
+        supervisor = self._supervisor
+        if supervisor is not None:  # without one nothing is live, and what is enabled later is not meant
+            self._asked = reason
+            supervisor.wake()
 
     def carry_on(self) -> None:
         """Have the program told that a signal has stopped it, since it goes on."""
@@ -319,6 +328,9 @@ class Watch:
         if self.is_told_to_end and self._axes.may_turn.any():
             with self._axes.lock:
                 self._stops.begin(self._axes.may_turn, holds=False)
+        asked, self._asked = self._asked, None
+        if asked is not None and self._axes.may_turn.any():
+            self._stops.stop_for(asked, "enable them again to go on")
 
     def _go_on_stopping(self) -> None:
         with self._axes.lock:

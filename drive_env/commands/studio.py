@@ -1,0 +1,162 @@
+"""`drive-env studio`: a web page for drives, emulated or on a bus."""
+
+from __future__ import annotations
+
+import importlib.util
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drive_env.commands.options import (
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Nodes,
+    Timeout,
+    check_time,
+    connect,
+    cycle_for,
+    errors_as_exit_codes,
+    names_a_bus,
+    was_typed,
+)
+from drive_env.commands.scope import refuse_other_masters
+
+if TYPE_CHECKING:
+    from drive_env.drives.interface import Drives
+    from drive_env.master.description import Description
+
+OF_EMULATED = ("load", "motor", "seed", "factory")
+
+
+def studio(
+    context: typer.Context,
+    device: DeviceName = "tmcm1636",
+    load: Annotated[str, typer.Option(help="Load of the emulated machine, a name or an MJCF file.")] = "two_mass",
+    motor: Annotated[
+        str | None, typer.Option(help="Its motor, a name or a TOML file; the device's usual one by default.")
+    ] = None,
+    factory: Annotated[bool, typer.Option("--factory", help="Emulated drives with factory values.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of everything random in the emulated machine.")] = 0,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    port: Annotated[int, typer.Option(help="TCP port of the page; 0 for a free one.")] = 29640,
+    listen: Annotated[
+        str, typer.Option(help="Address of the page; any but loopback lets the network in, with a token.")
+    ] = "127.0.0.1",
+    token: Annotated[
+        str | None, typer.Option(help="Token of other addresses, 12 letters or more; one is made if none is given.")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+) -> None:
+    """Show drives on a local web page: state, motion, scope, dictionary; and what tuning and agents add.
+
+    Emulated drives, unless --interface, --channel or --node names those of a bus. The safety envelope is on. Quick stop
+        is a button and the space bar of every page; a page that is closed, or asleep, stops what it moves.
+    """
+    with errors_as_exit_codes():
+        check_extra()
+        from drive_env.master.description import describe
+        from drive_env.studio import server
+        from drive_env.studio.gate import checked_token, is_loopback, new_token
+        from drive_env.studio.pages import studio_pages
+        from drive_env.studio.session import Session
+
+        check_time("--duration", duration)
+        is_bus = names_a_bus(context) or eds is not None
+        if wrong := [name for name in OF_EMULATED if was_typed(context, name) and is_bus]:
+            raise ValueError(f"--{wrong[0]} is of an emulated machine, and a bus is named: leave one of them out")
+        if not 0 <= port <= 65_535:
+            raise ValueError(f"--port {port} must be 0 to 65535")
+        if not listen:
+            raise ValueError("--listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in")
+        described = describe(device, eds)
+        opener = (
+            _bus(described, interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout)
+            if is_bus
+            else _machine(device, load, motor, factory, seed)
+        )
+        title = _title(described, interface, channel, node) if is_bus else f"{device}, emulated, load {load}"
+        session = Session(opener, title, described)
+        pages = studio_pages(emulated=not is_bus)
+        if is_loopback(listen) and token is None:
+            ticket = None
+        else:
+            ticket = new_token() if token is None else checked_token(token)
+        sock = server.listen(listen, port)
+        url = server.address(listen, sock.getsockname()[1], ticket)
+
+        def ready() -> None:
+            print(f"drive-env: {title}: {url}", flush=True)
+            print("drive-env: stop with Ctrl-C", flush=True)
+            if browser:
+                webbrowser.open(url)
+
+        server.serve_studio(session, pages, sock, server.ServingTerms(listen, ticket, duration), ready)
+        if session.error is not None:
+            raise session.error
+        if session.failure:
+            raise RuntimeError(session.failure)
+        print("drive-env: stopped", flush=True)
+
+
+def check_extra() -> None:
+    """Raise ValueError where the studio's packages are not installed."""
+    if importlib.util.find_spec("nicegui") is None:
+        raise ValueError("the studio needs NiceGUI, which is not installed: pip install 'drive-env[studio]'")
+
+
+def _machine(device: str, load: str, motor: str | None, factory: bool, seed: int) -> Callable[[], Drives]:
+    """Return what opens an emulated machine; ValueError for one that cannot be."""
+    from drive_env.devices import find_device
+    from drive_env.motors import find_motor
+    from mechanics.loads import find_load
+
+    known = find_device(device)
+    known.check_motor(find_motor(known.default_motor if motor is None else motor))
+    find_load(load)
+
+    def open_machine() -> Drives:
+        from drive_env.emulator.emulated_drives import EmulatedDrives
+
+        return EmulatedDrives(device, load, motor, seed=seed, commissioned=not factory)
+
+    return open_machine
+
+
+def _bus(
+    described: Description,
+    interface: str | None,
+    channel: str | None,
+    nodes: list[int] | None,
+    device: str,
+    eds: Path | None,
+    **options: Any,
+) -> Callable[[], Drives]:
+    """Return what opens drives of a bus, with the envelope; where another master commands them it raises."""
+
+    def open_bus() -> Drives:
+        refuse_other_masters(interface, channel, nodes, options["bitrate"])
+        return connect(interface, channel, nodes, device, eds, cycle=cycle_for(described), **options)
+
+    return open_bus
+
+
+def _title(described: Description, interface: str | None, channel: str | None, nodes: list[int] | None) -> str:
+    from drive_env.master.open_drives import default_nodes
+
+    where = " ".join(filter(None, (interface, channel))) or "the bus"
+    numbers = ", ".join(map(str, nodes or default_nodes(interface)))
+    return f"{described.name}, node {numbers} on {where}"

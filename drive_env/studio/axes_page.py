@@ -1,0 +1,249 @@
+"""The page Axes: state machine, mode, motion, faults with cause and remedy, switches and temperatures of one axis."""
+
+from __future__ import annotations
+
+import time
+
+from nicegui import ui
+from nicegui.events import GenericEventArguments
+
+from drive_env import cia402
+from drive_env.cia402 import State
+from drive_env.studio import motion_jobs
+from drive_env.studio.axis_states import MODE_NAMES, AxisState, ShownQuantity
+from drive_env.studio.page import StudioPage
+from drive_env.studio.session import Session
+from drive_env.studio.state_diagram import ARROWS, diagram
+from drive_env.studio.visitor import Visitor
+
+REFRESH = 0.1  # s
+BITS = (  # of the statusword, that people ask for
+    ("Target reached", cia402.TARGET_REACHED),
+    ("Internal limit active", cia402.INTERNAL_LIMIT),
+    ("Warning", cia402.WARNING),
+    ("Takes commands (remote)", cia402.REMOTE),
+)
+
+
+def build(session: Session, visitor: Visitor) -> None:
+    """Make the page."""
+    with ui.element("div").classes("studio-grid"):
+        with ui.element("div").classes("studio-stack"):
+            _state_card(session, visitor)
+        with ui.element("div").classes("studio-stack"):
+            _motion_card(visitor)
+            _move_card(session, visitor)
+        with ui.element("div").classes("studio-stack"):
+            _fault_card(session, visitor)
+            _around_card(visitor)
+    ui.on("studio_command", lambda event: _command(event, visitor))
+
+
+async def _command(event: GenericEventArguments, visitor: Visitor) -> None:
+    word = int(event.args)
+    await visitor.do(motion_jobs.command(visitor.axis, word), f"Controlword {word:02X}h")
+
+
+def card(title: str, name: str) -> ui.card:
+    """Return a card with a heading; `name` is its class."""
+    made = ui.card().classes(f"studio-card {name}")
+    with made:
+        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
+    return made
+
+
+def _state_card(session: Session, visitor: Visitor) -> None:
+    with card("State (CiA 402)", "card-state"):
+        picture = ui.html(diagram(None), sanitize=False).classes("w-full")
+        with ui.row().classes("studio-buttons"):
+            modes = {name: f"{name}  {MODE_NAMES[name]}" for name in _modes(visitor.state)}
+            first = _first_mode(visitor.state)
+            mode = ui.select(modes, value=first, label="Mode of operation").props("dense outlined").classes("grow")
+            mode.props("data-test=mode")
+
+            async def enable() -> None:
+                await visitor.do(motion_jobs.enable(visitor.axis, str(mode.value)), f"Enable axis {visitor.axis}")
+
+            async def disable() -> None:
+                await visitor.do(motion_jobs.disable(visitor.axis), f"Disable axis {visitor.axis}")
+
+            async def select() -> None:
+                await visitor.do(motion_jobs.select_mode(visitor.axis, str(mode.value)), f"Mode {mode.value}")
+
+            ui.button("Set mode", on_click=select).props("outline no-caps").props("data-test=set-mode")
+            ui.button("Enable", icon="power", on_click=enable).props("unelevated no-caps color=positive").props(
+                "data-test=enable"
+            )
+            ui.button("Disable", icon="power_off", on_click=disable).props("outline no-caps").props("data-test=disable")
+        ui.label("Single transitions, also by a lit arrow:").classes("studio-label")
+        single = ui.row().classes("studio-buttons")
+    shown: list[object] = [object()]
+
+    def show() -> None:
+        state = visitor.state
+        if state is not None and state.state is not shown[0]:
+            shown[0] = state.state
+            picture.set_content(diagram(state.state))
+            single.clear()
+            with single:
+                _single_transitions(state.state)
+
+    ui.timer(REFRESH, show)
+
+
+def _single_transitions(state: State | None) -> None:
+    """Make a button for each transition that leaves a state by a command."""
+    leaving = [arrow for arrow in ARROWS if arrow.start is state and arrow.word is not None]
+    for arrow in leaving:
+        button = ui.button(f"{arrow.numbers} {arrow.name}").props("outline no-caps dense").classes("studio-transition")
+        button.props(f"data-command={arrow.word}")
+    if not leaving:
+        ui.label("None from this state: the drive goes on by itself.").classes("studio-hint")
+
+
+def _modes(state: AxisState | None) -> tuple[str, ...]:
+    return tuple(MODE_NAMES) if state is None else state.modes
+
+
+def _first_mode(state: AxisState | None) -> str:
+    """Return the mode that the axis is in, else the first that moves to places."""
+    modes = _modes(state)
+    if state is not None and state.mode in modes:
+        return state.mode
+    return "pp" if "pp" in modes else modes[0]
+
+
+def _motion_card(visitor: Visitor) -> None:
+    with card("Motion", "card-motion"):
+        values = _Values()
+        with ui.row().classes("studio-bits"):
+            bits = [(ui.label(f"○ {name}").classes("studio-bit"), name, bit) for name, bit in BITS]
+
+    def show() -> None:
+        state = visitor.state
+        if state is None:
+            return
+        values.show(state.motion)
+        for label, name, bit in bits:
+            is_set = state.has_bit(bit)
+            label.set_text(f"{'●' if is_set else '○'} {name}")
+            label.classes(add="is-set" if is_set else "", remove="" if is_set else "is-set")
+
+    ui.timer(REFRESH, show)
+
+
+class _Values:
+    """A list of quantities that are shown, each with its label and unit."""
+
+    def __init__(self) -> None:
+        self._box = ui.element("div").classes("studio-values")
+        self._rows: dict[str, tuple[ui.label, ui.label]] = {}
+
+    def show(self, quantities: tuple[ShownQuantity, ...]) -> None:
+        """Show quantities; the labels of new ones are added."""
+        for one in quantities:
+            if one.label not in self._rows:
+                with self._box:
+                    ui.label(one.label).classes("name")
+                    number, unit = ui.label("").classes("number"), ui.label(one.unit).classes("unit")
+                self._rows[one.label] = number, unit
+            number, unit = self._rows[one.label]
+            number.set_text("—" if one.value is None else f"{one.value:,.3f}".rstrip("0").rstrip("."))
+            unit.set_text(one.unit)
+
+
+def _move_card(session: Session, visitor: Visitor) -> None:
+    with card("Move", "card-move"):
+        ui.label("Jog: as long as you hold").classes("studio-label")
+        with ui.row().classes("studio-buttons"):
+            speed = ui.input("Jog speed", value=visitor.jog_speed, placeholder="60 rpm").props("dense outlined")
+            speed.classes("grow").bind_value(visitor, "jog_speed").props("data-test=jog-speed")
+            for text, icon, direction in (("Backwards", "fast_rewind", -1), ("Forwards", "fast_forward", 1)):
+                button = ui.button(text, icon=icon).props(f"no-caps outline data-jog={direction}")
+                button.classes("studio-jog").tooltip("Hold the button, or Enter while it has the focus")
+        ui.label("Move to a place, or by a distance").classes("studio-label")
+        with ui.row().classes("studio-buttons"):
+            goal = (
+                ui.input("Position or distance", value="1 rev")
+                .props("dense outlined")
+                .classes("grow")
+                .props("data-test=goal")
+            )
+            rate = ui.input("Speed (empty: the drive's)", placeholder="300 rpm").props("dense outlined")
+            rate.classes("grow").props("data-test=rate")
+
+            async def go(relative: bool) -> None:
+                what = f"Move axis {visitor.axis} {'by' if relative else 'to'} {goal.value}"
+                job = motion_jobs.move(session, visitor.axis, goal.value, rate.value or "", relative=relative)
+                await visitor.do(job, what)
+
+            async def home() -> None:
+                await visitor.do(motion_jobs.home(visitor.axis), f"Home axis {visitor.axis}")
+
+            ui.button("Move to", on_click=lambda: go(False)).props("unelevated no-caps").props("data-test=move-to")
+            ui.button("Move by", on_click=lambda: go(True)).props("unelevated no-caps").props("data-test=move-by")
+            ui.button("Home", icon="home", on_click=home).props("outline no-caps").props("data-test=home")
+        ui.label("Units: rev, deg, rad; rpm, rev/s, rad/s; an integer alone is in the drive's own unit.").classes(
+            "studio-hint"
+        )
+
+
+def _fault_card(session: Session, visitor: Visitor) -> None:
+    with card("Faults", "card-faults"):
+        box = ui.column().classes("w-full")
+
+        async def reset() -> None:
+            await visitor.do(motion_jobs.reset_fault(visitor.axis), f"Fault reset of axis {visitor.axis}")
+            state = visitor.state
+            if state is not None and not state.is_in_fault:
+                session.forget_faults(visitor.axis)
+
+        ui.button("Reset fault", icon="restart_alt", on_click=reset).props("outline no-caps").props("data-test=reset")
+    shown: list[object] = [object()]
+
+    def show() -> None:
+        state = visitor.state
+        if state is None or (state.faults, state.is_in_fault) == shown[0]:
+            return
+        shown[0] = (state.faults, state.is_in_fault)
+        box.clear()
+        with box:
+            _faults(state)
+
+    ui.timer(REFRESH, show)
+
+
+def _faults(state: AxisState) -> None:
+    if not state.faults:
+        unseen = "The axis is in fault; it told the cause before this page looked." if state.is_in_fault else "None."
+        ui.label(unseen).classes("studio-hint")
+    for fault in state.faults:
+        with ui.element("div").classes("studio-fault"):
+            when = time.strftime("%H:%M:%S", time.localtime(fault.at))
+            ui.label(f"▲ {fault.code:04X}h  {fault.text.name}  ({when})").classes("studio-strong")
+            ui.label(f"Cause: {fault.text.cause}")
+            ui.label(f"Remedy: {fault.text.remedy}")
+
+
+def _around_card(visitor: Visitor) -> None:
+    with card("Supply, temperature, switches", "card-around"):
+        values = _Values()
+        switches = ui.row().classes("studio-bits")
+    labels: dict[str, ui.label] = {}
+
+    def show() -> None:
+        state = visitor.state
+        if state is None:
+            return
+        values.show(state.slow)
+        for name, is_active in state.inputs.items():
+            if name not in labels:
+                with switches:
+                    labels[name] = ui.label("").classes("studio-bit")
+            labels[name].set_text(f"{'●' if is_active else '○'} {name}")
+            labels[name].classes(add="is-set" if is_active else "", remove="" if is_active else "is-set")
+
+    ui.timer(5 * REFRESH, show)
+
+
+page = StudioPage("/axes", "Axes", "settings_input_component", 10, build)

@@ -1,0 +1,248 @@
+"""What is known of every axis, for people: state, mode, motion, faults, switches, temperatures."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from drive_env import cia402
+from drive_env.cia402 import State
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.roles import Role
+from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.interface import Drives
+from drive_env.master.quantities import SHOWN, UNITS, Scale, find_unit
+from drive_env.studio.fault_texts import FaultText, fault_text
+from drive_env.studio.recorder import Key, ScopeRecorder
+from drive_env.studio.scales import axis_scales
+
+if TYPE_CHECKING:
+    from drive_env.master.description import Description
+
+SLOW = 0.5  # s between two readings of what changes slowly
+QUICK = 0.08  # s between two pictures of what is sampled
+SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+INPUTS = ("negative limit switch", "positive limit switch", "home switch")  # bits 0 to 2 of 60FDh
+MODE_NAMES = {
+    "pp": "profile position", "pv": "profile velocity", "tq": "profile torque", "hm": "homing",
+    "ip": "interpolated position", "csp": "cyclic synchronous position", "csv": "cyclic synchronous velocity",
+    "cst": "cyclic synchronous torque",
+}  # fmt: skip
+NO_FAULT = ("fault_reset", "error_reset")
+
+
+@dataclass(frozen=True)
+class ShownQuantity:
+    """A value of an object as people read it: label, number, unit; the number is None where it is not known."""
+
+    label: str
+    value: float | None
+    unit: str
+
+    def __str__(self) -> str:
+        if self.value is None:
+            return "—"
+        digits = f"{self.value:.6g}" if abs(self.value) < 1e6 else f"{self.value:.0f}"
+        return f"{digits} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class AxisFault:
+    """An emergency that stands: its code, its text, and when it came (time of day [s])."""
+
+    code: int
+    text: FaultText
+    at: float
+
+
+@dataclass(frozen=True)
+class AxisState:
+    """What is known of an axis.
+
+    Attributes:
+        axis: Its number, from 0.
+        name: What people call it.
+        status: Statusword 6041h.
+        state: That it shows; None where it shows none, or nothing was read yet.
+        mode: Mode of operation by its abbreviation; "" for none.
+        modes: Those that the drive has.
+        motion: Position, velocity, current as they are.
+        faults: Emergencies since the last reset.
+        inputs: Switches by name, and whether they are active.
+        slow: Temperatures, DC link and the like.
+    """
+
+    axis: int
+    name: str
+    status: int = 0
+    state: State | None = None
+    mode: str = ""
+    modes: tuple[str, ...] = ()
+    motion: tuple[ShownQuantity, ...] = ()
+    faults: tuple[AxisFault, ...] = ()
+    inputs: dict[str, bool] = field(default_factory=dict)
+    slow: tuple[ShownQuantity, ...] = ()
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether it is in operation enabled."""
+        return self.state is State.OPERATION_ENABLED
+
+    @property
+    def is_live(self) -> bool:
+        """Whether its power stage may be on."""
+        return bool(cia402.is_live(self.status))
+
+    @property
+    def is_in_fault(self) -> bool:
+        """Whether it is in fault."""
+        return self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
+
+    def has_bit(self, pattern: tuple[int, int]) -> bool:
+        """Return whether its statusword shows a pattern."""
+        return bool(cia402.matches(self.status, pattern))
+
+
+class AxisStates:
+    """Keeps what is known of the axes; refreshed by the thread of the drives, read by any.
+
+    Args:
+        drives: The drives.
+        description: Of their device.
+
+    Attributes:
+        axes: What is known, replaced as a whole.
+        scales: What the units of each axis follow.
+        sampled: Objects that are wanted of each cycle, the most important first.
+    """
+
+    def __init__(self, drives: Drives, description: Description) -> None:
+        self._known = description
+        self.scales: list[Scale] = axis_scales(drives, description)
+        self.sampled: tuple[Key, ...] = tuple((index, 0) for index in SAMPLED if description.has((index, 0)))
+        self._slow_at = self._quick_at = -1e9
+        self._slow_entries = [entry for entry in description.dictionary if _is_slow(entry, description)]
+        self._unreadable: set[Key] = set()
+        modes = self._modes(drives)
+        self.axes: tuple[AxisState, ...] = tuple(
+            AxisState(axis, axis_label(drives, description, axis), modes=modes) for axis in range(drives.num_axes)
+        )
+
+    def refresh(self, drives: Drives, recorder: ScopeRecorder) -> None:
+        """Look at the newest samples, and read what is due besides."""
+        now = time.monotonic()
+        if now - self._slow_at > SLOW:
+            self._slow_at = now
+            self._read_slow(drives)
+        if now - self._quick_at > QUICK:
+            self._quick_at = now
+            self._read_quick(drives, recorder)
+
+    def hear(self, message: EmergencyMessage) -> tuple[str, str]:
+        """Take note of an emergency; return how grave it is, and what it says."""
+        text = fault_text(message.name)
+        axis = self.axes[message.axis]
+        if message.code == 0 or message.name in NO_FAULT:
+            self._replace(message.axis, faults=())
+            return "info", f"{axis.name}: no error any more"
+        fault = AxisFault(message.code, text, time.time())
+        others = tuple(one for one in axis.faults if one.code != message.code)
+        self._replace(message.axis, faults=(*others, fault))
+        return "error", f"{axis.name}: {message.code:04X}h {text.name}. {text.cause} {text.remedy}"
+
+    def forget_faults(self, axis: int) -> None:
+        """Take note that the faults of an axis were reset."""
+        self._replace(axis, faults=())
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _replace(self, axis: int, **changes: Any) -> None:
+        self.axes = tuple(replace(one, **changes) if one.axis == axis else one for one in self.axes)
+
+    def _modes(self, drives: Drives) -> tuple[str, ...]:
+        """Return the modes that the drive says it has, by 6502h; all where it does not say."""
+        every = tuple(cia402.MODES)
+        try:
+            bits = int(drives.read((cia402.SUPPORTED_MODES, 0))[0])
+        except ObjectAccessError:
+            return every
+        return tuple(name for name in every if bits >> (cia402.MODES[name] - 1) & 1) or every
+
+    def _read_quick(self, drives: Drives, recorder: ScopeRecorder) -> None:
+        newest = recorder.newest()
+        missing = [key for key in self.sampled if key not in newest]
+        newest |= {key: drives.read(key) for key in missing}
+        for axis in range(drives.num_axes):
+            status = int(newest[cia402.STATUSWORD, 0][axis])
+            quantities = tuple(self._quantity(key, int(newest[key][axis]), axis) for key in self.sampled[1:])
+            state = cia402.state_of(status)
+            self._replace(axis, status=status, state=state, motion=quantities)
+
+    def _read_slow(self, drives: Drives) -> None:
+        shown = self._try(drives, (cia402.MODE_DISPLAY, 0))
+        inputs = self._try(drives, (cia402.DIGITAL_INPUTS, 0))
+        slow = {(e.index, e.sub): self._try(drives, (e.index, e.sub)) for e in self._slow_entries}
+        names = {number: name for name, number in cia402.MODES.items()}
+        for axis in range(drives.num_axes):
+            switches = {} if inputs is None else {name: bool(inputs[axis] >> k & 1) for k, name in enumerate(INPUTS)}
+            values = tuple(
+                self._quantity(key, int(found[axis]), axis) for key, found in slow.items() if found is not None
+            )
+            mode = "" if shown is None else names.get(int(shown[axis]), "")
+            values += _of_machine(drives, axis)
+            self._replace(axis, mode=mode, inputs=switches, slow=values)
+
+    def _try(self, drives: Drives, key: Key) -> Any:
+        """Return an object of every axis, None of one that the drive does not have."""
+        if key in self._unreadable:
+            return None
+        try:
+            return drives.read(key)
+        except ObjectAccessError:
+            self._unreadable.add(key)
+            return None
+
+    def _quantity(self, key: Key, raw: int, axis: int) -> ShownQuantity:
+        return quantity_of(self._known.dictionary.find(key), raw, self.scales[axis])
+
+
+def quantity_of(entry: Entry, raw: int, scale: Scale) -> ShownQuantity:
+    """Return an integer of an object in the unit that people read."""
+    unit = find_unit(entry.unit, scale)
+    if unit is None:
+        return ShownQuantity(entry.name, float(raw), entry.unit)
+    shown = SHOWN[unit.dimension]
+    return ShownQuantity(entry.name, raw * unit.factor / UNITS[shown].factor, shown)
+
+
+def axis_label(drives: Drives, description: Description, axis: int) -> str:
+    """Return what people call an axis: its node and its number there, or its number alone."""
+    if drives.bus is None:
+        return f"axis {axis}"
+    node, part = divmod(axis, description.num_axes)
+    return f"node {drives.bus.nodes[node]}" + (f" axis {part}" if description.num_axes > 1 else "")
+
+
+def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
+    """Return what an emulated machine tells besides the drive, nothing of a real one."""
+    if drives.machine is None:
+        return ()
+    winding, stage = drives.machine.temperatures
+    return (
+        ShownQuantity("Winding temperature (emulated)", round(float(winding[axis]), 1), "°C"),
+        ShownQuantity("Stage temperature (emulated)", round(float(stage[axis]), 1), "°C"),
+        ShownQuantity("Supply (emulated)", round(float(drives.machine.supply[axis]), 2), "V"),
+    )
+
+
+def _is_slow(entry: Entry, known: Description) -> bool:
+    """Return whether an object tells a temperature or a supply: DC link, analog inputs that the device names."""
+    if entry.bits is None or entry.access == "wo":
+        return False
+    analog = known.dictionary.roles.get(Role.ANALOG_INPUTS)
+    if analog is not None and entry.index == analog[0]:
+        return entry.sub > 0
+    if entry.index == cia402.DC_LINK_VOLTAGE:
+        return True
+    return "temperature" in entry.name.lower() and entry.access in ("ro", "const", "rwr")

@@ -1,0 +1,45 @@
+"""Many samples as few columns of pixels: each keeps its least and its greatest, so that no spike is lost."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Columns(NamedTuple):
+    """Columns of samples.
+
+    starts: Place of the first sample of each column, shape (columns,).
+    low, high: Least and greatest of each column, shape (columns, ...).
+    """
+
+    starts: NDArray[np.int64]
+    low: NDArray[Any]
+    high: NDArray[Any]
+
+
+def stride_of(count: int, columns: int) -> int:
+    """Return how many samples make a column, so that there are at most so many columns."""
+    return max(1, -(-count // max(1, columns)))
+
+
+def min_max(values: NDArray[Any], stride: int, first: int = 0) -> Columns:
+    """Return samples as columns whose borders do not move while samples come: multiples of the stride.
+
+    Args:
+        values: Samples, shape (n, ...).
+        stride: Samples of a column.
+        first: Number of the first sample since the beginning; a column begins where its number is a multiple.
+    """
+    count = len(values)
+    if count == 0:
+        return Columns(np.empty(0, np.int64), values, values)
+    begins = np.arange((-first) % stride, count, stride)
+    starts = begins if len(begins) and begins[0] == 0 else np.concatenate([[0], begins])
+    if stride == 1:
+        return Columns(starts, values, values)
+    low = np.minimum.reduceat(values, starts, axis=0)
+    high = np.maximum.reduceat(values, starts, axis=0)
+    return Columns(starts, low, high)

@@ -1,0 +1,43 @@
+"""Cause and remedy of each emergency, from the file that the page of messages is made of."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+_PACKAGE = Path(__file__).parents[1]
+# In a wheel it lies in the package; in a working copy it is where the documentation is made.
+_PLACES = (_PACKAGE / "messages.toml", _PACKAGE.parent / "docs" / "messages.toml")
+
+
+class FaultText(NamedTuple):
+    """What an emergency is called, why it comes, and what to do."""
+
+    name: str
+    cause: str
+    remedy: str
+
+
+@cache
+def _rows() -> dict[str, dict[str, str]]:
+    for place in _PLACES:
+        if place.is_file():
+            topics = tomllib.loads(place.read_text(encoding="utf-8"))["topic"]
+            return {row["emcy"]: row for topic in topics for row in topic["message"] if "emcy" in row}
+    return {}
+
+
+def fault_text(name: str) -> FaultText:
+    """Return the text of an emergency by the name that its device's table gives it."""
+    row = _rows().get(name, {})
+    row = _rows().get(row.get("same", ""), row)
+    unknown = "The drive's manual lists its code."
+    return FaultText(name.replace("_", " "), _plain(row.get("cause", unknown)), _plain(row.get("remedy", unknown)))
+
+
+def _plain(text: str) -> str:
+    """Return a text without the marks of Markdown."""
+    return re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text).replace("`", "")

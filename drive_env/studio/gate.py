@@ -1,0 +1,138 @@
+"""Who may use the studio: the host that is asked for, where a page comes from, and the token of other addresses.
+
+A page of another site must not command drives by the browser of whoever visits it: its requests carry its own Origin,
+and a name that it has pointed at this computer (DNS rebinding) is no host of ours. Where the studio is open to the
+network a token is asked for once, by the address that is printed, and kept in a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+import http.cookies
+import ipaddress
+import secrets
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Any]]
+Send = Callable[[Any], Awaitable[None]]
+
+COOKIE = "drive_env_studio"
+QUERY = "token"
+TOKEN_BYTES = 16  # of chance: 22 characters
+LEAST_TOKEN = 12  # characters
+LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address is reached from this computer alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def new_token() -> str:
+    """Return a token."""
+    return secrets.token_urlsafe(TOKEN_BYTES)
+
+
+def checked_token(token: str) -> str:
+    """Return a token; ValueError for one that is too short, or that an address cannot carry."""
+    if len(token) < LEAST_TOKEN or not all(letter.isalnum() or letter in "-_" for letter in token):
+        raise ValueError(
+            f"a token of {len(token)} characters is none: it takes {LEAST_TOKEN} or more letters, digits, - and _; "
+            "leave --token out, and one is made"
+        )
+    return token
+
+
+class StudioGate:
+    """Lets requests and websockets through that come from where they may.
+
+    Args:
+        app: What is behind.
+        host: The address that is listened on.
+        port: Its port.
+        token: What visitors must have; None on a loopback address.
+    """
+
+    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], host: str, port: int,
+                 token: str | None) -> None:  # fmt: skip
+        self._app = app
+        self._token = token
+        names = LOOPBACK_NAMES if is_loopback(host) else ()
+        self._hosts = {_with_port(name, port) for name in (*names, host)} if token is None else None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or pass it on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        refusal = self.refusal(headers)
+        if not refusal and self._token is not None and not self._has_cookie(headers):
+            if scope["type"] == "http" and self._asks_in(scope):
+                await _redirect(scope, self._token, send)
+                return
+            refusal = 401, "This studio needs a token: open the address that drive-env studio has printed."
+        if not refusal:
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 4400 + refusal[0] % 100, "reason": refusal[1][:100]})
+        else:
+            await _answer(send, *refusal)
+
+    def refusal(self, headers: MutableMapping[str, str]) -> tuple[int, str] | None:
+        """Return why a request is refused by its Host and Origin; None for one that may come."""
+        host = headers.get("host", "").lower()
+        if self._hosts is not None and host not in self._hosts:
+            return (
+                421,
+                f"There is no studio named {host or 'nothing'}: open the address that drive-env studio has printed.",
+            )
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin.lower()).netloc != host:
+            return 403, f"Pages of {origin} may not use this studio."
+        return None
+
+    def _has_cookie(self, headers: MutableMapping[str, str]) -> bool:
+        try:
+            jar = http.cookies.SimpleCookie(headers.get("cookie", ""))
+        except http.cookies.CookieError:
+            return False
+        return COOKIE in jar and self._is_token(jar[COOKIE].value)
+
+    def _asks_in(self, scope: Scope) -> bool:
+        query = dict(parse_qsl(scope["query_string"].decode("latin-1")))
+        return self._is_token(query.get(QUERY, ""))
+
+    def _is_token(self, given: str) -> bool:
+        return self._token is not None and hmac.compare_digest(given.encode(), self._token.encode())
+
+
+def _with_port(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+async def _redirect(scope: Scope, token: str, send: Send) -> None:
+    """Give the cookie, and have the token vanish from the address."""
+    query = [(k, v) for k, v in parse_qsl(scope["query_string"].decode("latin-1")) if k != QUERY]
+    where = scope["path"] + (f"?{urlencode(query)}" if query else "")
+    headers = [
+        (b"location", where.encode()),
+        (b"set-cookie", f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Lax".encode()),
+    ]
+    await send({"type": "http.response.start", "status": 303, "headers": headers})
+    await send({"type": "http.response.body", "body": b""})
+
+
+async def _answer(send: Send, status: int, text: str) -> None:
+    headers = [(b"content-type", b"text/plain; charset=utf-8")]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": text.encode()})

@@ -1,0 +1,213 @@
+"""What the page Axes asks of the drives, each a job: a function of the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.access import check_limits
+from drive_env.drives import motion
+from drive_env.drives.interface import Drives
+from drive_env.master import quantities
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectName
+    from drive_env.master.description import Description
+    from drive_env.studio.session import Session
+
+Mask = NDArray[np.bool_]
+MotionJob = Callable[[Drives], None]
+
+LONGEST_MOVE = 600.0  # s
+
+
+def masks_of(num_axes: int, axis: int) -> Mask:
+    """Return the mask of one axis of so many."""
+    return np.asarray(np.arange(num_axes) == axis)
+
+
+def turned_round(speed: str, direction: int) -> str:
+    """Return a speed as text, forwards for +1, backwards for -1."""
+    text = speed.strip()
+    if direction >= 0:
+        return text
+    return text[1:] if text.startswith("-") else f"-{text.removeprefix('+')}"
+
+
+def only(drives: Drives, axis: int) -> Mask:
+    """Return the mask of one axis."""
+    return masks_of(drives.num_axes, axis)
+
+
+def enable(axis: int, mode: str) -> MotionJob:
+    """Return the job that enables an axis in a mode."""
+
+    def job(drives: Drives) -> None:
+        where = only(drives, axis)
+        _stay(drives, where, mode)
+        motion.enable(drives, mode=mode, where=where, timeout=3.0)
+
+    return job
+
+
+def disable(axis: int) -> MotionJob:
+    """Return the job that brings an axis to rest and switches it off."""
+
+    def job(drives: Drives) -> None:
+        where = only(drives, axis)
+        if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
+            motion.quick_stop(drives, where=where)
+            _await_rest(drives, axis)
+        motion.disable(drives, where=where, timeout=3.0)
+
+    return job
+
+
+def reset_fault(axis: int) -> MotionJob:
+    """Return the job that resets the fault of an axis."""
+    return lambda drives: motion.reset_fault(drives, where=only(drives, axis))
+
+
+def command(axis: int, word: int) -> MotionJob:
+    """Return the job that writes a controlword of the state machine; one that enables moves to no target of before."""
+
+    def job(drives: Drives) -> None:
+        if word == cia402.FAULT_RESET:
+            motion.reset_fault(drives, where=only(drives, axis))
+        else:
+            motion.take_command(drives, where=only(drives, axis))
+            if word == cia402.ENABLE_OPERATION:
+                _stay(drives, only(drives, axis), _mode_of(drives, axis))
+            drives.write(cia402.CONTROLWORD, word, where=only(drives, axis))
+
+    return job
+
+
+def select_mode(axis: int, mode: str) -> MotionJob:
+    """Return the job that selects a mode of operation; an axis that is enabled stays where it is."""
+
+    def job(drives: Drives) -> None:
+        where = only(drives, axis)
+        if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
+            _stay(drives, where, mode)
+        motion.select_mode(drives, mode, where=where)
+
+    return job
+
+
+def home(axis: int) -> MotionJob:
+    """Return the job that runs the homing method of 6098h."""
+    return lambda drives: motion.home(drives, where=only(drives, axis))
+
+
+def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) -> MotionJob:
+    """Return the job that moves an axis in pp.
+
+    Args:
+        session: Knows the units.
+        axis: The axis.
+        goal: Where to, or how far: "1 rev", "90 deg", or an integer of the drive's unit.
+        speed: Profile velocity; "" leaves the drive's.
+        relative: Whether the goal is from where the axis is.
+    """
+
+    def job(drives: Drives) -> None:
+        where = only(drives, axis)
+        target = parsed(session, axis, goal, cia402.TARGET_POSITION)
+        rate = parsed(session, axis, speed, cia402.PROFILE_VELOCITY) if speed.strip() else None
+        _check_enabled(drives, axis)
+        motion.select_mode(drives, "pp", where=where)
+        if rate is not None:
+            if rate <= 0:
+                raise ValueError(f"a speed of {speed} moves nothing; give one above 0")
+            drives.write(cia402.PROFILE_VELOCITY, rate, where=where)
+        motion.move_to(drives, target, relative=relative, where=where, timeout=LONGEST_MOVE)
+
+    return job
+
+
+def turn(session: Session, axis: int, speed: str, number: int) -> MotionJob:
+    """Return the job that turns an axis in pv, as long as a motion of a page lasts.
+
+    Args:
+        session: Knows the units, and the motion.
+        axis: The axis.
+        speed: Signed.
+        number: Of the motion.
+    """
+
+    def job(drives: Drives) -> None:
+        where = only(drives, axis)
+        rate = parsed(session, axis, speed, cia402.TARGET_VELOCITY)
+        _check_enabled(drives, axis)
+        if not session.presence.is_on(number):
+            return  # released before it began
+        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
+        motion.select_mode(drives, "pv", where=where)
+        if session.presence.is_on(number):
+            drives.write(cia402.TARGET_VELOCITY, rate, where=where)
+
+    return job
+
+
+def end_turn(axis: int) -> MotionJob:
+    """Return the job that lets an axis come to rest by its own ramp: a button was released."""
+
+    def job(drives: Drives) -> None:
+        if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
+            drives.write(cia402.TARGET_VELOCITY, 0, where=only(drives, axis))
+
+    return job
+
+
+def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
+    """Return the integer that a text means for an object of an axis, within its range; ValueError for what is none."""
+    known: Description = session.description
+    entry = known.dictionary.find(name)
+    raw = quantities.parse(text, entry, session.scales[axis])
+    check_limits(entry, raw)
+    return raw
+
+
+def _check_enabled(drives: Drives, axis: int) -> None:
+    status = int(drives.read(cia402.STATUSWORD)[axis])
+    if not cia402.matches(status, cia402.OPERATION_ENABLED):
+        raise RuntimeError(f"axis {axis} is not enabled and cannot move: statusword {status:04X}h; enable it first")
+
+
+def _mode_of(drives: Drives, axis: int) -> str:
+    """Return the mode of operation of an axis by its abbreviation, "" for none."""
+    try:
+        number = int(drives.read(cia402.MODE_DISPLAY)[axis])
+    except ObjectAccessError:  # a drive that does not show it
+        number = int(drives.read(cia402.MODE)[axis])
+    return next((name for name, one in cia402.MODES.items() if one == number), "")
+
+
+def _stay(drives: Drives, where: Mask, mode: str) -> None:
+    """Have no target of before move an axis once it is in a mode: its position is the target, and no speed."""
+    if mode in ("csp", "pp", "ip"):
+        drives.write(cia402.TARGET_POSITION, drives.read(cia402.POSITION_ACTUAL), where=where)
+    elif mode in ("pv", "csv"):
+        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
+    elif mode in ("tq", "cst"):
+        drives.write(cia402.TARGET_TORQUE, 0, where=where)
+
+
+def _await_rest(drives: Drives, axis: int, timeout: float = 5.0) -> None:
+    """Let time pass until the quick stop of an axis is over, or it has left its state."""
+    waited = 0.0
+    before = int(drives.read(cia402.POSITION_ACTUAL)[axis])
+    while waited < timeout:
+        drives.advance(0.02)
+        waited += 0.02
+        here = int(drives.read(cia402.POSITION_ACTUAL)[axis])
+        is_live = cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis]))
+        if not is_live or abs(here - before) <= motion.NEAR:
+            return
+        before = here

@@ -1,0 +1,137 @@
+"""What is sampled of the drives, in a ring: the newest minutes of some objects, at every communication cycle."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.drives.trace import Trace
+
+Key = tuple[int, int]
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+CAPACITY = 120_000  # samples: two minutes at 1 kHz
+GAP = 1.5  # of the time between two samples: more is a gap
+
+
+@dataclass(frozen=True)
+class RingSamples:
+    """Samples in a row.
+
+    first: Number of the first one since the ring began.
+    t: Times [s], shape (n,).
+    values: Integers of each object, shape (n, num_axes).
+    """
+
+    first: int
+    t: Floats
+    values: dict[Key, Integers]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+class SampleRing:
+    """The newest samples of some objects, as the wire carries them.
+
+    Args:
+        keys: The objects.
+        num_axes: Of the drives.
+        capacity: Samples that are kept.
+    """
+
+    def __init__(self, keys: tuple[Key, ...], num_axes: int, capacity: int = CAPACITY) -> None:
+        self.keys = keys
+        self.total = 0  # samples so far, those that are gone among them
+        self._capacity = capacity
+        self._t = np.zeros(capacity)
+        self._values = np.zeros((capacity, len(keys), num_axes), np.int64)
+
+    @property
+    def oldest(self) -> int:
+        """The number of the oldest sample that is still there."""
+        return max(0, self.total - self._capacity)
+
+    def append(self, t: Floats, values: dict[Key, Integers]) -> None:
+        """Add samples."""
+        skipped = max(0, len(t) - self._capacity)
+        places = (self.total + np.arange(skipped, len(t))) % self._capacity
+        self._t[places] = t[skipped:]
+        for k, key in enumerate(self.keys):
+            self._values[places, k] = values[key][skipped:]
+        self.total += len(t)
+
+    def read(self, first: int, last: int) -> RingSamples:
+        """Return the samples from one number to before another one, as far as they are there."""
+        first, last = max(first, self.oldest), min(last, self.total)
+        places = np.arange(first, max(first, last)) % self._capacity
+        values = self._values[places]
+        return RingSamples(first, self._t[places], {key: values[:, k] for k, key in enumerate(self.keys)})
+
+    def number_at(self, t: float) -> int:
+        """Return the number of the first sample that is not before a time [s]."""
+        low, high = self.oldest, self.total
+        while low < high:
+            middle = (low + high) // 2
+            if self._t[middle % self._capacity] < t:
+                low = middle + 1
+            else:
+                high = middle
+        return low
+
+
+class ScopeRecorder:
+    """Keeps what is sampled, whoever lets time pass; read by any thread.
+
+    Args:
+        num_axes: Of the drives.
+        period: Time between two samples [s].
+
+    Attributes:
+        period: Time between two samples [s].
+        now: The time of the newest sample's end [s], since the beginning.
+        generation: Grows when other objects are sampled than before: numbers of samples begin anew.
+    """
+
+    def __init__(self, num_axes: int, period: float) -> None:
+        self.period = period
+        self.now = 0.0
+        self.generation = 0
+        self.lock = threading.RLock()
+        self._num_axes = num_axes
+        self._objects: tuple[Key, ...] = ()
+        self._ring = SampleRing((), num_axes, 1)
+
+    @property
+    def objects(self) -> tuple[Key, ...]:
+        """What is wanted of each cycle."""
+        return self._objects
+
+    @objects.setter
+    def objects(self, keys: tuple[Key, ...]) -> None:
+        self._objects = tuple(dict.fromkeys(keys))
+
+    @property
+    def ring(self) -> SampleRing:
+        """The samples."""
+        return self._ring
+
+    def keep(self, trace: Trace, asked: tuple[Key, ...], start: float, end: float) -> None:
+        """Keep a trace that began and ended at times [s]; of objects that were asked for."""
+        with self.lock:
+            if asked != self._ring.keys:
+                self._ring = SampleRing(asked, self._num_axes)
+                self.generation += 1
+            if len(trace):
+                self._ring.append(start + trace.t, {key: trace[key] for key in asked})
+            self.now = end
+
+    def newest(self) -> dict[Key, Integers]:
+        """Return the newest sample of each object, shape (num_axes,); empty before there is one."""
+        with self.lock:
+            rows = self._ring.read(self._ring.total - 1, self._ring.total)
+        return {key: values[0] for key, values in rows.values.items()} if len(rows) else {}

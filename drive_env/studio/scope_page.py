@@ -1,0 +1,363 @@
+"""The page Scope: live at the communication rate, triggers, cursors, figures of a step, recordings to keep."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+from fastapi import FastAPI, WebSocket, WebSocketDisconnect
+from nicegui import run, ui
+from nicegui.events import GenericEventArguments
+
+from drive_env import cia402
+from drive_env.dictionary.entries import Entry
+from drive_env.master import quantities
+from drive_env.studio.page import StudioPage
+from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
+from drive_env.studio.scope_trigger import EDGES, ScopeTrigger
+from drive_env.studio.scope_view import (
+    MODES,
+    MOST_CHANNELS,
+    WINDOWS,
+    ScopeChannel,
+    ScopeRecording,
+    ScopeView,
+    channel_of,
+    with_channels,
+)
+from drive_env.studio.sentences import sentence
+from drive_env.studio.session import Session
+from drive_env.studio.visitor import Visitor
+
+FRAME = 0.05  # s between two frames
+DEFAULT = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+FIRST = (  # of the objects that can be chosen, those that people look for
+    cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
+    cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
+    cia402.DC_LINK_VOLTAGE,
+)  # fmt: skip
+
+_views: dict[str, ScopeView] = {}  # of each page that is open, by its visitor's id
+
+
+def attach(web: FastAPI, session: Session) -> None:
+    """Add the way by which frames come to the page."""
+
+    @web.websocket("/studio/scope")
+    async def frames(line: WebSocket, page: str = "") -> None:
+        await line.accept()
+        view = _views.get(page)
+        if view is None:
+            await line.close()
+            return
+        listener = asyncio.create_task(_listen(line, view))
+        try:
+            while not listener.done():
+                begun = time.monotonic()
+                await line.send_bytes(view.frame())
+                await asyncio.sleep(max(0.005, FRAME - (time.monotonic() - begun)))
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            listener.cancel()
+
+
+async def _listen(line: WebSocket, view: ScopeView) -> None:
+    """Hear how wide the picture is."""
+    with contextlib.suppress(WebSocketDisconnect, ValueError, KeyError, TypeError):
+        while True:
+            message = json.loads(await line.receive_text())
+            view.columns = min(4000, max(50, int(message["columns"])))
+
+
+def build(session: Session, visitor: Visitor) -> None:
+    """Make the page."""
+    ScopePanel(session, visitor).build()
+
+
+class ScopePanel:
+    """The controls of one page's scope.
+
+    Args:
+        session: The drives.
+        visitor: The page.
+    """
+
+    def __init__(self, session: Session, visitor: Visitor) -> None:
+        self._session = session
+        self._visitor = visitor
+        self._view = ScopeView(session.recorder)
+        self._entries = _choices(session)
+        self._cursors: list[float | None] = [None, None]
+        known = session.description
+        defaults = [(index, 0) for index in DEFAULT if known.has((index, 0))]
+        self._view.channels = tuple(self._channel(key, visitor.axis) for key in defaults)
+
+    def build(self) -> None:
+        """Make it."""
+        _views[self._visitor.id] = self._view
+        self._visitor.client.on_delete(self._leave)
+        self._want()
+        with ui.element("div").classes("studio-scope-page"):
+            with ui.card().classes("studio-card studio-scope-card"):
+                self._bar()
+                with ui.element("div").classes("studio-scope"):
+                    ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
+                self._readout()
+            with ui.element("div").classes("studio-scope-side"):
+                self._channel_card()
+                self._trigger_card()
+                self._figure_card()
+        ui.on("scope_cursors", self._take_cursors)
+        ui.run_javascript(f"studioScope.start({self._visitor.id!r})")
+
+    def _leave(self) -> None:
+        _views.pop(self._visitor.id, None)
+        self._session.forget_samples(self._visitor.id)
+
+    def _want(self) -> None:
+        keys = [channel.key for channel in self._view.channels]
+        if self._view.trigger is not None:
+            keys.append(self._view.trigger.key)
+        self._session.sample(self._visitor.id, keys)
+
+    def _channel(self, key: tuple[int, int], axis: int) -> ScopeChannel:
+        entry = self._session.description.dictionary.find(key)
+        several = self._session.num_axes > 1
+        return channel_of(entry, axis, self._session.scales[axis], several=several)
+
+    # --- run and halt ---------------------------------------------------------------------------------------------
+    def _bar(self) -> None:
+        view = self._view
+        with ui.row().classes("studio-buttons"):
+            run_button = ui.button("Halt", icon="pause", on_click=lambda: toggle()).props("unelevated no-caps")
+            run_button.props("data-test=run").classes("studio-run")
+            ui.label("running").classes("studio-scope-status studio-bit").props('role="status"')
+            ui.space()
+            window = ui.select({one: f"{one:g} s" for one in WINDOWS}, value=view.window, label="Time across [s]")
+            window.props("dense outlined options-dense").classes("studio-narrow")
+            window.on_value_change(lambda event: self._set(window=float(event.value)))
+            for text, icon, script, hint in (
+                ("Cursors", "straighten", "() => studioScope.toggle()", "Two cursors: drag them, or a, b and arrows"),
+                ("Fit", "fit_screen", "() => studioScope.fit()", "Scale every panel to what it shows"),
+            ):
+                ui.button(text, icon=icon).props("outline no-caps").on("click", js_handler=script).tooltip(hint)
+
+        def toggle() -> None:
+            if view.is_running:
+                view.halt()
+            else:
+                view.run()
+
+        late = ui.label("").classes("studio-hint studio-figures")
+        late.tooltip("Times are the nominal ones of the SYNCs; a busy computer sends them late")
+
+        def show() -> None:
+            late.set_text(self._session.lateness)
+            run_button.set_text("Halt" if view.is_running else "Run")
+            run_button.set_icon("pause" if view.is_running else "play_arrow")
+
+        ui.timer(0.2, show)
+
+    def _set(self, **changes: Any) -> None:
+        for name, value in changes.items():
+            setattr(self._view, name, value)
+        if self._view.is_running:
+            self._view.run()
+
+    def _readout(self) -> None:
+        head = "".join(f"<th>{text}</th>" for text in ("Channel", "now", "A", "B", "B - A", "unit"))
+        table = f'<table class="studio-readout"><thead><tr>{head}</tr></thead><tbody></tbody></table>'
+        ui.html(table, sanitize=False).classes("w-full studio-scroll")
+
+    # --- channels -------------------------------------------------------------------------------------------------
+    def _channel_card(self) -> None:
+        with ui.card().classes("studio-card"):
+            ui.label(f"Channels ({MOST_CHANNELS} at most)").classes("studio-heading")
+            chips = ui.row().classes("studio-chips")
+            options = {f"{index:04X}:{sub:02X}": entry.label for (index, sub), entry in self._entries.items()}
+            add = ui.select(options, label="Add an object, by index or name", with_input=True, clearable=True)
+            add.props("dense outlined options-dense data-test=add-channel").classes("w-full")
+
+        def draw() -> None:
+            chips.clear()
+            with chips:
+                for channel in self._view.channels:
+                    ui.chip(channel.label, removable=True, on_value_change=lambda _, one=channel: remove(one)).props(
+                        "outline square"
+                    )
+
+        def remove(channel: ScopeChannel) -> None:
+            change(tuple(one for one in self._view.channels if one != channel))
+
+        def change(channels: tuple[ScopeChannel, ...]) -> None:
+            try:
+                with_channels(self._view, channels)
+            except ValueError as error:
+                self._visitor.say(str(error), "warning")
+                return
+            self._want()
+            draw()
+            names = [f"{one.key[0]:04X}:{one.key[1]:02X}" for one in channels if one.axis == self._visitor.axis]
+            ui.run_javascript(f"studioScope.keep({json.dumps(names)})")
+
+        def kept(event: GenericEventArguments) -> None:
+            """Show what this browser showed last, as far as the drive has it."""
+            keys = [(int(name[:4], 16), int(name[5:], 16)) for name in event.args]
+            there = [key for key in keys if key in self._entries][:MOST_CHANNELS]
+            if there:
+                self._view.channels = tuple(self._channel(key, self._visitor.axis) for key in there)
+                self._want()
+                draw()
+
+        def added() -> None:
+            if not add.value:
+                return
+            index, _, sub = str(add.value).partition(":")
+            channel = self._channel((int(index, 16), int(sub, 16)), self._visitor.axis)
+            add.set_value(None)
+            if channel not in self._view.channels:
+                change((*self._view.channels, channel))
+
+        add.on_value_change(added)
+        ui.on("scope_channels", kept)
+        draw()
+
+    # --- trigger --------------------------------------------------------------------------------------------------
+    def _trigger_card(self) -> None:
+        with ui.card().classes("studio-card"):
+            ui.label("Trigger").classes("studio-heading")
+            with ui.row().classes("studio-buttons"):
+                mode = ui.select(MODES, value="roll", label="Mode").props("dense outlined").classes("grow")
+                mode.props("data-test=trigger-mode")
+                kind = ui.select(EDGES, value="rising", label="On").props("dense outlined").classes("grow")
+            options = {f"{index:04X}:{sub:02X}": entry.label for (index, sub), entry in self._entries.items()}
+            usual = f"{cia402.VELOCITY_ACTUAL:04X}:00"
+            source = ui.select(options, value=usual if usual in options else next(iter(options)), label="Of the object",
+                               with_input=True).props("dense outlined options-dense").classes("w-full")  # fmt: skip
+            with ui.row().classes("studio-buttons"):
+                level = ui.input("Level, with its unit", value="30 rpm").props("dense outlined data-test=level")
+                level.classes("grow")
+                before = ui.number("Before the trigger [%]", value=10, min=0, max=90).props("dense outlined")
+                before.classes("grow")
+            button = ui.button("Arm", icon="bolt").props("outline no-caps data-test=arm")
+
+        def apply() -> None:
+            try:
+                self._arm(str(mode.value), str(kind.value), str(source.value), level.value or "", before.value)
+            except Exception as error:
+                self._visitor.say(sentence(error), "error")
+
+        def needed() -> None:
+            has_level = kind.value in ("rising", "falling")
+            source.set_enabled(has_level)
+            level.set_enabled(has_level)
+
+        kind.on_value_change(needed)
+        mode.on_value_change(apply)
+        button.on_click(apply)
+
+    def _arm(self, mode: str, kind: str, source: str, level: str, before: float | None) -> None:
+        axis, view = self._visitor.axis, self._view
+        key, raw = (cia402.STATUSWORD, 0), 0.0
+        if kind in ("rising", "falling"):
+            index, _, sub = source.partition(":")
+            key = int(index, 16), int(sub, 16)
+            entry = self._session.description.dictionary.find(key)
+            raw = float(quantities.parse(level, entry, self._session.scales[axis]))
+        view.trigger = ScopeTrigger(kind, axis, key, raw)
+        view.before = min(0.9, max(0.0, (10.0 if before is None else float(before)) / 100.0))
+        view.mode = mode
+        self._want()
+        view.run()
+
+    # --- figures, recordings, files -------------------------------------------------------------------------------
+    def _figure_card(self) -> None:
+        with ui.card().classes("studio-card"):
+            ui.label("Recording").classes("studio-heading")
+            with ui.row().classes("studio-buttons"):
+                ui.button("Keep under the next", icon="layers", on_click=self._keep).props("outline no-caps")
+                ui.button("Take away", icon="layers_clear", on_click=self._forget).props("outline no-caps")
+            ui.label("Figures of a step (from cursor A to B, if they are shown)").classes("studio-label")
+            with ui.row().classes("studio-buttons"):
+                channel = ui.select({}, label="Channel").props("dense outlined options-dense").classes("grow")
+                ui.button("Measure", icon="analytics", on_click=lambda: measure()).props(
+                    "outline no-caps data-test=measure"
+                )
+            told = ui.label("").classes("studio-hint studio-figures")
+            ui.label("Export what is shown, at every sample").classes("studio-label")
+            with ui.row().classes("studio-buttons"):
+                for text, suffix, make in (("CSV", "csv", as_csv), ("NumPy", "npz", as_npz)):
+                    ui.button(text, icon="download", on_click=self._saver(suffix, make)).props("outline no-caps")
+                ui.button("PNG", icon="image", on_click=self._saver("png", self._png)).props("outline no-caps")
+
+        def measure() -> None:
+            chosen = next((one for one in self._view.channels if one.label == channel.value), None)
+            if chosen is None:
+                told.set_text("Choose the channel whose step is meant.")
+                return
+            try:
+                found = measure_step(self._view.shown(), chosen, *self._between())
+                told.set_text(f"{chosen.name}: {in_words(found, chosen.unit)}")
+            except ValueError as error:
+                told.set_text(str(error))
+
+        def options() -> None:
+            labels = [one.label for one in self._view.channels]
+            if labels != channel.options:
+                channel.set_options(labels, value=channel.value if channel.value in labels else _response(labels))
+
+        ui.timer(0.5, options)
+
+    def _between(self) -> tuple[float | None, float | None]:
+        a, b = self._cursors
+        return (None, None) if a is None or b is None else (min(a, b), max(a, b))
+
+    def _take_cursors(self, event: GenericEventArguments) -> None:
+        self._cursors = [None if one is None else float(one) for one in event.args]
+
+    def _keep(self) -> None:
+        if not self._view.keep_as_reference():
+            self._visitor.say("there is nothing to keep yet; run the scope first", "warning")
+
+    def _forget(self) -> None:
+        self._view.reference = None
+
+    def _png(self, recording: ScopeRecording) -> bytes:
+        return as_png(recording, self._view.reference)
+
+    def _saver(self, suffix: str, make: Callable[[ScopeRecording], bytes]) -> Callable[[], Any]:
+        async def save() -> None:
+            recording = self._view.shown()
+            if not len(recording.t) or not recording.values:
+                self._visitor.say("there is nothing to save yet; run the scope first", "warning")
+                return
+            content = await run.io_bound(make, recording)
+            assert content is not None
+            ui.download(content, f"scope-{time.strftime('%Y%m%d-%H%M%S')}.{suffix}")
+
+        return save
+
+
+def _choices(session: Session) -> dict[tuple[int, int], Entry]:
+    """Return the objects that a scope can show: numbers that can be sampled, those that people look for first."""
+    known = session.description
+    entries = [
+        entry
+        for entry in known.dictionary
+        if entry.pdo_mappable and entry.bits is not None and entry.access not in ("wo", "const")
+    ]
+    entries.sort(key=lambda one: (one.index not in FIRST, one.index, one.sub))
+    return {(entry.index, entry.sub): entry for entry in entries}
+
+
+def _response(labels: list[str]) -> str | None:
+    """Return the channel whose step is measured most: the position, which a move leaves at another place."""
+    return next((one for one in labels if "osition actual" in one), labels[0] if labels else None)
+
+
+page = StudioPage("/scope", "Scope", "show_chart", 20, build, attach=attach)

@@ -1,0 +1,230 @@
+"""The web server of the studio: its pages, the life line of each, and the quick stop that waits for nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import logging
+import os
+import signal
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Iterable
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple
+
+import uvicorn
+from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
+from nicegui import Client, app, ui
+
+from drive_env.studio import motion_jobs
+from drive_env.studio.gate import StudioGate, is_loopback
+from drive_env.studio.layout import frame
+from drive_env.studio.page import StudioPage
+from drive_env.studio.session import Session
+from drive_env.studio.visitor import Visitor
+
+logger = logging.getLogger(__name__)
+
+ASSETS = Path(__file__).parent / "assets"
+PORT = 29640  # no service is registered there
+LOOPBACK = "127.0.0.1"
+GRACE = 1  # s that browsers get to close at the end
+RECONNECT = 3.0  # s
+
+
+class Studio:
+    """The pages of a session.
+
+    Args:
+        session: The drives.
+        pages: In their order; the first one is where "/" leads.
+    """
+
+    def __init__(self, session: Session, pages: Iterable[StudioPage]) -> None:
+        self.session = session
+        self.pages = list(pages)
+        self.visitors: dict[str, Visitor] = {}
+        for page in self.pages:
+            self._add(page)
+        self._add_root()
+        app.add_static_files("/studio/assets", ASSETS)
+
+    def _add(self, page: StudioPage) -> None:
+        @ui.page(page.path, title=f"{page.title} · drive-env studio")
+        def show(client: Client, axis: int = 0) -> None:
+            visitor = Visitor(self.session, client, max(0, axis))
+            self.visitors[client.id] = visitor
+            client.on_delete(lambda: self.visitors.pop(client.id, None))
+            frame(self.session, visitor, self.pages, page)
+
+    def _add_root(self) -> None:
+        first = self.pages[0].path
+
+        @ui.page("/")
+        def root() -> Response:
+            return Response(status_code=307, headers={"location": first})
+
+    async def live(self, line: WebSocket, page: str) -> None:
+        """Hear a page's beats until it is gone: what it has set in motion ends with it."""
+        await line.accept()
+        held: dict[int, int] = {}  # the page's number of a button that is held -> of its motion
+        presence = self.session.presence
+        presence.beat(page)
+        try:
+            while True:
+                message = json.loads(await line.receive_text())
+                self._hear(page, message, held)
+        except (WebSocketDisconnect, ValueError, KeyError, TypeError):
+            pass
+        finally:
+            presence.leave(page)
+
+    def _hear(self, page: str, message: dict[str, Any], held: dict[int, int]) -> None:
+        presence, kind = self.session.presence, message["k"]
+        if kind == "beat":
+            presence.beat(page, held.get(int(message.get("held", 0)), 0))
+        elif kind == "stop":
+            self.session.stop_now("the button or the space bar of a page")
+        elif kind == "turn":
+            self._turn(page, int(message["hold"]), int(message["direction"]), held)
+        elif kind == "release":
+            self._release(page, held.pop(int(message["hold"]), 0))
+
+    def _turn(self, page: str, hold: int, direction: int, held: dict[int, int]) -> None:
+        """Turn the axis of a page as long as it holds the button."""
+        visitor = self.visitors.get(page)
+        if visitor is None or not self.session.num_axes:
+            return
+        axes = motion_jobs.masks_of(self.session.num_axes, visitor.axis)
+        lasting = self.session.presence.begin(page, axes, held=True)
+        held[hold] = lasting.number
+        speed = motion_jobs.turned_round(visitor.jog_speed, direction)
+        job = motion_jobs.turn(self.session, visitor.axis, speed, lasting.number)
+        visitor.hand_in(job, f"Jog axis {visitor.axis}")
+
+    def _release(self, page: str, number: int) -> None:
+        visitor = self.visitors.get(page)
+        if number and self.session.presence.end(number) is not None and visitor is not None:
+            visitor.hand_in(motion_jobs.end_turn(visitor.axis), f"End of the jog of axis {visitor.axis}")
+
+
+class StudioServer(uvicorn.Server):
+    """Serves until a signal ends it: then the drives are stopped first."""
+
+    def __init__(self, config: uvicorn.Config, stop: Callable[[str], None]) -> None:
+        super().__init__(config)
+        self._stop = stop
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop the drives, then end."""
+        self._stop("the studio ends")
+        super().handle_exit(sig, frame)
+
+
+def web_app(studio: Studio, host: str, port: int, token: str | None) -> FastAPI:
+    """Return the whole application."""
+    web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+    @web.post("/studio/quick-stop")
+    def quick_stop() -> dict[str, bool]:
+        studio.session.stop_now("the button or the space bar of a page")
+        return {"stopped": True}
+
+    @web.websocket("/studio/life")
+    async def life(line: WebSocket, page: str = "") -> None:
+        await studio.live(line, page)
+
+    for page in studio.pages:
+        if page.attach is not None:
+            page.attach(web, studio.session)
+    ui.run_with(
+        web, title="drive-env studio", dark=None, reconnect_timeout=RECONNECT, show_welcome_message=False,
+        favicon=ASSETS / "studio.svg",
+    )  # fmt: skip
+    # NiceGUI looks for its server among all objects there are, and one of python-canopen's cannot be looked at.
+    web.router.lifespan_context = _lifespan
+    web.add_middleware(StudioGate, host=host, port=port, token=token)  # type: ignore[arg-type]
+    return web
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(_: FastAPI) -> AsyncIterator[None]:
+    """Start NiceGUI, and end it."""
+    async with app.router.lifespan_context(app):
+        yield
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens.
+
+    Raises:
+        ValueError: Where that cannot be, with what to try.
+    """
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        why = "another program has it" if error.errno == errno.EADDRINUSE else os.strerror(error.errno or 0)
+        raise ValueError(
+            f"cannot listen on {host}:{port}: {why}; end that program, or choose another --port (0: a free one)"
+        ) from None
+    except (OverflowError, UnicodeError) as error:
+        raise ValueError(f"cannot listen on {host}:{port}: {error}; give --listen {LOOPBACK}, --port {PORT}") from None
+
+
+def address(host: str, port: int, token: str | None) -> str:
+    """Return what a browser opens."""
+    shown = f"[{host}]" if ":" in host else host
+    if not is_loopback(host) and host in ("0.0.0.0", "::"):
+        shown = socket.gethostname()
+    return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
+
+
+class ServingTerms(NamedTuple):
+    """How it is served: on which address, with which token (None: none), for how long [s] (None: until a signal)."""
+
+    host: str
+    token: str | None = None
+    duration: float | None = None
+
+
+def serve_studio(
+    session: Session, pages: list[StudioPage], sock: socket.socket, terms: ServingTerms, ready: Callable[[], None]
+) -> None:
+    """Serve a session until a signal comes; its drives are stopped and closed at the end, however it ends.
+
+    Args:
+        session: The drives; they are opened here.
+        pages: What there is to see.
+        sock: Listens already.
+        terms: How.
+        ready: Called before the first request is served.
+    """
+    port = sock.getsockname()[1]
+    studio = Studio(session, pages)
+    web = web_app(studio, terms.host, port, terms.token)
+    config = uvicorn.Config(web, log_level="warning", timeout_graceful_shutdown=GRACE, lifespan="on")
+    server = StudioServer(config, session.stop_now)
+    hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed ends it as Ctrl-C does
+    before = None if hang_up is None else signal.getsignal(hang_up)
+    if hang_up is not None and before is not signal.SIG_IGN:
+        signal.signal(hang_up, server.handle_exit)
+    session.when_not_opened = lambda: server.handle_exit(signal.SIGTERM, None)
+    session.start()
+    end = threading.Timer(terms.duration or 0.0, server.handle_exit, (signal.SIGTERM, None))
+    end.daemon = True
+    try:
+        ready()
+        if terms.duration is not None:
+            end.start()
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[sock])
+    finally:
+        end.cancel()
+        session.close()
+        sock.close()
+        if hang_up is not None:
+            signal.signal(hang_up, before)

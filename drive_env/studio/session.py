@@ -1,0 +1,481 @@
+"""The session: the one set of drives that all browser pages share, in a thread of its own.
+
+Pages hand in jobs, functions of the drives; one runs at a time. Between jobs time passes: an emulated machine lives in
+real time, drives of a bus are sampled. What stops a motor does not wait for a job: `stop_now` acts from any thread, and
+the job that is under way ends at its next call.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.drives import motion
+from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.interface import Drives
+from drive_env.master.parameters import parameters
+from drive_env.master.quantities import Scale
+from drive_env.safety.errors import SafetyError
+from drive_env.studio.axis_states import AxisState, AxisStates
+from drive_env.studio.errors import JobEndedError, JobStoppedError
+from drive_env.studio.presence import Presence
+from drive_env.studio.recorder import Key, ScopeRecorder
+from drive_env.studio.sentences import sentence
+from drive_env.studio.shared_drives import PIECE, SharedDrives
+from drive_env.studio.single_axes import SingleAxes
+
+if TYPE_CHECKING:
+    from drive_env.master.description import Description
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Mask = NDArray[np.bool_]
+
+BUS_IDLE = 0.05  # s of a bus that are sampled at once between two looks for jobs
+RETRY = 0.5  # s after which a bus that failed is asked again
+STOP_WAIT = 3.0  # s that axes get to come to rest before their voltage is taken away
+KEPT = 200  # events
+TOLD_ONCE = 0.5  # s within which one more wish to stop is the same one
+PATIENCE = 10.0  # s for the thread to end
+
+
+@dataclass(frozen=True)
+class SessionEvent:
+    """Something that happened: when (time of day [s]), how grave (info, warning, error), and what."""
+
+    at: float
+    level: str
+    text: str
+
+
+@dataclass
+class Job:
+    """A function of the drives, and what becomes of it.
+
+    Attributes:
+        title: What it does, in a few words.
+        page: The page that wants it.
+        paced: Whether emulated time passes in real time meanwhile.
+        quiet: Whether pages do not show it.
+        progress: Share that is done, None where it is not known.
+        told: What it says of itself.
+        stopped: Why it shall end; empty while it may go on.
+    """
+
+    function: Callable[[Drives], Any]
+    title: str
+    page: str
+    paced: bool
+    quiet: bool
+    future: Future[Any] = field(default_factory=Future)
+    progress: float | None = None
+    told: str = ""
+    stopped: str = ""
+    is_told: bool = False  # whether it has been stopped by an exception: what it puts back then must get through
+
+    def refuse(self, error: BaseException) -> None:
+        """End it before it begins; whoever asked for it may have given it up."""
+        if self.future.set_running_or_notify_cancel():
+            self.future.set_exception(error)
+
+
+class Session:
+    """The drives and their thread.
+
+    Args:
+        open_drives: Opens the drives, in the thread that will use them.
+        title: What they are, for people.
+        description: Of the device.
+
+    Attributes:
+        state: "opening", "open", "failed", "closed".
+        failure: Why it failed.
+        error: What was raised where the drives could not be opened.
+        when_not_opened: Called then, by the drives' thread.
+        presence: The pages there are.
+        recorder: What is sampled.
+        stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
+    """
+
+    def __init__(self, open_drives: Callable[[], Drives], title: str, description: Description) -> None:
+        self.title = title
+        self.description = description
+        self.state = "opening"
+        self.failure = ""
+        self.error: BaseException | None = None
+        self.when_not_opened: Callable[[], None] = lambda: None
+        self.presence = Presence()
+        self.recorder = ScopeRecorder(1, description.cycle)
+        self.stored: dict[int, dict[Key, int]] = {}
+        self.events: deque[SessionEvent] = deque(maxlen=KEPT)
+        self.num_events = 0
+        self._open = open_drives
+        self._drives: SharedDrives | None = None
+        self._real: Drives | None = None
+        self._states: AxisStates | None = None
+        self._jobs: deque[Job] = deque()
+        self._waiting = threading.Condition()
+        self._current: Job | None = None
+        self._stop_asked: str = ""
+        self._is_closing = False
+        self._failed_at = self._told_at = -1e9
+        self._sampled: dict[str, tuple[Key, ...]] = {}
+        self._told_reason = ""
+        self._is_left = False  # whether an axis was switched off since no page is there
+        self._thread = threading.Thread(target=self._run, name="drive studio", daemon=True)
+
+    # --- for pages, any thread ----------------------------------------------------------------------------------
+    def start(self) -> None:
+        """Open the drives."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop what moves, close the drives, end the thread."""
+        if self.state == "closed":
+            return
+        self.stop_now("the studio ends")
+        with self._waiting:
+            self._is_closing = True
+            self._waiting.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(PATIENCE)
+
+    def do(
+        self, function: Callable[[Drives], T], title: str, *, page: str = "", paced: bool = True, quiet: bool = False
+    ) -> Future[T]:
+        """Have a function of the drives run in their thread, after those that were asked for before.
+
+        Args:
+            function: What to do; it may let time pass, and is ended by an exception when somebody stops it.
+            title: What it does, in a few words: "Move axis 0".
+            page: Who wants it.
+            paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
+            quiet: Whether pages do not show it: one of many that only read.
+
+        Returns:
+            What it returns, or raises: `JobEndedError` if it was stopped.
+        """
+        job = Job(function, title, page, paced, quiet)
+        with self._waiting:
+            if self._is_closing or self.state in ("failed", "closed"):
+                job.refuse(RuntimeError(self.failure or "the drives are closed; start the studio again"))
+                return job.future
+            self._jobs.append(job)
+            self._waiting.notify_all()
+        return job.future
+
+    def sample(self, page: str, keys: Iterable[Key]) -> None:
+        """Have objects sampled for a page, in place of those that it wanted before."""
+        self._sampled[page] = tuple(keys)
+        self._choose_samples()
+
+    def forget_samples(self, page: str) -> None:
+        """Sample nothing for a page any more."""
+        self._sampled.pop(page, None)
+        self._choose_samples()
+
+    def _choose_samples(self) -> None:
+        states = self._states
+        if states is not None:
+            wanted = [key for keys in list(self._sampled.values()) for key in keys]
+            self.recorder.objects = (*states.sampled, *wanted)
+
+    def stop_now(self, reason: str) -> None:
+        """Quick-stop every axis at once, and end the job that is under way and those that wait.
+
+        It does not wait for the job: emulated axes are commanded here, between two pieces of time; those of a bus by
+        the supervisor of their envelope.
+        """
+        with self._waiting:
+            self._stop_asked = reason
+            waiting, self._jobs = list(self._jobs), deque()
+            if self._current is not None and not self._current.stopped:
+                self._current.stopped = reason
+        for job in waiting:
+            job.refuse(JobEndedError(f"it was not begun: {reason}"))
+        real, shared = self._real, self._drives
+        if real is None or shared is None:
+            return
+        if real.safety is not None:
+            real.safety.stop_at_once(reason)
+        elif real.time_waits:
+            with shared.lock:
+                _stop_live(real)
+
+    def end_job(self, reason: str) -> None:
+        """End the job that is under way, and stop every axis: it may have set any in motion."""
+        self.stop_now(reason)
+
+    def tell(self, text: str, progress: float | None = None) -> None:
+        """Say how far the present job is; called by the job itself."""
+        if self._current is not None:
+            self._current.told, self._current.progress = text, progress
+
+    def say(self, level: str, text: str) -> None:
+        """Add to what happened: level info, warning or error."""
+        self.events.append(SessionEvent(time.time(), level, text))
+        self.num_events += 1
+
+    @property
+    def job(self) -> Job | None:
+        """What is under way."""
+        return self._current
+
+    @property
+    def waiting(self) -> int:
+        """How many jobs wait."""
+        return len(self._jobs)
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether there are emulated machines behind the drives."""
+        return self._real is not None and self._real.machine is not None
+
+    @property
+    def axes(self) -> Sequence[AxisState]:
+        """What is known of every axis; empty before the drives are open."""
+        return () if self._states is None else self._states.axes
+
+    @property
+    def scales(self) -> Sequence[Scale]:
+        """What the units of each axis follow; empty before the drives are open."""
+        return () if self._states is None else self._states.scales
+
+    def forget_faults(self, axis: int) -> None:
+        """Take note that the faults of an axis were reset."""
+        if self._states is not None:
+            self._states.forget_faults(axis)
+
+    @property
+    def lateness(self) -> str:
+        """How many SYNCs of a bus were late since the start, in words; "" for none, and for emulated drives."""
+        bus = None if self._real is None else self._real.bus
+        if bus is None or not bus.total_timing.late:
+            return ""
+        cycles, late, worst = bus.total_timing
+        return f"{100.0 * late / cycles:.1f} % of the SYNCs were late, the worst by {1e3 * worst:.0f} ms"
+
+    @property
+    def num_axes(self) -> int:
+        """Number of axes; 0 before the drives are open."""
+        return 0 if self._real is None else self._real.num_axes
+
+    # --- the thread of the drives -----------------------------------------------------------------------------------
+    def _run(self) -> None:
+        try:
+            self._real = self._open()
+        except BaseException as error:
+            self.failure, self.error = sentence(error), error
+            self.state = "failed"
+            self._refuse_all(RuntimeError(self.failure))
+            self.when_not_opened()
+            return
+        try:
+            if self._real.bus is not None:
+                self.description = self._real.bus.description  # which knows the time between two SYNCs
+            self.recorder = ScopeRecorder(self._real.num_axes, self.description.cycle)
+            self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear, self.presence.moves)
+            self._states = AxisStates(self._real, self.description)
+            self._choose_samples()
+            self._drives.advance(PIECE)  # emulators are compiled here
+            self._read_stored()
+            self.state = "open"
+            while not self._is_closing:
+                job = self._next()
+                if job is None:
+                    self._idle()
+                else:
+                    self._work(job)
+        except BaseException as error:  # nothing that a drive or a job does may end the thread
+            self.failure = sentence(error)
+            logger.error("the session ends: %s", self.failure)
+        finally:
+            self._end()
+
+    def _read_stored(self) -> None:
+        """Read the parameters of every axis: after a start they are what the drive has stored."""
+        assert self._drives is not None
+        drives = self._drives
+        self.stored = {axis: {} for axis in range(self.num_axes)}
+        for entry in parameters(SingleAxes(drives, self.description).as_bus()):
+            key = (entry.index, entry.sub)
+            with contextlib.suppress(ObjectAccessError):
+                for axis, value in enumerate(drives.read(key).tolist()):
+                    self.stored[axis][key] = int(value)
+
+    def _end(self) -> None:
+        real = self._real
+        assert real is not None
+        try:
+            if real.safety is None:
+                self._bring_to_rest(real)
+            real.close()
+        except BaseException as error:
+            logger.error("closing the drives: %s", sentence(error))
+        self.state = "failed" if self.failure else "closed"
+        self._refuse_all(RuntimeError(self.failure or "the drives are closed; start the studio again"))
+
+    def _refuse_all(self, error: BaseException) -> None:
+        with self._waiting:
+            waiting, self._jobs = list(self._jobs), deque()
+        for job in waiting:
+            job.refuse(error)
+
+    def _next(self) -> Job | None:
+        with self._waiting:
+            if not self._jobs:
+                return None
+            self._current = self._jobs.popleft()
+            return self._current
+
+    def _work(self, job: Job) -> None:
+        drives = self._drives
+        assert drives is not None
+        if not job.future.set_running_or_notify_cancel():  # its page has given it up
+            with self._waiting:
+                self._current = None
+            return
+        drives.paced = job.paced
+        try:
+            result = job.function(drives)
+        except (KeyboardInterrupt, SystemExit) as error:  # which would end the event loop that waits for it
+            job.future.set_exception(JobEndedError(f"stopped: {error or job.stopped}"))
+        except BaseException as error:
+            job.future.set_exception(JobEndedError(f"stopped: {job.stopped}") if job.stopped else error)
+        else:
+            job.future.set_result(result)
+        finally:
+            drives.paced = True
+            with self._waiting:
+                self._current = None
+
+    def _idle(self) -> None:
+        """Let time pass for a moment, and look at the drives."""
+        drives, states = self._drives, self._states
+        assert drives is not None and states is not None
+        if time.monotonic() - self._failed_at < RETRY:
+            with self._waiting:
+                self._waiting.wait(PIECE)
+            return
+        try:
+            drives.advance(PIECE if drives.time_waits else BUS_IDLE)
+            states.refresh(drives, self.recorder)
+            drives.emergencies()
+        except JobStoppedError:
+            pass
+        except SafetyError as error:  # the envelope has stopped the drives
+            self._tell_stop(error)
+        except Exception as error:  # a node that is gone: told, and tried again
+            self._failed_at = time.monotonic()
+            told = sentence(error)
+            if not self.events or self.events[-1].text != told:
+                self.say("error", told)
+
+    def _tell_stop(self, error: SafetyError) -> None:
+        """Say why the envelope has stopped the drives, unless that was asked for a moment ago, and is told."""
+        if time.monotonic() - self._told_at > STOP_WAIT or not str(error).startswith(self._told_reason):
+            self.say("error", sentence(error))
+
+    def _look(self) -> None:
+        """See to everything that must not wait for a job: called before each call and after each piece of time."""
+        job = self._current
+        if self._stop_asked:
+            self._obey()
+        for overdue in self.presence.take_overdue():
+            self.say("warning", f"stopped: {overdue.why}")
+            self._stop(overdue.axes)
+        if not self.presence.is_abandoned():
+            self._is_left = False
+        elif self._is_any_live():
+            self._leave_alone(job)
+        if job is not None and job.stopped and not job.is_told:
+            job.is_told = True
+            raise JobStoppedError(job.stopped)
+
+    def _obey(self) -> None:
+        """Do what `stop_now` asks of this thread."""
+        reason, self._stop_asked = self._stop_asked, ""
+        now = time.monotonic()
+        if now - self._told_at > TOLD_ONCE:  # a page has two ways to ask
+            self.say("warning", f"quick stop: {reason}")
+        self._told_at, self._told_reason = now, reason
+        self._stop(np.ones(self.num_axes, bool))
+
+    def _leave_alone(self, job: Job | None) -> None:
+        """Stop and disable everything, since nobody looks at an axis that is enabled."""
+        if not self._is_left:
+            self._is_left = True
+            self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")
+        if job is not None and not job.stopped:
+            job.stopped = "the last page was closed"
+        self._stop(np.ones(self.num_axes, bool))
+        assert self._real is not None
+        self._bring_to_rest(self._real)
+
+    def _stop(self, axes: Mask) -> None:
+        """Quick-stop axes that are live; past the look, which is where it is called from."""
+        self.presence.end_all(axes)
+        real, drives = self._real, self._drives
+        assert real is not None and drives is not None
+        try:
+            with drives.lock:
+                _stop_live(real, axes)
+        except SafetyError as error:  # the envelope stops them already
+            self._tell_stop(error)
+        except Exception as error:  # the bus is gone: the drive's watchdog acts
+            self.say("error", sentence(error))
+
+    def _bring_to_rest(self, real: Drives) -> None:
+        """Wait until no axis turns any more, then take the voltage away."""
+        assert self._drives is not None
+        try:
+            with self._drives.lock:
+                live = _stop_live(real)
+                waited = 0.0
+                while live.any() and waited < STOP_WAIT and _turns(real, live):
+                    real.advance(PIECE)
+                    waited += PIECE
+                if live.any():
+                    motion.disable(real, where=live)
+        except Exception as error:
+            self.say("error", sentence(error))
+
+    def _is_any_live(self) -> bool:
+        newest = self.recorder.newest().get((cia402.STATUSWORD, 0))
+        return newest is not None and bool(np.any(cia402.is_live(newest)))
+
+    def _hear(self, messages: Sequence[EmergencyMessage]) -> None:
+        assert self._states is not None
+        for message in messages:
+            self.say(*self._states.hear(message))
+
+
+def _stop_live(drives: Drives, axes: Mask | None = None) -> Mask:
+    """Quick-stop the axes that are in operation enabled; return those that may be live."""
+    status = drives.read(cia402.STATUSWORD)
+    live = np.asarray(cia402.is_live(status)) & (True if axes is None else axes)
+    enabled = np.asarray(live & cia402.matches(status, cia402.OPERATION_ENABLED))
+    if enabled.any():
+        motion.quick_stop(drives, where=enabled)
+    return np.asarray(live)
+
+
+def _turns(drives: Drives, axes: Mask) -> bool:
+    """Return whether an axis is still being stopped, or moves."""
+    before = drives.read(cia402.POSITION_ACTUAL)
+    drives.advance(PIECE)
+    moved = np.abs(drives.read(cia402.POSITION_ACTUAL) - before)
+    return bool(np.any(moved[axes] > motion.NEAR))

@@ -1,0 +1,241 @@
+"""The drives as a job of the studio sees them: it can be stopped at any call, and all that passes is recorded.
+
+Emulated drives live in real time here, in pieces of 20 ms, unless a job is in a hurry; those of a bus do so by
+themselves.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.drives.arguments import object_names, whole_cycles
+from drive_env.drives.interface import Drives, Integers, Mask
+from drive_env.drives.trace import Trace
+from drive_env.studio.recorder import ScopeRecorder
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.dictionary.entries import ObjectName
+    from drive_env.drives.emergency import EmergencyMessage
+    from drive_env.drives.observed import Observer
+    from drive_env.emulator.machine import Machines
+    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.envelope import Envelope
+
+PIECE = 0.02  # s of emulated time between two looks at whether to go on
+BUS_PIECE = 0.1  # s of a recording on a bus, where nothing is played
+SEAMLESS = 0.004  # s between two recordings of a bus, whose SYNCs follow one another
+MOST_BEHIND = 0.1  # s; a computer that was slower does not catch up
+
+Key = tuple[int, int]
+
+
+class SharedDrives:
+    """Drives whose calls end when their job is stopped.
+
+    Args:
+        drives: The drives, emulated or on a bus.
+        recorder: Keeps what is sampled.
+        look: Called between two pieces of time, by the thread whose calls these are; it may raise, which ends them.
+        hear: Called with emergencies, whoever asked for them.
+        moves: Returns whether a page moves an axis by a button that it holds, or as long as it is there.
+
+    Attributes:
+        lock: Held while emulated drives are called: a stop from another thread waits for a piece at most.
+        paced: Whether emulated time passes as fast as real time; otherwise as fast as it can.
+    """
+
+    def __init__(
+        self,
+        drives: Drives,
+        recorder: ScopeRecorder,
+        look: Callable[[], None],
+        hear: Callable[[Sequence[EmergencyMessage]], None],
+        moves: Callable[[], bool],
+    ) -> None:
+        self.lock = threading.RLock()
+        self.paced = True
+        self._drives = drives
+        self._recorder = recorder
+        self._look = look
+        self._hear = hear
+        self._moves = moves
+        self._refused: set[tuple[Key, ...]] = set()  # what cannot be sampled at once
+        self._due = time.perf_counter()
+        self._start = time.monotonic()
+
+    # --- the interface --------------------------------------------------------------------------------------------
+    @property
+    def num_axes(self) -> int:
+        """Number of axes."""
+        return self._drives.num_axes
+
+    @property
+    def device(self) -> Device | None:
+        """What the drives are."""
+        return self._drives.device
+
+    @property
+    def machine(self) -> Machines | None:
+        """The emulated machines' side."""
+        return self._drives.machine
+
+    @property
+    def bus(self) -> BusDrives | None:
+        """The same drives as those of a bus: for descriptions; its calls are not recorded, and cannot be stopped."""
+        return self._drives.bus
+
+    @property
+    def safety(self) -> Envelope | None:
+        """What watches over drives that may be real."""
+        return self._drives.safety
+
+    @property
+    def time_waits(self) -> bool:
+        """Whether time stands still until it is asked to pass."""
+        return self._drives.time_waits
+
+    @property
+    def observers(self) -> tuple[Observer, ...]:
+        """Who looks at these drives."""
+        return self._drives.observers
+
+    def read(self, name: ObjectName) -> Integers:
+        """Return an object of every axis."""
+        self._look()
+        with self.lock:
+            return self._drives.read(name)
+
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
+        """Write an object of every axis, or of some."""
+        self._look()
+        with self.lock:
+            self._drives.write(name, value, where=where)
+
+    def advance(self, duration: float) -> None:
+        """Let time pass [s], whole communication cycles; it is recorded."""
+        if not self._drives.time_waits:
+            cycle = self._recorder.period
+            duration = max(1, -int(-(duration + 1e-9) // cycle)) * cycle if duration > 0.0 else 0.0
+        if duration > 0.0:
+            self.record((), duration, period=self._recorder.period)
+
+    def record(
+        self,
+        objects: ObjectName | Sequence[ObjectName],
+        duration: float,
+        play: Mapping[Any, ArrayLike] | None = None,
+        period: float = 0.001,
+    ) -> Trace:
+        """Let time pass [s] while objects are recorded and played, as `Drives.record`; the recorder sees it, too."""
+        self._look()
+        asked = tuple(object_names(objects))
+        if self._drives.time_waits:
+            return self._in_pieces(asked, duration, play, period, PIECE)
+        if play and self._moves():  # set-points go out in one piece, in which no page's silence would be noticed
+            raise RuntimeError("a page moves an axis; end its jog, or its target, before set-points are played")
+        return self._in_pieces(asked, duration, play, period, duration if play else BUS_PIECE)
+
+    def emergencies(self) -> list[EmergencyMessage]:
+        """Return what the drives have said by themselves since the last call."""
+        with self.lock:
+            found = self._drives.emergencies()
+        if found:
+            self._hear(found)
+        return found
+
+    def reset_node(self, where: Mask | None = None) -> None:
+        """Restart nodes, as after power-on."""
+        self._look()
+        with self.lock:
+            self._drives.reset_node(where)
+
+    def close(self) -> None:
+        """Do nothing: the session closes its drives."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _in_pieces(
+        self,
+        asked: tuple[ObjectName, ...],
+        duration: float,
+        play: Mapping[Any, ArrayLike] | None,
+        period: float,
+        longest: float,
+    ) -> Trace:
+        cycle = self._recorder.period
+        cycles, every = whole_cycles(duration, cycle), whole_cycles(period, cycle)
+        rows = {name: np.asarray(values) for name, values in (play or {}).items()}
+        if cycles == 0 or every == 0 or any(one.ndim == 0 or len(one) != cycles for one in rows.values()):
+            with self.lock:
+                return self._drives.record(asked, duration, play, period)  # which knows what is wrong
+        piece = max(1, round(longest / cycle) // every) * every
+        parts = []
+        for first in range(0, cycles, piece):
+            count = min(piece, cycles - first)
+            part = {name: values[first : first + count] for name, values in rows.items()} or None
+            parts.append(self._piece(asked, count * cycle, part, period))
+            self._keep_pace(count * cycle)
+            self._look()
+        return parts[0] if len(parts) == 1 else Trace.joined(parts, period)
+
+    def _piece(
+        self,
+        asked: tuple[ObjectName, ...],
+        span: float,
+        play: Mapping[Any, ArrayLike] | None,
+        period: float,
+    ) -> Trace:
+        """Let a piece of time pass, with as much of what the recorder wants as can be sampled besides."""
+        wanted = self._recorder.objects
+        while (chosen := (*asked, *wanted)) in self._refused and wanted:
+            wanted = wanted[:-1]
+        start = self._begin()
+        while True:
+            try:
+                with self.lock:
+                    trace = self._drives.record((*asked, *wanted), span, play, period)
+                break
+            except ObjectAccessError:
+                if not wanted:
+                    raise
+                # More than fits into the process data of a bus, or what cannot be sampled: found before time passes.
+                self._refused.add(chosen)  # type: ignore[arg-type]
+                wanted = wanted[:-1]
+                chosen = (*asked, *wanted)
+        end = start + span
+        self._recorder.keep(trace, wanted, start, end)
+        return trace
+
+    def _begin(self) -> float:
+        """Return when what passes now begins [s]: right after what passed before, unless there was a gap."""
+        before = self._recorder.now
+        if self._drives.time_waits:
+            return before
+        now = time.monotonic() - self._start
+        return before if abs(now - before) < SEAMLESS else max(now, before)
+
+    def _keep_pace(self, span: float) -> None:
+        """Wait until real time has passed, too, where that of the drives does not by itself."""
+        now = time.perf_counter()
+        if not self._drives.time_waits or not self.paced:
+            self._due = now
+            return
+        self._due = max(self._due + span, now - MOST_BEHIND)
+        if self._due > now:
+            time.sleep(self._due - now)

@@ -1,0 +1,73 @@
+"""Drives, emulated or on a bus, with what the commands for parameters ask of those of a bus: one axis at a time.
+
+What is written goes through the Drives interface, and so through its envelope.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.drives.interface import Drives, Integers
+
+if TYPE_CHECKING:
+    from drive_env.master.bus_drives import BusDrives
+    from drive_env.master.description import Description
+
+
+class SingleAxes:
+    """Reads and writes single axes.
+
+    Args:
+        drives: The drives.
+        description: Of their device.
+    """
+
+    def __init__(self, drives: Drives, description: Description) -> None:
+        self._drives = drives
+        # A machine may have fewer axes than a node of its device.
+        per_node = min(description.num_axes, drives.num_axes)
+        self.description = replace(description, num_axes=per_node)
+        self.num_axes = drives.num_axes
+        bus = drives.bus
+        self.nodes: tuple[int, ...] = (
+            tuple(range(1, 1 + -(-drives.num_axes // per_node))) if bus is None else tuple(bus.nodes)
+        )
+
+    def read(self, name: ObjectName) -> Integers:
+        """Return an object of every axis."""
+        return self._drives.read(name)
+
+    def read_axis(self, entry: Entry, axis: int) -> Any:
+        """Return an object of one axis: an integer, or a text."""
+        found = self._drives.read((entry.index, entry.sub))[axis]
+        return str(found) if entry.bits is None else int(found)
+
+    def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
+        """Write an object of one axis."""
+        self._drives.write((entry.index, entry.sub), value, where=np.arange(self.num_axes) == axis)
+
+    def sdo(self, node: int) -> _Objects:
+        """Return what reads the objects of a node as bytes."""
+        return _Objects(self, node)
+
+    def as_bus(self) -> BusDrives:
+        """Return these as what the functions of `master/parameters.py` take."""
+        return cast("BusDrives", self)
+
+
+class _Objects:
+    """Reads objects of a node as bytes: for what a node says of itself."""
+
+    def __init__(self, axes: SingleAxes, node: int) -> None:
+        self._axes = axes
+        self._node = node
+
+    def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
+        """Return an object as bytes."""
+        known = self._axes.description
+        entry = known.dictionary.find((index, sub))
+        return known.encode(entry, self._axes.read_axis(entry, self._node * known.num_axes))

@@ -1,0 +1,71 @@
+"""A visitor: one browser page that is open, with the axis that it looks at, and its way to hand in jobs."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from nicegui import Client, background_tasks, ui
+
+from drive_env.drives.interface import Drives
+from drive_env.studio.sentences import sentence
+
+if TYPE_CHECKING:
+    from drive_env.studio.axis_states import AxisState
+    from drive_env.studio.session import Session
+
+T = TypeVar("T")
+KINDS = {"info": "info", "warning": "warning", "error": "negative", "done": "positive"}
+
+
+class Visitor:
+    """One open browser page.
+
+    Args:
+        session: The drives.
+        client: NiceGUI's side of it.
+        axis: The axis that it looks at.
+    """
+
+    def __init__(self, session: Session, client: Client, axis: int) -> None:
+        self.session = session
+        self.client = client
+        self.axis = axis
+        self.jog_speed = "60 rpm"
+
+    @property
+    def id(self) -> str:
+        """What tells it from other pages."""
+        return self.client.id
+
+    @property
+    def state(self) -> AxisState | None:
+        """What is known of its axis; None before the drives are open."""
+        axes = self.session.axes
+        return axes[self.axis] if self.axis < len(axes) else None
+
+    async def do(
+        self, function: Callable[[Drives], T], title: str, *, paced: bool = True, quiet: bool = False
+    ) -> T | None:
+        """Have a job run and return what it returns; None where it failed, which the page shows then."""
+        future = self.session.do(function, title, page=self.id, paced=paced, quiet=quiet)
+        try:
+            return await asyncio.wrap_future(future)
+        except Exception as error:
+            self.say(f"{title}: {sentence(error)}", "error")
+            return None
+
+    def hand_in(self, function: Callable[[Drives], T], title: str) -> None:
+        """Have a job run without waiting for it; the page shows it if it fails. For the event loop's thread."""
+        background_tasks.create(self.do(function, title), name=title)
+
+    def say(self, text: str, kind: str = "info") -> None:
+        """Show a line on the page: info, warning, error or done."""
+        if self.client.is_deleted:
+            return
+        with self.client:
+            ui.notify(
+                text, type=KINDS[kind], position="bottom-left", multi_line=True, close_button="Close",  # type: ignore[arg-type]
+                timeout=12_000 if kind == "error" else 4_000,
+            )  # fmt: skip
