@@ -39,6 +39,12 @@ class Slave:
         return self._waiting.pop(0) if self._waiting else b""
 
 
+def emergency(*content):
+    """A message of the mailbox with an emergency, whose counter is none of a transfer's."""
+    head = message(CoeService.EMERGENCY, bytes(content))
+    return struct.pack("<HHBB", len(head), 0, 0, MailboxProtocol.COE) + head
+
+
 def numbers(first, count):
     return bytes(range(first, first + count)).hex(" ")
 
@@ -85,3 +91,11 @@ def test_a_segment_with_the_toggle_bit_of_the_last_one_is_refused():
     with pytest.raises(SdoAbortError, match="did not alternate") as error:
         slave.client.upload(0x2005, 1, 1.0)
     assert error.value.abort_code == TOGGLE_NOT_ALTERNATED == 0x0503_0000
+
+
+def test_emergencies_between_are_kept_and_answer_nothing():
+    """Code, error register and five bytes of the device (ETG.1000.6, 5.6.4); one that is cut short is none."""
+    slave = Slave(f"4b {KEY.hex()} 34 12 00 00")
+    slave._waiting = [emergency(0x11, 0x86, 0x20, 1, 2, 3, 4, 5), emergency(0x11, 0x86), emergency(0x00, 0x00, 0x00)]
+    assert slave.client.upload(0x2005, 1, 1.0) == bytes.fromhex("34 12")
+    assert list(slave.client.emergencies) == [(0x8611, 0x20, (1, 2, 3, 4, 5)), (0x0000, 0x00, ())]
