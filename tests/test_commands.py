@@ -367,6 +367,15 @@ def test_a_ramp_that_would_not_stop_an_axis_from_its_speed_within_a_second_is_re
     bench.write(BRAKING, 499)
 
 
+def test_each_axis_has_a_ramp_of_its_own_for_its_own_speed():
+    bench = Bench(None, PV)
+    bench.axes.live[:] = True
+    bench.axes.velocity[:] = (50.0, -500.0)
+    bench.write(BRAKING, [50, 500])
+    bench.refuses(r"axis 1: .* = 499 would not stop it", BRAKING, [50, 499])
+    bench.refuses(r"axis 0: .* = 49 would not stop it", BRAKING, [49, 500])
+
+
 @pytest.mark.parametrize(
     ("mode", "value", "refused"), [(CSP, 100 * TURN, False), (CSP, 100 * TURN - 1, True), (PV, 5, False)]
 )

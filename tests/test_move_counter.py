@@ -43,9 +43,9 @@ PLAYED = [
 
 
 @pytest.mark.parametrize(("key", "rows", "moves"), PLAYED)
-@pytest.mark.parametrize("pieces", [1, 4], ids=["in one record", "in four"])
+@pytest.mark.parametrize("pieces", [1, 4, None], ids=["in one record", "in four", "row by row"])
 def test_what_is_played_is_counted_row_by_row(counter, key, rows, moves, pieces):
-    for part in np.array_split(rows, pieces):
+    for part in np.array_split(rows, pieces or len(rows)):
         counter.passed(len(part), {key: part})
     assert counter.moves.tolist() == [moves, moves]
 

@@ -115,6 +115,14 @@ def test_an_option_that_is_about_to_be_written_is_for_afterwards(raw, where, len
     assert not bench.drives.log
 
 
+def test_an_option_that_a_drive_lacks_does_not_hide_the_others():
+    bench = runner_of({HALT: 0, FAULT: (0, 1)})
+    del bench.drives.entries[QUICK]
+    bench.runner.make_sure_of_ramps()
+    assert bench.drives.values[HALT].tolist() == [1, 1]
+    assert bench.drives.values[FAULT].tolist() == [2, 2]
+
+
 def test_an_option_that_coasts_is_not_written_where_no_other_is_taken():
     bench = runner_of(takes={QUICK: lambda value: None})
     with pytest.raises(SafetyError, match=r"axis 1: 605Ah:00 object 605Ah = 0 would let it coast.*nothing was sent"):

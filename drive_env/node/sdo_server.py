@@ -64,7 +64,7 @@ class SdoServer:
     """
 
     def __init__(
-        self, port: Callable[[int, int], ObjectPort], timeout: float, block_size: int = 0, longest_text: int = 0
+        self, port: Callable[[int, int], ObjectPort], timeout: float, block_size: int, longest_text: int
     ) -> None:
         self._port = port
         self._timeout = timeout
