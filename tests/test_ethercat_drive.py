@@ -46,9 +46,9 @@ def first_line(process):
     raise AssertionError(f"it did not begin: {process.poll()}")
 
 
-def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal"):
+def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal", library="pysoem"):
     """Return what a master saw of a drive that is served."""
-    pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
+    pytest.importorskip(library, reason=f"{library} is not installed: pip install -e '.[test]'")
     program = "from drive_env.programs import drive_env; drive_env()"
     serve = ("-c", program, "serve", device, "--load", load, pace)
     served = subprocess.Popen(
