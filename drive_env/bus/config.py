@@ -38,10 +38,10 @@ class Machine:
     load: str = "two_mass"
     motor: str | None = None
     nodes: tuple[int, ...] = (1,)
-    on_ethercat: tuple[int, ...] = ()
     commissioned: bool = True
     ideal: bool = False
     parameters: Mapping[str, float] = field(default_factory=dict)
+    on_ethercat: tuple[int, ...] = ()
 
     @property
     def motor_name(self) -> str:

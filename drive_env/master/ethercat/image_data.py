@@ -165,7 +165,10 @@ class EtherCatProcessData:
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
         """Return whether the images that are exchanged carry these already."""
         has = len(self._ready) == len(self._nodes)
-        return has and self._carries(OUTPUTS, played) and set(sampled) <= set(self.sampled_entries())
+        if not has or not self._carries(OUTPUTS, played):
+            return False
+        # What nobody needs any more is not read before each frame.
+        return set(sampled) - set(self._layouts[INPUTS].entries) == set(self._beside)
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
         """Have images carry entries of every axis besides what is in them, as far as there is room.
