@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from test_tmcm3313_loops import target_of
 from typer.testing import CliRunner
 
 import agents.commands.cli
@@ -18,6 +19,9 @@ from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.slave import EtherCatSlave
 from drive_env.ethercat.ways import UdpSocket
 from drive_env.ethercat.world import EtherCatWorld
+from drive_env.master.ethercat_drives import EtherCatDrives
+from tuning.commands.optimise import leave_oscillations_to_trials
+from tuning.stepper.commissioning import commission
 
 
 @contextmanager
@@ -65,3 +69,15 @@ def test_an_agent_for_servos_tunes_no_stepper(tmp_path):
     with served("tmcm3313") as (port, _):
         code, printed = run(agents.commands.cli.app, "tune", "tmcm3313", port, tmp_path / "agent")
     assert code == 2 and "tmcm3313 has no P of the velocity loop" in printed and "drive-tune optimise" in printed
+
+
+@pytest.mark.slow
+def test_a_stepper_in_a_loop_is_commissioned(tmp_path):
+    """Inside the envelope at 6,000 rpm; `drive-tune auto` sets it less, and trials of its loop pass that."""
+    with (
+        served("tmcm3313") as (port, _),
+        EtherCatDrives("tmcm3313", interface="ethercat-udp", channel=port, pace="lockstep") as drives,
+    ):
+        leave_oscillations_to_trials(drives)
+        result = commission(target_of(drives), tmp_path / "before.toml", keep=False)
+    assert [axis.verdict == "rejected" for axis in result.axes] == [False] * drives.num_axes, result.axes
