@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import ethercat_cable
@@ -46,23 +47,30 @@ def first_line(process):
     raise AssertionError(f"it did not begin: {process.poll()}")
 
 
-def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal"):
-    """Return what a master saw of a drive that is served."""
-    pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
+@contextmanager
+def served(spaces, pace, device="tmcm3313", load="portal"):
+    """Serve a drive in its namespace."""
     program = "from drive_env.programs import drive_env; drive_env()"
     serve = ("-c", program, "serve", device, "--load", load, pace)
-    served = subprocess.Popen(
+    process = subprocess.Popen(
         inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface),
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
-        assert f"1 slave ({device}" in first_line(served)
+        assert f"1 slave ({device}" in first_line(process)
+        yield
+    finally:
+        process.terminate()
+        process.wait(PATIENCE)
+        process.stdout.close()
+
+
+def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal", library="pysoem"):
+    """Return what a master saw of a drive that is served."""
+    pytest.importorskip(library, reason=f"{library} is not installed: pip install -e '.[test]'")
+    with served(spaces, pace, device, load):
         master = inside(spaces.master, HERE / program_of_master, spaces.master_interface, *arguments)
         done = subprocess.run(master, capture_output=True, text=True, timeout=PATIENCE)
-    finally:
-        served.terminate()
-        served.wait(PATIENCE)
-        served.stdout.close()
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 

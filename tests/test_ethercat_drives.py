@@ -128,7 +128,7 @@ def test_it_goes_to_op_when_a_motor_is_to_run_and_to_init_at_the_end():
 
 
 def test_an_image_is_changed_while_no_axis_is_enabled_and_put_back():
-    with linked() as (drives, segment):
+    with linked(pace="real-time") as (drives, segment):
         drives.record([0x6041, 0x6077], 0.003)
         assert [entry.index for entry in drives.sampled_entries()] == [0x6041, 0x6077, 0x6064]
         motion.enable(drives, mode="csp")
@@ -141,6 +141,28 @@ def test_an_image_is_changed_while_no_axis_is_enabled_and_put_back():
             drives.record([0x6083], 0.002)
         assert (drives.read(0x6041) & 0x6F == 0x27).all(), "a refusal stops nobody"
     assert segment.slaves[0].application.input_size == 30
+
+
+def test_in_lockstep_what_no_image_has_is_read_by_sdo_before_each_frame():
+    """No time passes meanwhile: rows are those of a drive in process, whether an object is in the image or not."""
+    objects = [0x6041, 0x6064, 0x606C, 0x6077, 0x6062, 0x6083]
+    targets = np.minimum(np.arange(60), 40)[:, None] * np.array([4, 8, 12])
+
+    def moved(drives):
+        drives.record([0x6041, 0x6064, 0x6077], 0.003)
+        motion.enable(drives, mode="csp")
+        trace = drives.record(objects, 0.06, {0x607A: drives.read(0x6064) + targets})
+        later = drives.record([0x6062, 0x6064], 0.005)
+        motion.disable(drives)
+        return np.stack([trace[index] for index in objects]), np.stack([later[index] for index in (0x6062, 0x6064)])
+
+    with linked() as (drives, segment):
+        found = moved(drives)
+        assert segment.slaves[0].application.input_size == 24, "as it was chosen before the axes were enabled"
+    with EmulatedDrives("tmcm3313", load="portal", num_threads=1) as inside:
+        expected = moved(inside)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one[1:], other[1:])  # a statusword shows a controlword one row later
 
 
 def test_a_refusal_names_the_object_and_the_position():

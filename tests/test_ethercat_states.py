@@ -218,3 +218,27 @@ def test_each_slave_has_its_own():
         world.run_until(start + k * 1e-3)
         rig.write(0x1100, "01 02 03 04", STATION + 1)
     assert [rig.value(0x0130, station=STATION + k) for k in range(2)] == [S | ERROR, O]
+
+
+@pytest.mark.parametrize(
+    ("state", "mailbox", "counter", "locked"),
+    [
+        (AlState.OP, 1, 3, "0000"),
+        (AlState.SAFE_OP, 1, 3, "0000"),
+        (AlState.PRE_OP, 1, 0, "0011"),
+        (AlState.INIT, 0, 0, "1111"),
+    ],
+)
+def test_the_working_counter_says_that_a_slave_has_left_op(state, mailbox, counter, locked):
+    """A device deactivates the sync managers that its state has not (ET1100, section I, 8: 0807h bit 0)."""
+    rig = Rig()
+    rig.address()
+    rig.bring_to(AlState.OP)
+    if state is not AlState.OP:
+        assert rig.request(state) == (state, 0)
+    assert "".join(str(rig.value(0x0807 + 8 * k, 1) & 1) for k in range(4)) == locked
+    assert rig.exchange(bytes(4))[1] == counter
+    assert rig.mail(3, bytes(10)) == mailbox
+    if state < AlState.SAFE_OP:  # and it can be had again
+        rig.bring_to(AlState.OP)
+        assert rig.exchange(bytes(4))[1] == 3 and rig.mail(3, bytes(10)) == 1

@@ -209,9 +209,16 @@ def test_a_master_takes_the_image_that_has_what_is_played_and_puts_the_factorys_
             trace = drives.record([0x33C0, 0x6077], 0.3, {0x23C7: targets})
             assert trace[0x33C0][-1] - before == pytest.approx(targets[-1] - before, rel=0.2)
             motion.disable(drives)
-            with pytest.raises(ObjectAccessError, match=r"60FDh:00 .* is in no image of this drive, for every axis"):
-                drives.record([0x60FD], 0.002)
         assert (slave.output_size, slave.input_size) == (40, 40)
+
+
+def test_in_real_time_what_no_image_has_for_every_axis_is_refused():
+    with (
+        EmulatedSegment("tgz_d", load="gantry", lockstep=False) as segment,
+        EtherCatDrives("tgz_d", master=segment.master()) as drives,
+        pytest.raises(ObjectAccessError, match=r"60FDh:00 .* is in no image of this drive, for every axis"),
+    ):
+        drives.record([0x60FD], 0.002)
 
 
 def test_while_the_d_mode_does_not_fit_commands_of_the_image_are_ignored(rig):

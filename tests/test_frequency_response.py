@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from test_parity import served
 
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
 from drive_env.gains import BASELINE_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
 from tuning.identify.true_plant import true_plant
+from tuning.response import excitation_run
 from tuning.response.frequency_response import Signal, measure
 from tuning.response.held_samples import seen_by_bus
 from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
@@ -394,3 +396,16 @@ def test_what_cannot_be_measured_is_refused_before_anything_moves(arguments, mes
     with pytest.raises(ValueError, match=message):
         measure(target, **arguments)
     assert target.drives.read(0x6041)[0] & 0x6F != 0x27
+
+
+def test_an_axis_that_goes_on_after_an_excitation_has_both_of_its_modes():
+    """A mode of operation alone would leave the D-Mode of the excitation, with which the axis ignores its master."""
+    with EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1) as drives:
+        motion.enable(drives, mode="pp")
+        modes = drives.read(cia402.MODE)
+        motion.enable(drives, mode="csv")
+        excitation_run._give_modes_back(drives, modes, np.array([True, True]))
+        drives.advance(0.02)
+        assert drives.read(cia402.MODE).tolist() == [1, 1] and drives.read(0x2303).tolist() == [7, 7]
+        words = drives.read(cia402.STATUSWORD)
+        assert cia402.matches(words, cia402.OPERATION_ENABLED).all() and (words & cia402.REMOTE.mask).all()

@@ -30,7 +30,8 @@ class Machine:
     `motor` is by default the device's usual one. Drives that are not `commissioned` for their motor have their factory
     values. Axes of the last node that the load does not need have no motor connected. `parameters` are true machine
     parameters [SI] that replace defaults, as those of EmulatedDrives; `ideal` takes a stage, encoder and bearings
-    without faults.
+    without faults. `on_ethercat` are numbers of devices, from 0 in the order of the axes, that are slaves of an
+    EtherCAT master and no nodes.
     """
 
     device: str = "tmcm1636"
@@ -40,6 +41,7 @@ class Machine:
     commissioned: bool = True
     ideal: bool = False
     parameters: Mapping[str, float] = field(default_factory=dict)
+    on_ethercat: tuple[int, ...] = ()
 
     @property
     def motor_name(self) -> str:
@@ -54,7 +56,9 @@ class Bus:
     """All of a bus.
 
     `bit_rate` [bit/s]; `seed` of everything random; `store` the folder in which the nodes keep what is saved in them,
-    relative to the file; `machines` the machines; `faults` what disturbs the wire.
+    relative to the file; `machines` the machines; `faults` what disturbs the wire. Where some devices are on EtherCAT,
+    `ethercat_interface` and `ethercat_channel` are the way to them, as `--interface` and `--channel` of a bus that has
+    no others.
     """
 
     bit_rate: int = BIT_RATE
@@ -62,6 +66,13 @@ class Bus:
     store: str | None = None
     machines: tuple[Machine, ...] = (Machine(),)
     faults: Faults = field(default_factory=Faults)
+    ethercat_interface: str = "ethercat-udp"
+    ethercat_channel: str | None = None
+
+    @property
+    def has_both(self) -> bool:
+        """Whether some devices are on EtherCAT beside those on CAN."""
+        return any(row.on_ethercat for row in self.machines)
 
 
 def load_bus(path: Path) -> Bus:
@@ -101,7 +112,8 @@ def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
         world = World(lockstep=lockstep, wire=wire)
         store = store_folder(bus)
         for k, row in enumerate(bus.machines):
-            world.add(build_drives(bus, k), row.nodes, store)
+            check_devices(row)
+            world.add(build_drives(bus, k), row.nodes, store, row.on_ethercat)
     except (ValueError, OSError) as error:
         raise BusConfigError(str(error)) from None
     return world
@@ -121,6 +133,24 @@ def build_drives(bus: Bus, k: int) -> EmulatedDrives:
         row.device, row.load, row.motor, commissioned=row.commissioned, seed=bus.seed, first_machine=k,
         ideal=row.ideal, parameters=row.parameters, num_threads=1,
     )  # fmt: skip
+
+
+def check_devices(row: Machine) -> None:
+    """Raise ValueError where a machine says of other devices than its own that they are on EtherCAT."""
+    from drive_env.devices import find_device
+    from mechanics.loads import find_load
+
+    if not row.on_ethercat:
+        return
+    device, axes = find_device(row.device), find_load(row.load).num_axes
+    number = -(-axes // device.num_axes)
+    if len(set(row.on_ethercat)) < len(row.on_ethercat) or not set(row.on_ethercat) <= set(range(number)):
+        raise ValueError(
+            f"on_ethercat = {list(row.on_ethercat)}: load {row.load!r} takes {number} of {row.device}; name each "
+            f"at most once, 0 to {number - 1}"
+        )
+    if device.ethercat is None:
+        raise ValueError(f"on_ethercat = {list(row.on_ethercat)}: {row.device} has no EtherCAT; take a device that has")
 
 
 def check_seed(bus: Bus) -> None:
@@ -170,7 +200,8 @@ def _numbers(where: str, value: Any) -> dict[str, float]:
 
 
 _READERS = {
-    "machines": _machines, "faults": _faults, "nodes": _whole_numbers, "only": _whole_numbers, "parameters": _numbers,
+    "machines": _machines, "faults": _faults, "nodes": _whole_numbers, "on_ethercat": _whole_numbers,
+    "only": _whole_numbers, "parameters": _numbers,
 }  # fmt: skip
 _SCALARS: dict[str, type] = {"str": str, "str | None": str, "int": int, "float": float, "bool": bool}
 _MEANINGS: dict[type, str] = {str: "a text", int: "a whole number", float: "a number", bool: "true or false"}

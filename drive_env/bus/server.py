@@ -29,6 +29,7 @@ class Server:
     Attributes:
         lateness: Of the cycles begun in real time [s].
         skipped: Time that was not made up for [s].
+        guard: Held while the world is changed; whoever else changes it takes it.
 
     Args:
         world: What is served.
@@ -40,6 +41,7 @@ class Server:
         self.transport = transport
         self.lateness = Lateness()
         self.skipped = 0.0
+        self.guard = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
@@ -116,18 +118,25 @@ class Server:
     def _run_real_time(self) -> None:
         world, transport, wire = self.world, self.transport, self.world.wire
         while not self._over():
-            self._catch_up()
-            transport.flush()
-            wait = min(LONGEST_WAIT, world.next_event() - self._now() - EARLY)
+            with self.guard:
+                self.catch_up()
+                transport.flush()
+                wait = min(LONGEST_WAIT, world.next_event() - self._now() - EARLY)
             for frame, sender, extended in transport.wait(max(0.0, wait), wire):
-                self._catch_up()
-                world.receive(frame, sender, extended=extended)
+                with self.guard:
+                    self.catch_up()
+                    world.receive(frame, sender, extended=extended)
 
     def _now(self) -> float:
         return time.perf_counter() - self._start
 
-    def _catch_up(self) -> None:
-        """Let everything happen that is due."""
+    @property
+    def is_serving(self) -> bool:
+        """Whether real time has begun."""
+        return self._start > 0.0
+
+    def catch_up(self) -> None:
+        """Let everything happen that is due in real time; whoever calls holds the guard."""
         late = self._now() - self.world.next_cycle
         if late > MOST_BEHIND:
             self.skipped += late

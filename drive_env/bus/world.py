@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -47,6 +47,22 @@ class BusNode(Protocol):
         """Boot."""
 
 
+class Beside(Protocol):
+    """What lives by a world's time without being on its bus: another fieldbus of the same machines."""
+
+    def begin_cycle(self) -> None:
+        """Prepare for a communication cycle."""
+
+    def end_cycle(self) -> None:
+        """Take what a communication cycle has brought."""
+
+    def pass_time(self, now: float) -> None:
+        """Do what is due between cycles until `now` [s]."""
+
+    def next_event(self) -> float:
+        """Return when something is due next [s]."""
+
+
 class World:
     """Nodes and their drives on one bus.
 
@@ -58,8 +74,10 @@ class World:
     Attributes:
         nodes: Node identifier -> node; those that begin without one have numbers from 128 on here.
         drives: All emulated drives, each a set with its nodes.
+        machines: Those of `drives` that have a load, in the order in which they were added.
         listeners: Called with each frame that everybody received, also its own sender.
         before_cycle: Called as a communication cycle begins; they may send by the wire.
+        beside: Another fieldbus of these drives, that lives by this world's time; None: there is none.
         time: Time since the world began [s].
         cycles: Communication cycles that have passed.
 
@@ -73,8 +91,10 @@ class World:
         self.wire = wire if wire is not None else Wire(instant=lockstep)
         self.nodes: dict[int, BusNode] = {}
         self.drives: list[EmulatedDrives] = []
+        self.machines: list[EmulatedDrives] = []
         self.listeners: list[Callable[[Transmission], None]] = []
         self.before_cycle: list[Callable[[], None]] = []
+        self.beside: Beside | None = None
         self.time = 0.0
         self.cycles = 0
         self._answering: list[Node] = []  # whose SDO answers take time
@@ -84,7 +104,13 @@ class World:
         self._overflowed: set[int] = set()
         self._off: dict[int, float] = {}  # node identifier -> when its controller is back [s]
 
-    def add(self, drives: EmulatedDrives, node_ids: Sequence[int], store: Path | None = None) -> list[Node]:
+    def add(
+        self,
+        drives: EmulatedDrives,
+        node_ids: Sequence[int],
+        store: Path | None = None,
+        elsewhere: Collection[int] = (),
+    ) -> list[Node]:
         """Put drives on the bus, one node per device, and return the nodes.
 
         Axes of the last node that the machines leave over have no motor connected.
@@ -93,6 +119,7 @@ class World:
             drives: The drives; machines of several one-axis devices have as many nodes as axes.
             node_ids: Identifiers 1 to 127 in the order of the axes; 255, of devices with LSS, for a node without one.
             store: Folder of the nodes' stored values; without one they live as long as the world.
+            elsewhere: Numbers of the devices, from 0 in the order of the axes, that are not on this bus.
 
         Raises:
             ValueError: For identifiers that are taken, out of range, or too few or too many; for a bit rate of the wire
@@ -100,26 +127,32 @@ class World:
         """
         per_node = drives.device.num_axes
         needed = -(-drives.num_axes // per_node)
-        if len(node_ids) != needed:
+        here = [k for k in range(needed) if k not in elsewhere]
+        if len(node_ids) != len(here):
             raise ValueError(
                 f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take {needed} nodes of "
-                f"{drives.device.name}, which drives {per_node} axes; {len(node_ids)} node identifiers were given"
+                f"{drives.device.name}, which drives {per_node} axes{self._told(needed - len(here))}; "
+                f"{len(node_ids)} node identifiers were given"
             )
-        left_over = needed * per_node - drives.num_axes
+        left_over = needed * per_node - drives.num_axes if needed - 1 in here else 0
         spare = without_motors(drives, left_over) if left_over else None
         nodes: list[Node] = []
-        for k, given in enumerate(node_ids):
+        for k, given in zip(here, node_ids, strict=True):
             is_new = given == UNCONFIGURED and drives.device.canopen.services.lss
             node_id = max([MAX_NODE_ID, *self.nodes]) + 1 if is_new else given
             path = None if store is None else store / f"node-{node_id}-{Path(drives.device.name).stem}.json"
 
             def make(
-                send: Callable[[Frame], None], k: int = k, path: Path | None = path, node_id: int = node_id
+                send: Callable[[Frame], None],
+                k: int = k,
+                path: Path | None = path,
+                node_id: int = node_id,
+                given: int = given,
             ) -> Node:
                 bit_rate = round(self.wire.bit_rate)
                 real = not self.lockstep  # docs/decisions/bus.md has why nothing takes time in lockstep
                 node = Node(
-                    node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real,
+                    given, drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real,
                     spare=spare if k == needed - 1 else None, serial=node_id,
                     has_room=lambda: self.wire.waiting(("node", node_id)) < self._room_of(node_id) // 2,
                 )  # fmt: skip
@@ -132,8 +165,13 @@ class World:
             axes = slice(k * per_node, (k + 1) * per_node)
             drives.machine.connect_lamps(axes, self._lamps_of(nodes[-1], node_id))
         self.drives += [drives] if spare is None else [drives, spare]
+        self.machines.append(drives)
         self._answering += nodes
         return nodes
+
+    @staticmethod
+    def _told(elsewhere: int) -> str:
+        return f" ({elsewhere} of them on EtherCAT)" if elsewhere else ""
 
     def attach(self, node_id: int, make: Callable[[Callable[[Frame], None]], BusNode]) -> None:
         """Put a node on the bus that `make` returns when handed the function by which it sends."""
@@ -195,6 +233,8 @@ class World:
             else:
                 break
         self.time = max(self.time, now)
+        if self.beside is not None:
+            self.beside.pass_time(self.time)
 
     @property
     def next_cycle(self) -> float:
@@ -203,7 +243,8 @@ class World:
 
     def next_event(self) -> float:
         """Return when `run_until` has something to do next [s]."""
-        return min(self.next_cycle, self.wire.next_event(), self._next_answer())
+        beside = math.inf if self.beside is None else self.beside.next_event()
+        return min(self.next_cycle, self.wire.next_event(), self._next_answer(), beside)
 
     def cycle(self) -> None:
         """Let one communication cycle of 1 ms pass."""
@@ -217,10 +258,14 @@ class World:
             self.nodes[node_id].overrun(self.time, "transmit")
         for node in self.nodes.values():
             node.before_cycle(self.time)
+        if self.beside is not None:
+            self.beside.begin_cycle()
         for drives in self.drives:
             drives.advance(CYCLE)
         self.cycles += 1
         self.time = self.cycles * CYCLE
+        if self.beside is not None:
+            self.beside.end_cycle()
         for node in self.nodes.values():
             node.after_cycle(self.time)
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from drive_env.bus.config import Bus
     from drive_env.bus.server import Server
     from drive_env.bus.transport import Transport
+    from drive_env.ethercat.beside_can import BesideCan
     from drive_env.ethercat.ethercat_server import EtherCatServer
     from drive_env.faults.control import Control
 
@@ -122,7 +123,7 @@ def serve(
             token = secrets.token_urlsafe(TOKEN_BYTES)
         made = _server(bus, real_time, port, listen, token, interface, channel)
         server.append(made)
-        controls = _faults(made, fault or [], control)
+        controls: list[Control | BesideCan] = [*_faults(made, fault or [], control), *_beside(made, bus, real_time)]
         _announce(made, bus, real_time, token, interface, channel)
         try:
             made.run(duration)
@@ -176,6 +177,10 @@ def _serve_ethercat(
     from drive_env.commands.options import check_free
     from drive_env.commands.serve_ethercat import open_ethercat, run_ethercat
 
+    if bus.has_both:
+        _fail(
+            f"machines of this bus are on CAN, too: leave --interface {interface} out; the file says where EtherCAT is"
+        )
     for name, value in of_can.items():
         if value is not None and value != []:
             _fail(f"--{name} is for CAN; a slave on --interface {interface} has none: leave it out")
@@ -233,6 +238,17 @@ def _server(
     open_transport().close()
     _warm_up(bus)
     return Server(world, open_transport())
+
+
+def _beside(server: Server, bus: Bus, real_time: bool) -> list[BesideCan]:
+    """Return what answers the EtherCAT master of a bus that has drives on both."""
+    from drive_env.commands.serve_ethercat import open_beside
+
+    if not bus.has_both:
+        return []
+    if not real_time:
+        _fail("drives on CAN and EtherCAT at once have one time, that of the clock: leave --lockstep out")
+    return [open_beside(server, bus, _fail)]
 
 
 def _faults(server: Server, orders: list[str], port: int | None) -> list[Control]:
@@ -299,6 +315,7 @@ def _announce(
 
     nodes = ", ".join(
         f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor_name}, {row.load}"
+        f"{f'; {len(row.on_ethercat)} on EtherCAT' if row.on_ethercat else ''}"
         f"{'' if row.commissioned else '; factory values, not commissioned'})"
         for row in bus.machines
     )

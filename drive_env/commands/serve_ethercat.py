@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
+    from drive_env.bus.server import Server
+    from drive_env.ethercat.beside_can import BesideCan
     from drive_env.ethercat.ethercat_server import EtherCatServer
     from drive_env.ethercat.ways import EtherCatWay
     from drive_env.ethercat.world import EtherCatWorld
@@ -46,6 +48,26 @@ def open_ethercat(
         first.cycle()
     first.close()
     return EtherCatServer(world, open_way())
+
+
+def open_beside(server: Server, bus: Bus, fail: Callable[[str], NoReturn]) -> BesideCan:
+    """Let the slaves of a bus with drives on CAN, too, answer their master; `fail` ends the command."""
+    from drive_env.bus.config import BusConfigError
+    from drive_env.ethercat.beside_can import BesideCan
+    from drive_env.ethercat.slaves import build_beside
+
+    if bus.ethercat_interface not in (RAW, UDP):
+        fail(f"ethercat_interface = {bus.ethercat_interface!r} must be {RAW} or {UDP}")
+    try:
+        beside = BesideCan(
+            server, build_beside(bus, server.world), _way(bus.ethercat_interface, bus.ethercat_channel, fail)
+        )
+    except (BusConfigError, OSError) as error:
+        fail(str(error))
+    beside.start()
+    number = len(beside.world.segment.slaves)
+    print(f"drive-env: {number} slave{'s' if number > 1 else ''} on {beside.way.name}, beside the nodes on CAN")
+    return beside
 
 
 def run_ethercat(server: EtherCatServer, bus: Bus, duration: float | None, pcap: Path | None, stats: bool) -> None:

@@ -32,6 +32,7 @@ SYNC_MANAGERS_END = registers.SYNC_MANAGERS + registers.NUM_SYNC_MANAGERS * regi
 FMMUS_END = registers.FMMUS + registers.NUM_FMMUS * registers.FMMU_SIZE
 MICROSECOND = 1e-6
 ACTIVATE, REPEAT = 6, 0x02  # byte of a sync manager's registers, and its bit
+PDI_CONTROL, DEACTIVATED = 7, 0x01  # alike, the device's side
 UNUSED_PORTS = 0b01010000_00000000  # of 0110h: ports 2 and 3 are closed
 DL_EVENT, AL_EVENT = 0x04, 0x08  # of 0210h
 WATCHDOG_IS_GOOD = 0x01
@@ -68,6 +69,7 @@ class SlaveController:
         """Reset all registers, and read the configuration of the EEPROM's content `sii`."""
         self.memory[:] = registers.reset_values()
         for manager in self.managers:
+            manager.is_locked = False
             manager.configure(SyncManagerSetting(0, 0, 0, False))
             manager.reset()
         self._units: list[Fmmu] = []
@@ -109,9 +111,18 @@ class SlaveController:
     def acknowledge_repeat(self, number: int) -> None:
         """Answer the repeat request of a sync manager."""
         base = registers.SYNC_MANAGERS + number * registers.SYNC_MANAGER_SIZE
-        self.memory[base + 7] = self.memory[base + 7] & ~REPEAT | (
+        self.memory[base + PDI_CONTROL] = self.memory[base + PDI_CONTROL] & ~REPEAT | (
             REPEAT if self.managers[number].repeat_request else 0
         )
+
+    def deactivate(self, number: int, is_locked: bool) -> None:
+        """Deactivate a sync manager, or activate it again, from the device's side (0807h); either empties it."""
+        manager = self.managers[number]
+        if manager.is_locked != is_locked:
+            manager.is_locked = is_locked
+            manager.reset()
+            at = registers.SYNC_MANAGERS + number * registers.SYNC_MANAGER_SIZE + PDI_CONTROL
+            self.memory[at] = self.memory[at] & ~DEACTIVATED | (DEACTIVATED if is_locked else 0)
 
     # --- watchdog of process data -------------------------------------------------------------------------------------
     @property
@@ -128,7 +139,10 @@ class SlaveController:
     def watchdog_deadline(self) -> float | None:
         """Return when it expires [s]; None: it is off, or no sync manager is watched."""
         time = self.watchdog_time
-        watched = any(m.end and m.setting.has_watchdog and m.setting.is_written_by_master for m in self.managers)
+        watched = any(
+            m.end and not m.is_locked and m.setting.has_watchdog and m.setting.is_written_by_master
+            for m in self.managers
+        )
         return self._triggered + time if time > 0.0 and watched else None
 
     def expire_watchdog(self) -> None:

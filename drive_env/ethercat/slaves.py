@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drive_env.bus.config import BusConfigError, build_drives, check_seed, store_folder
 from drive_env.devices import find_device
 from drive_env.ethercat.slave import EtherCatSlave
-from drive_env.ethercat.world import EtherCatWorld
+from drive_env.ethercat.world import CYCLE, EtherCatWorld
 
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
+    from drive_env.bus.world import World
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
 
 def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
@@ -24,30 +27,66 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
     Raises:
         BusConfigError: If it cannot be.
     """
-    from drive_env.bus.world import without_motors
-    from drive_env.ethercat.coe_node import CoeNode
-
     check_seed(bus)
     world = EtherCatWorld(lockstep=lockstep, cycle_time=_cycle_time(bus))
     try:
         store = store_folder(bus)
         for k in range(len(bus.machines)):
             drives = build_drives(bus, k)
-            per_slave = drives.device.num_axes
-            for first in range(0, drives.num_axes, per_slave):
-                position = len(world.segment.slaves)
-                name = f"slave-{position}-{Path(drives.device.name).stem}.json"
-                left_over = max(first + per_slave - drives.num_axes, 0)
-                spare = without_motors(drives, left_over) if left_over else None
-                device = CoeNode(
-                    drives, first, spare=spare, store=None if store is None else store / name, serial=position + 1
-                )
-                world.add(EtherCatSlave(device, takes_time=not lockstep, epoch=position))
-                world.drives += ([drives] if first == 0 else []) + ([] if spare is None else [spare])
+            world.drives += [drives, *add_slaves(world, drives, store)]
     except (ValueError, OSError) as error:
         world.close()
         raise BusConfigError(str(error)) from None
     return world
+
+
+def build_beside(bus: Bus, world: World) -> EtherCatWorld:
+    """Return the slaves of a bus whose other devices are nodes of a CAN world; they live by that world's time.
+
+    Raises:
+        BusConfigError: If it cannot be.
+    """
+    beside = EtherCatWorld(lockstep=world.lockstep, cycle_time=_cycle_time(bus))
+    try:
+        if beside.cycle_time != CYCLE:
+            raise ValueError(f"beside CAN a communication cycle is {1e3 * CYCLE:g} ms, not {1e3 * beside.cycle_time:g}")
+        store = store_folder(bus)
+        for drives, row in zip(world.machines, bus.machines, strict=True):
+            world.drives += add_slaves(beside, drives, store, row.on_ethercat)
+    except (ValueError, OSError) as error:
+        raise BusConfigError(str(error)) from None
+    world.beside = beside
+    return beside
+
+
+def add_slaves(
+    world: EtherCatWorld, drives: EmulatedDrives, store: Path | None, devices: Collection[int] | None = None
+) -> list[EmulatedDrives]:
+    """Put devices of a machine at the end of the line.
+
+    Args:
+        world: Where the line is.
+        drives: The machine's drives.
+        store: Folder of the values that slaves store.
+        devices: Numbers of the devices, from 0 in the order of the axes; all by default.
+
+    Returns:
+        Drives of the axes that the machine leaves over, which have no motor connected; they must advance, too.
+    """
+    from drive_env.bus.world import without_motors
+    from drive_env.ethercat.coe_node import CoeNode
+
+    per_slave, spares = drives.device.num_axes, []
+    number = -(-drives.num_axes // per_slave)
+    for k in range(number) if devices is None else sorted(devices):
+        first, position = k * per_slave, len(world.segment.slaves)
+        name = f"slave-{position}-{Path(drives.device.name).stem}.json"
+        left_over = max(first + per_slave - drives.num_axes, 0)
+        spare = without_motors(drives, left_over) if left_over else None
+        spares += [] if spare is None else [spare]
+        node = CoeNode(drives, first, spare=spare, store=None if store is None else store / name, serial=position + 1)
+        world.add(EtherCatSlave(node, takes_time=not world.lockstep, epoch=position))
+    return spares
 
 
 def _cycle_time(bus: Bus) -> float:

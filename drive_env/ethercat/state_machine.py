@@ -30,6 +30,12 @@ TRANSITIONS = frozenset((
 WITH_MAILBOX = frozenset((S.PRE_OP, S.SAFE_OP, S.OP))
 WITH_INPUTS = frozenset((S.SAFE_OP, S.OP))
 RECEIVE, SEND, OUTPUTS, INPUTS = range(4)  # sync managers
+# Those that the device keeps active in a state that it enters: the working counter tells a master that it has left Op.
+# At power-on the registers are at their reset values, and nothing is deactivated.
+ACTIVE = {
+    S.INIT: (), S.BOOTSTRAP: (RECEIVE, SEND), S.PRE_OP: (RECEIVE, SEND),
+    S.SAFE_OP: (RECEIVE, SEND, OUTPUTS, INPUTS), S.OP: (RECEIVE, SEND, OUTPUTS, INPUTS),
+}  # fmt: skip
 
 
 class StateMachine:
@@ -95,9 +101,14 @@ class StateMachine:
     # --- inside -----------------------------------------------------------------------------------------------------
     def _enter(self, new: AlState, code: AlStatusCode, now: float) -> None:
         self.state, self.has_error, self.code = new, code is not Code.NO_ERROR, code
+        self._activate()
         self._changed(new, now)
         self._application.state_changed(new, code, now)
         self._show()
+
+    def _activate(self) -> None:
+        for number in (RECEIVE, SEND, OUTPUTS, INPUTS):
+            self._controller.deactivate(number, number not in ACTIVE[self.state])
 
     def _refuse(self, code: AlStatusCode) -> None:
         self.has_error, self.code = True, code

@@ -20,6 +20,7 @@ class SyncManager:
     Attributes:
         setting: As the master has set it.
         end: First address behind its memory; 0 while it is off.
+        is_locked: The device has deactivated it: the master can neither read nor write its memory.
         repeat_request: The bit by which the master asks for the last mailbox message again.
         written: Bytes that the master has written whole, since the device last looked; None: none.
         was_read: The master has read a whole buffer since the device last looked.
@@ -27,7 +28,7 @@ class SyncManager:
 
     def __init__(self) -> None:
         self.setting = OFF
-        self.repeat_request = False
+        self.repeat_request = self.is_locked = False
         self.reset()
 
     def reset(self) -> None:
@@ -64,7 +65,7 @@ class SyncManager:
     def master_write(self, first: int, data: bytes | bytearray) -> bool:
         """Write bytes from offset `first` on; returns whether it was allowed."""
         setting = self.setting
-        if not setting.is_written_by_master or (setting.is_mailbox and self.is_full):
+        if self.is_locked or not setting.is_written_by_master or (setting.is_mailbox and self.is_full):
             return False
         if first == 0:
             self._is_writing = True
@@ -82,7 +83,7 @@ class SyncManager:
     def master_read(self, first: int, length: int) -> bytes | None:
         """Return bytes from offset `first` on; None: not allowed."""
         setting = self.setting
-        if setting.is_written_by_master or (setting.is_mailbox and not self.is_full):
+        if self.is_locked or setting.is_written_by_master or (setting.is_mailbox and not self.is_full):
             return None
         if first == 0:
             self._reading = self._newest

@@ -70,6 +70,10 @@ class EtherCatWorld:
             if begins is not None:
                 begins(self.next_cycle)
             self.cycle()
+        self.pass_time(now)
+
+    def pass_time(self, now: float) -> None:
+        """Let pulses and watchdogs happen that are due until `now` [s]."""
         self.time = max(self.time, now)
         for slave in self.segment.slaves:
             slave.run_until(self.time)
@@ -85,10 +89,18 @@ class EtherCatWorld:
 
     def cycle(self) -> None:
         """Let one communication cycle pass."""
-        for slave in self.segment.slaves:
-            slave.before_cycle(self.time)
+        self.begin_cycle()
         for drives in self.drives:
             drives.advance(self.cycle_time)
+        self.end_cycle()
+
+    def begin_cycle(self) -> None:
+        """Do what is due before the drives advance."""
+        for slave in self.segment.slaves:
+            slave.before_cycle(self.time)
+
+    def end_cycle(self) -> None:
+        """Do what is due after the drives have advanced."""
         self.cycles += 1
         self.time = max(self.time, self.cycles * self.cycle_time)
         for slave in self.segment.slaves:

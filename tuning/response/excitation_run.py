@@ -112,10 +112,7 @@ class Shaker:
             motion.disable(drives, where=off & _enabled(drives))
         for name, values in zip(INTERPOLATION, self._interpolation, strict=True):
             drives.write(name, values, where=where)
-        for mode in np.unique(self._modes[where]):
-            changed = where & (self._modes == mode) & (drives.read(cia402.MODE) != mode)
-            if mode and changed.any():
-                drives.write(cia402.MODE, mode, where=changed)
+        _give_modes_back(drives, self._modes, where)
 
     def run(self, amplitude: Floats, speed: Floats, passes: int, periods: int, *, traced: bool = False) -> Pass:
         """Run there and back; the axes end at rest.
@@ -243,10 +240,19 @@ def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
     finally:
         if (now := off & _enabled(drives)).any():
             motion.disable(drives, where=now)
-        for mode in np.unique(modes[where]):
-            changed = where & (modes == mode) & (drives.read(cia402.MODE) != mode)
-            if mode and changed.any():
-                drives.write(cia402.MODE, mode, where=changed)
+        _give_modes_back(drives, modes, where)
+
+
+def _give_modes_back(drives: Drives, modes: Integers, where: Mask) -> None:
+    """Write the modes from before; an axis that goes on takes commands in its own, with a drive's mode that fits."""
+    names = {number: name for name, number in cia402.MODES.items()}
+    for mode in np.unique(modes[where]).tolist():
+        changed = where & (modes == mode) & (drives.read(cia402.MODE) != mode)
+        goes_on = changed & _enabled(drives) if mode in names else changed & False
+        if goes_on.any():
+            motion.select_mode(drives, names[mode], goes_on)
+        if mode and (changed & ~goes_on).any():
+            drives.write(cia402.MODE, mode, where=changed & ~goes_on)
 
 
 @contextmanager

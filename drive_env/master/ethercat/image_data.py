@@ -3,6 +3,9 @@
 An image stays as it is from frame to frame: what is not played keeps its last value, and what is written to an object
 of an image by an SDO is put into the image, too. Images are changed in Pre-Op, where no motor runs; so they are not
 changed while an axis is enabled.
+
+In lockstep no time passes but with a frame of process data. What no image has, or would change it while an axis is
+enabled, is then read by SDO before each frame, when the drive has what the frame brings back.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +28,7 @@ from drive_env.master.ethercat.ethercat_master import EtherCatMaster, ImageSizes
 from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImageLayout, ImagePlanner
 from drive_env.master.ethercat.slave_images import SlaveImages
 from drive_env.master.link import ObjectClient
-from drive_env.master.packing import unpack_rows
+from drive_env.master.packing import Member, unpack_rows
 
 Integers = NDArray[np.int64]
 FRAME = 0.02  # s for a frame to come back in real time
@@ -126,6 +130,7 @@ class EtherCatProcessData:
         self._planner = ImagePlanner(description)
         self._layouts: dict[int, ImageLayout] = {}
         self._places: dict[Key, tuple[int, int]] = {}
+        self._beside: tuple[Entry, ...] = ()  # what is read by SDO before each frame, in lockstep
         self._ready: set[int] = set()  # slaves that have these images, by their number here
         self._clients: list[ObjectClient] = []
         self._slaves: list[SlaveImages] = []
@@ -138,6 +143,7 @@ class EtherCatProcessData:
     # --- what is chosen ---------------------------------------------------------------------------------------------
     def check_sampled(self, entries: Sequence[Entry]) -> None:
         """Raise ObjectAccessError 06040041h for an object that cannot come with every cycle."""
+        entries = [entry for entry in entries if not self._lockstep or entry.bits is None]
         self._check(entries, INPUTS, "wo", "recorded")
 
     def check_played(self, entries: Sequence[Entry]) -> None:
@@ -152,13 +158,17 @@ class EtherCatProcessData:
         Raises:
             ObjectAccessError: 06040042h if not even what is wanted fits.
         """
-        image = self._planner.plan(INPUTS, wanted, self._layout(INPUTS)).entries
+        fitting = self._fitting(wanted) if self._lockstep else wanted
+        image = self._planner.plan(INPUTS, fitting, self._layout(INPUTS)).entries
         return (*wanted, *(entry for entry in welcome if entry in image and entry not in wanted))
 
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
         """Return whether the images that are exchanged carry these already."""
         has = len(self._ready) == len(self._nodes)
-        return has and self._carries(OUTPUTS, played) and self._carries(INPUTS, sampled)
+        if not has or not self._carries(OUTPUTS, played):
+            return False
+        # What nobody needs any more is not read before each frame.
+        return set(sampled) - set(self._layouts[INPUTS].entries) == set(self._beside)
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
         """Have images carry entries of every axis besides what is in them, as far as there is room.
@@ -167,10 +177,14 @@ class EtherCatProcessData:
             ObjectAccessError: 06040042h if they do not fit; 08000022h while an axis is enabled: images are changed in
                 Pre-Op, where no motor runs.
         """
+        fitting = self._fitting(sampled) if self._lockstep else sampled
+        if self._lockstep and self._is_any_enabled() and self._carries(OUTPUTS, played):
+            fitting = tuple(entry for entry in fitting if entry in self._layouts[INPUTS].entries)
         wanted = {
             direction: self._planner.plan(direction, entries, self._layout(direction))
-            for direction, entries in ((OUTPUTS, played), (INPUTS, sampled))
+            for direction, entries in ((OUTPUTS, played), (INPUTS, fitting))
         }
+        self._beside = tuple(entry for entry in sampled if entry not in fitting)
         self.mapping += 1
         if wanted == self._layouts and len(self._ready) == len(self._nodes):
             return
@@ -183,7 +197,7 @@ class EtherCatProcessData:
 
     def sampled_entries(self) -> tuple[Entry, ...]:
         """Return what comes with every cycle."""
-        return self._layouts[INPUTS].entries if self._ready else ()
+        return (*self._layouts[INPUTS].entries, *self._beside) if self._ready else ()
 
     def outputs(self, played: Mapping[Entry, Integers]) -> ImageRows | None:
         """Return rows to send; None of nothing."""
@@ -192,7 +206,7 @@ class EtherCatProcessData:
     def samples(self) -> ImageSamples | None:
         """Begin to collect input images; None while there are none."""
         self.owed = 0
-        return ImageSamples(self, self._layouts[INPUTS], self._description) if self._ready else None
+        return ImageSamples(self, self._sampled_layout(), self._description) if self._ready else None
 
     def forget(self, nodes: Sequence[int]) -> None:
         """Forget what nodes have: they have restarted."""
@@ -264,10 +278,11 @@ class EtherCatProcessData:
         with self.turn:
             if self.is_silent or len(self._ready) < len(self._nodes):
                 return False
+            beside = self._read_beside() if is_cycle and self._beside else [b""] * len(self._nodes)
             found = self._master.exchange([bytes(image) for image in self.images], timeout)
             if self.phase is not None and self._master.system_time is not None:
                 self.phase.take(self._master.system_time)
-            row = [image for image in found if image is not None]
+            row = [image + more for image, more in zip(found, beside, strict=True) if image is not None]
             if len(row) < len(self._nodes):
                 return False
             self.exchanged_at = time.monotonic()
@@ -289,6 +304,39 @@ class EtherCatProcessData:
             return True
 
     # --- inside -----------------------------------------------------------------------------------------------------
+    def _fitting(self, wanted: Sequence[Entry]) -> tuple[Entry, ...]:
+        """Return what of the wanted an image can have together, the first ones first."""
+        fitting: tuple[Entry, ...] = ()
+        for entry in wanted:
+            with suppress(ObjectAccessError):
+                self._check([entry], INPUTS, "wo", "recorded")
+                self._planner.plan(INPUTS, (*fitting, entry), self._layout(INPUTS))
+                fitting = (*fitting, entry)
+        return fitting
+
+    def _sampled_layout(self) -> ImageLayout:
+        """Return where each object is in a row: the input image, and behind it what is read by SDO."""
+        layout, members = self._layouts[INPUTS], []
+        size = layout.size
+        for entry in self._beside:
+            for axis in range(self._description.num_axes):
+                width = (entry.bits or 0) // 8
+                members.append(Member(entry, axis, size, width))
+                size += width
+        return layout._replace(members=(*layout.members, *members), size=size)
+
+    def _read_beside(self) -> list[bytes]:
+        """Return of each slave what is read by SDO, in the order of `_sampled_layout`."""
+        known, rows = self._description, []
+        for client in self._clients:
+            parts = []
+            for entry in self._beside:
+                for axis in range(known.num_axes):
+                    data = client.read(*known.key(entry, axis), known.label(entry, axis), known.answer_timeout)
+                    parts.append(data[: (entry.bits or 0) // 8])
+            rows.append(b"".join(parts))
+        return rows
+
     def _layout(self, direction: int) -> ImageLayout:
         """Return the image that is mapped, or will be where nobody asks for more: the slave's, and what is needed."""
         if direction not in self._layouts:
@@ -307,20 +355,30 @@ class EtherCatProcessData:
                 raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot be {verb}: it is no process data")
 
     def _check_none_is_enabled(self, entries: Sequence[Entry]) -> None:
+        axis = self._enabled_axis()
+        if axis is not None:
+            names = ", ".join(entry.label for entry in entries if not self._is_in_an_image(entry))
+            raise ObjectAccessError(
+                WRONG_STATE,
+                f"{names} is not in the process image, which cannot be changed while axis {axis} is enabled; record or "
+                "play it once before enabling",
+            )
+
+    def _is_any_enabled(self) -> bool:
+        return self._enabled_axis() is not None
+
+    def _enabled_axis(self) -> int | None:
+        """Return the first axis that is enabled; None: none is, or no slave has its images."""
         if not self._ready:
-            return
+            return None
         status = self._description.dictionary.find((cia402.STATUSWORD, 0))
         for k, client in enumerate(self._clients):
             for axis in range(self._description.num_axes):
                 label = self._description.label(status, axis)
                 data = client.read(*self._description.key(status, axis), label, self._description.answer_timeout)
                 if cia402.is_live(int.from_bytes(data, "little")):
-                    names = ", ".join(entry.label for entry in entries if not self._is_in_an_image(entry))
-                    raise ObjectAccessError(
-                        WRONG_STATE,
-                        f"{names} is not in the process image, which cannot be changed while axis "
-                        f"{k * self._description.num_axes + axis} is enabled; record or play it once before enabling",
-                    )
+                    return k * self._description.num_axes + axis
+        return None
 
     def _is_in_an_image(self, entry: Entry) -> bool:
         return any(entry in layout.entries for layout in self._layouts.values())
