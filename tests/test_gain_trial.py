@@ -9,7 +9,7 @@ import pytest
 
 from drive_env import cia402
 from drive_env.devices import find_device
-from drive_env.motors import find_motor
+from drive_env.motors import MOTORS, find_motor
 from drive_env.trials import gain_trial
 from drive_env.trials.gain_trial import (
     PHASES,
@@ -30,6 +30,7 @@ from drive_env.trials.positioning import (
     SETTLED,
     TRIAL,
     WATCH,
+    highest_ramp,
     plan_move,
     power_up,
     resting_swing,
@@ -355,3 +356,22 @@ def test_a_move_is_as_long_as_torque_speed_and_travel_allow(inertia, reach, angl
 def test_a_move_of_nothing_has_a_ramp_and_a_speed_all_the_same():
     move = plan_move(MOTOR, np.array([1.0]), 65536, np.array([0.0]))
     assert (move.distance, move.acceleration, move.velocity) == (0, 1, np.ceil(2 / 0.06) + 1)
+
+
+def test_a_move_asks_for_no_ramp_that_its_drive_refuses():
+    """The TMCM-6212 takes 7,629,278 pps^2 (its EDS); of every motor, with nothing but its rotor to turn."""
+    highest = highest_ramp(find_device("tmcm6212"))
+    assert highest == 7_629_278
+    steeper = 0
+    for motor in MOTORS.values():
+        free, bound = (
+            plan_move(motor, np.array([motor.inertia]), np.array([51_200]), np.array([np.inf]), most)
+            for most in (np.inf, highest)
+        )
+        assert bound.acceleration[0] <= highest, motor.name
+        steeper += free.acceleration[0] > highest
+        if free.acceleration[0] <= highest:
+            assert bound.distance == free.distance
+        else:
+            assert bound.acceleration[0] == pytest.approx(highest, abs=2_500)  # two increments of the way
+    assert steeper > 2 and highest_ramp(find_device("tmcm1636_fw109")) == np.inf  # which counts in rpm/s

@@ -27,6 +27,7 @@ from drive_env.trials.positioning import (
     TRIAL,
     WATCH,
     Move,
+    highest_ramp,
     move_terms,
     plan_move,
     power_up,
@@ -130,7 +131,13 @@ class Trials:
         drives = self._drives
         origin = drives.read(cia402.POSITION_ACTUAL)
         scaler = drives.read(Role.POSITION_SCALE)
-        move = plan_move(self._motor, np.full(drives.num_axes, 3.0 * self._motor.inertia), scaler, reach)
+        move = plan_move(
+            self._motor,
+            np.full(drives.num_axes, 3.0 * self._motor.inertia),
+            scaler,
+            reach,
+            highest_ramp(device_of(drives)),
+        )
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL]
         traces = []

@@ -23,7 +23,7 @@ from drive_env.trials.closed_loop import ClosedLoopTrials, plan_overload
 from drive_env.trials.gain_trial import Identified, Trials, softness
 from drive_env.trials.open_loop import OpenLoopTrials, open_loop_cost, open_loop_softness
 from drive_env.trials.position_pid import PID_I, PID_P, PidTrials, load_step_error, pid_time, plan_pid
-from drive_env.trials.positioning import plan_move
+from drive_env.trials.positioning import highest_ramp, plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Cascade(NamedTuple):
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
         """Return the move of trials; arguments as `positioning.plan_move` has them."""
-        return plan_move(self.motor, found.inertia, scaler, reach)
+        return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device))
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return the gains of the baseline rule."""
@@ -158,7 +158,7 @@ class OpenLoop(NamedTuple):
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
         """Return the move of trials."""
-        return plan_move(self.motor, found.inertia, scaler, reach)
+        return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device))
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return currents with which the load takes 30 degrees of load angle in the move."""

@@ -35,6 +35,7 @@ from drive_env.trials.positioning import (
     TRIAL,
     WATCH,
     Move,
+    highest_ramp,
     plan_move,
     start,
     wrapped,
@@ -265,7 +266,8 @@ class OpenLoopTrials(Trials):
         self.shift()
         origin = drives.read(cia402.POSITION_ACTUAL)
         scaler = drives.read(Role.POSITION_SCALE)
-        move = plan_move(motor, np.full(drives.num_axes, 3.0 * motor.inertia), scaler, reach)
+        most = highest_ramp(device_of(drives))
+        move = plan_move(motor, np.full(drives.num_axes, 3.0 * motor.inertia), scaler, reach, most)
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]
         traces = []

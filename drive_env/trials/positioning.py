@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.devices import Device
+from drive_env.dictionary.units import split_unit
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
@@ -29,6 +31,7 @@ CYCLE = 0.001  # s
 # In communication cycles: the profile, the end of the window in which it settles, and the trial.
 PROFILE, SETTLED, TRIAL = 60, 150, 250
 QUIET = (PROFILE + SETTLED) // 2  # where the ripple is looked at from
+COUNTED_RAMP = "pps^2"  # unit of ramps in increments per second squared
 WATCH = 25  # how often a trial looks whether the current swings
 ACCELERATION_SHARE = 0.4  # of the rated torque
 SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
@@ -54,7 +57,18 @@ class Move(NamedTuple):
         return 0.5 / self.counts * (TRIAL - SETTLED) * CYCLE
 
 
-def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayLike) -> Move:
+def highest_ramp(device: Device) -> float:
+    """Return the highest acceleration that a drive takes [inc/s^2], by its dictionary; inf where it counts in rpm.
+
+    The controllers of steppers have registers of 16 bits for it; others take more than any motor has.
+    """
+    key = (cia402.PROFILE_ACCELERATION, 0)
+    number, base = split_unit(device.bindings[key].unit)
+    high = device.new_dictionary().find(key).high
+    return math.inf if base != COUNTED_RAMP or high is None else high * number
+
+
+def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayLike, highest: float = math.inf) -> Move:
     """Return a triangular move of 60 ms with 0.4 of the rated torque, or less where speed or travel end before.
 
     Args:
@@ -62,13 +76,15 @@ def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayL
         inertia: Total inertia at the rotor [kg*m^2], shape (num_axes,).
         scaler: 2058h, increments per revolution.
         reach: How far the rotor may go, with its sign [rad].
+        highest: Acceleration that the drive takes at most [inc/s^2], see `highest_ramp`.
     """
     J, to = np.asarray(inertia, float), np.asarray(reach, float)
     time = PROFILE * CYCLE
     angle = ACCELERATION_SHARE * motor.rated_torque / J * time**2 / 4.0
     angle = np.minimum(angle, SPEED_SHARE * motor.rated_speed * time / 2.0)
-    angle = np.copysign(np.minimum(angle, TRAVEL_SHARE * np.abs(to)), to)
     increments = np.broadcast_to(np.asarray(scaler, float), angle.shape) / (2.0 * math.pi)
+    angle = np.minimum(angle, (highest * time**2 / 4.0 - 1.0) / increments)
+    angle = np.copysign(np.minimum(angle, TRAVEL_SHARE * np.abs(to)), to)
     distance = np.rint(angle * increments).astype(np.int64)
     # Rounded up: the profile ends in time.
     acceleration = np.ceil(np.maximum(4.0 * np.abs(distance) / time**2, 1.0)).astype(np.int64)

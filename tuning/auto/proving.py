@@ -21,7 +21,18 @@ from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trial, Trials, measured_cost, softness
 from drive_env.trials.oscillation import OSCILLATION, shakes
-from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
+from drive_env.trials.positioning import (
+    CYCLE,
+    TRIAL,
+    WATCH,
+    Move,
+    highest_ramp,
+    move_terms,
+    plan_move,
+    start,
+    wrapped,
+    write_profile,
+)
 from drive_env.trials.score import TRIP, Terms, cost
 from tuning.stop_causes import UNTOLD, stop_causes
 
@@ -150,7 +161,9 @@ class ProvingGround:
             shortest = np.abs(self.reach).reshape(ends).argmin(axis=1)
             self.reach = np.repeat(self.reach.reshape(ends)[np.arange(len(shortest)), shortest], ends[1])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
-        self.move: Move = plan_move(motor, inertia, drives.read(Role.POSITION_SCALE), self.reach)
+        self.move: Move = plan_move(
+            motor, inertia, drives.read(Role.POSITION_SCALE), self.reach, highest_ramp(target.device)
+        )
         self._count: Floats = self.move.increments / self.move.counts  # increments
         top = RETURN_SPEED * target.speed * self.move.increments
         self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from drive_env.gains import integers_per_si, rule_gains
 from drive_env.trials.oscillation import OSCILLATION
-from drive_env.trials.positioning import Move, plan_move
+from drive_env.trials.positioning import Move, highest_ramp, plan_move
 from drive_env.trials.score import RobustScore
 
 if TYPE_CHECKING:
@@ -289,7 +289,7 @@ class _Part:
         pull = np.array([-one.offset * motor.torque_constant for one in known])
         self._robust.set_constant_load(self._spread(pull))
         inertia = np.array([one.plant.inertia for one in known])
-        move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]))
+        move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]), highest_ramp(device))
         distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:4])
         self._robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
         self._robust.set_reference(self._spread(rule_gains(device, motor, inertia)))

@@ -23,7 +23,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import rule_gains
-from drive_env.trials.positioning import plan_move
+from drive_env.trials.positioning import highest_ramp, plan_move
 from drive_env.trials.score import RobustScore
 from mechanics.untrusted import parse_json
 from tuning.compare.rule_check import rule_passes
@@ -259,7 +259,9 @@ class Yardstick:
             reach = np.where(target.high >= -target.low, target.high, target.low)
             supply = target.supply.reshape(len(group), -1)[:, 0]
             self._score.set_machines(machine_of(drives).parameters, supply)
-            self._score.set_moves(plan_move(target.motor, inertia, drives.read(Role.POSITION_SCALE), reach))
+            self._score.set_moves(
+                plan_move(target.motor, inertia, drives.read(Role.POSITION_SCALE), reach, highest_ramp(target.device))
+            )
             rule = np.concatenate(
                 [
                     rule_gains(target.device, target.motor, J, supply=float(volts))
