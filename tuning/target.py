@@ -191,7 +191,10 @@ def of_machines(
     Args:
         drives: By which the tuner reaches them.
         made: What they were made as: its device, motor and load count.
-        supply, travel, speed, current: As `emulated` takes them.
+        supply: Supply voltage [V]; the motor's by default.
+        travel: How far the rotors may turn [rad], as `emulated` takes it.
+        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
+        current: Limit of what excites [A]; the motor's rated current by default.
 
     Raises:
         ValueError: For a travel that does not hold 0.
@@ -292,7 +295,11 @@ def of_bus(
         drives: The drives.
         motor: What every node turns.
         address: How they are opened again: what `CanDrives` takes.
-        supply, travel, speed, current, axes: As `on_bus` takes them.
+        supply: Supply voltage [V], one value or one per axis; the motor's by default.
+        travel: How far the rotors may turn from where they stand [rad], as `on_bus` takes it.
+        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
+        current: Limit of what excites [A]; the motor's rated current by default.
+        axes: How the nodes' axes belong together, one of `AXES`.
 
     Raises:
         ValueError: For a travel that does not hold 0.
