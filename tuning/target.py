@@ -267,7 +267,7 @@ def on_bus(
     drives = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
     try:
         target = of_bus(
-            drives, row, _address(interface, channel, numbers, options), supply=supply, travel=travel, speed=speed,
+            drives, row, address_of(interface, channel, numbers, options), supply=supply, travel=travel, speed=speed,
             current=current, axes=axes,
         )  # fmt: skip
         if "safety" not in options:
@@ -370,7 +370,7 @@ def _limits(
     }
 
 
-def _address(
+def address_of(
     interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return what opens these drives again; what a file cannot hold, such as an open bus, is left out."""
