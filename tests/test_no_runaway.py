@@ -11,6 +11,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 from contextlib import contextmanager, suppress
 
@@ -242,6 +243,54 @@ def test_three_ctrl_c_two_milliseconds_apart(emulated, programs):
             found[frame] = problems(world.truth)
             turned(world, TO_AND_FRO)
     assert not any(found.values()), found
+
+
+@pytest.mark.parametrize("doing", ["records", "advances", "computes"])
+def test_another_thread_stops_what_the_program_does(emulated, doing):
+    """`Envelope.stop_at_once`: the button of a page, while a job of the same program is under way."""
+    with bench(emulated) as (world, bus):
+        begun, told = threading.Event(), []
+
+        def press():
+            begun.wait(20.0)
+            time.sleep(0.2)
+            told[0].stop_at_once("somebody pressed the button")
+
+        def script(drives):
+            told.append(drives.safety)
+            turn_at(drives, SLOW)
+            thread.start()
+            begun.set()
+            if doing == "records":
+                drives.record([0x606C], 5.0)
+            elif doing == "advances":
+                drives.advance(5.0)
+            else:
+                end = time.monotonic() + 0.8
+                while time.monotonic() < end:
+                    np.sin(np.arange(1000.0))
+                stood.append(bool(world.truth.stands().all()))
+                drives.read(0x6041)
+
+        stood, thread = [], threading.Thread(target=press, daemon=True)
+        error = run(bus, script, safety=Limits())
+        assert isinstance(error, SafetyError) and str(error).startswith("somebody pressed the button"), error
+        assert stood in ([], [True])
+        ended_well(world, travel=(-100 * TURN, 100 * TURN))
+        turned(world, SLOW)
+
+
+def test_a_stop_from_another_thread_while_nothing_is_enabled_does_nothing(emulated):
+    with bench(emulated) as (world, bus):
+
+        def script(drives):
+            drives.safety.stop_at_once("somebody pressed the button")
+            turn_at(drives, SLOW, 0.3)
+
+        error = run(bus, script)
+        assert error is None
+        ended_well(world)
+        turned(world, SLOW)
 
 
 @pytest.mark.parametrize("when", ["as it is enabled", "while it turns"])

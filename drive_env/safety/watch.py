@@ -136,9 +136,10 @@ class Watch:
 
     def ask_to_stop(self, reason: str) -> None:
         """Have what is live stopped at the supervisor's next turn; callable from any thread."""
-        self._asked = reason
-        if self._supervisor is not None:
-            self._supervisor.wake()
+        supervisor = self._supervisor
+        if supervisor is not None:  # without one nothing is live, and what is enabled later is not meant
+            self._asked = reason
+            supervisor.wake()
 
     def carry_on(self) -> None:
         """Have the program told that a signal has stopped it, since it goes on."""

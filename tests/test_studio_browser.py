@@ -1,0 +1,289 @@
+"""The studio in a real browser, on an emulated machine: every page, and what people do on it."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+from selenium.webdriver.common.keys import Keys
+from studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
+
+pytestmark = needs_chromium
+PAGES = ("/axes", "/scope", "/dictionary")
+WIDTHS = (360, 1280, 2560)
+POSITION, VELOCITY = "Position actual value", "Velocity actual value"
+
+
+@pytest.fixture(scope="module")
+def served():
+    with studio() as made:
+        yield made
+        assert "Traceback" not in made.output, made.output
+
+
+@pytest.fixture(scope="module")
+def driver():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def tab(driver, served):
+    size_of(driver, 1280, 1000)
+    return Tab(driver, served)
+
+
+def at_rest(tab):
+    """Have the axis off, whatever the test before did."""
+    tab.open("/axes")
+    tab.press("disable")
+    tab.await_state("Switch on disabled")
+
+
+# --- every page ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("path", PAGES)
+def test_a_page_opens_without_an_error_and_from_this_computer_alone(tab, path):
+    tab.open(path)
+    time.sleep(0.5)
+    assert tab.errors() == []
+    script = "return performance.getEntriesByType('resource').map((one) => one.name)"
+    loaded = tab.driver.execute_script(script)
+    foreign = [one for one in loaded if not one.startswith((tab.served.page(""), "data:", "blob:"))]
+    assert foreign == []
+    assert tab.one(".studio-stop").is_displayed()
+
+
+@pytest.mark.every(2)
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("path", PAGES)
+def test_nothing_is_wider_than_the_window(tab, path, width):
+    size_of(tab.driver, width, 800)
+    tab.open(path)
+    time.sleep(0.3)
+    wide = tab.driver.execute_script("return document.documentElement.scrollWidth")
+    assert wide <= width
+    box = tab.one(".studio-stop").rect
+    assert box["x"] >= 0 and box["x"] + box["width"] <= width
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_every_control_has_a_name(tab, path):
+    """What a screen reader reads: a label, a text or an aria-label."""
+    tab.open(path)
+    script = """
+    const nameless = [];
+    for (const one of document.querySelectorAll("button, input, select, textarea, a, [role=button]")) {
+      if (one.closest("[aria-hidden=true]") || one.type === "file" || one.type === "hidden") continue;
+      const text = one.getAttribute("aria-label") || one.textContent.trim();
+      const label = text || (one.closest("label") || {}).textContent;
+      if (!label || !label.trim()) nameless.push(one.outerHTML.slice(0, 160));
+    }
+    return nameless;
+    """
+    assert tab.driver.execute_script(script) == []
+
+
+def test_navigation_by_keyboard_alone(tab):
+    tab.open("/axes")
+    for _ in range(12):
+        tab.key(Keys.TAB)
+        here = tab.driver.switch_to.active_element
+        if here.text.endswith("Scope"):
+            break
+    tab.key(Keys.ENTER)
+    until(lambda: tab.driver.current_url.endswith("/scope?axis=0"), "the page Scope")
+
+
+def test_light_and_dark(tab):
+    tab.open("/axes")
+    background = "return getComputedStyle(document.body).backgroundColor"
+    light = tab.driver.execute_script(background)
+    size_of(tab.driver, 1280, 1000, dark=True)
+    tab.open("/axes")
+    until(lambda: tab.driver.execute_script(background) != light, "the dark page")
+
+
+# --- axes ---------------------------------------------------------------------------------------------------------
+def test_enabled_moved_and_disabled(tab):
+    at_rest(tab)
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    before = tab.value(POSITION)
+    tab.type("goal", "90 deg")
+    tab.press("move-by")
+    until(lambda: abs(tab.value(POSITION) - before - 0.25) < 0.01, "the end of the move")
+    tab.press("disable")
+    tab.await_state("Switch on disabled")
+
+
+def test_a_move_of_an_axis_that_is_off_says_what_to_do(tab):
+    at_rest(tab)
+    tab.press("move-by")
+    until(lambda: any("enable it first" in line for line in tab.told()), f"the remedy; told: {tab.told()}")
+
+
+def test_transitions_are_pressed_in_the_diagram(tab):
+    at_rest(tab)
+    for transition, state in (("2", "Ready to switch on"), ("3", "Switched on"), ("6", "Ready to switch on")):
+        arrow = f".studio-diagram .can[aria-label^='{transition} ']"
+        until(lambda arrow=arrow: tab.all(arrow), f"transition {transition}")
+        tab.driver.execute_script(
+            "document.querySelector(arguments[0]).dispatchEvent(new MouseEvent('click', {bubbles: true}))", arrow
+        )
+        tab.await_state(state)
+    lit = tab.one(".studio-diagram .is-lit").text
+    assert lit == "Ready to switch on"
+
+
+@pytest.mark.every(5)
+@pytest.mark.parametrize("way", ["button", "space", "space, with a button focused", "control and space in a text"])
+@pytest.mark.parametrize("path", PAGES)
+def test_quick_stop_from_every_page(tab, path, way):
+    at_rest(tab)
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    tab.open(path)
+    assert tab.state == "Operation enabled"
+    if way == "button":
+        tab.one(".studio-stop").click()
+    elif way == "space":
+        tab.key(" ")
+    elif way == "space, with a button focused":
+        tab.driver.execute_script("document.querySelector('.studio-header button').focus()")
+        tab.key(" ")
+    else:
+        field = {"/axes": "goal", "/scope": "level", "/dictionary": "search"}[path]
+        tab.named(field).send_keys(Keys.CONTROL, " ")
+    until(lambda: tab.state != "Operation enabled", "the quick stop", 3.0)
+
+
+def test_the_space_bar_in_a_text_is_a_space(tab):
+    at_rest(tab)
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    tab.type("goal", "1 rev")
+    assert tab.named("goal").get_attribute("value") == "1 rev"
+    time.sleep(0.4)
+    assert tab.state == "Operation enabled"
+
+
+def test_a_jog_lasts_as_long_as_its_button_is_held(tab):
+    at_rest(tab)
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    tab.type("jog-speed", "300 rpm")
+    tab.hold_jog(-1)
+    until(lambda: tab.value(VELOCITY) < -200, "the jog")
+    tab.release()
+    until(lambda: abs(tab.value(VELOCITY)) < 5, "its end")
+    assert tab.state == "Operation enabled"
+
+
+def test_two_pages_at_once(tab, served):
+    """Both see the same axis; one stops what the other moves."""
+    at_rest(tab)
+    with chromium() as another:
+        second = Tab(another, served).open("/scope")
+        tab.press("enable")
+        second.await_state("Operation enabled")
+        tab.type("jog-speed", "200 rpm")
+        tab.hold_jog()
+        until(lambda: tab.value(VELOCITY) > 150, "the jog")
+        second.key(" ")
+        until(lambda: abs(tab.value(VELOCITY)) < 5, "the quick stop of the other page", 3.0)
+        tab.release()
+        until(lambda: second.state != "Operation enabled", "its state on the other page")
+        assert any("quick stop" in line for line in tab.told())
+
+
+# --- scope --------------------------------------------------------------------------------------------------------
+def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
+    at_rest(tab)
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    tab.open("/scope")
+    choose(tab, "trigger-mode", "single")
+    status = lambda: tab.one(".studio-scope-status").text  # noqa: E731
+    until(lambda: status() == "waiting for the trigger", "an armed trigger")
+    with chromium() as another:
+        mover = Tab(another, served).open("/axes")
+        mover.type("goal", "5 rev")
+        mover.press("move-by")
+        until(lambda: status() == "halted", "the picture")
+        header = tab.driver.execute_script("return studioScope.header")
+        assert header["triggered"] and header["from"] == pytest.approx(-0.2, abs=0.01)
+        assert {row["unit"] for row in header["channels"]} == {"rev", "rpm", "A"}
+    tab.press("measure")
+    until(lambda: "rise" in tab.one(".studio-figures").text, f"figures: {tab.one('.studio-figures').text}")
+
+
+def test_twenty_frames_a_second(tab):
+    tab.open("/scope")
+    until(lambda: tab.driver.execute_script("return studioScope.frames") > 5, "frames")
+    begun, first = time.monotonic(), tab.driver.execute_script("return studioScope.frames")
+    time.sleep(2.0)
+    frames = tab.driver.execute_script("return studioScope.frames") - first
+    assert frames / (time.monotonic() - begun) > 10.0  # on a busy computer; see benchmarks/studio.py
+
+
+def choose(tab, name, text):
+    """Choose a row of a select by keyboard and mouse."""
+    field = tab.named(name)
+    tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", field)
+    tab.driver.execute_script("arguments[0].closest('.q-field').querySelector('.q-field__control').click()", field)
+    until(lambda: [o for o in tab.all(".q-menu .q-item") if o.text == text], f"the choice {text}")
+    next(o for o in tab.all(".q-menu .q-item") if o.text == text).click()
+
+
+# --- dictionary ---------------------------------------------------------------------------------------------------
+def test_an_object_is_found_written_and_rolled_back(tab, tmp_path):
+    at_rest(tab)
+    tab.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    tab.open("/dictionary")
+    tab.press("backup")
+    until(lambda: list(tmp_path.glob("*.toml")), "the backup")
+    before = profile_velocity(tab)
+    assert before.endswith("rpm)")
+    tab.driver.execute_script("document.querySelector('[data-set=\"6081:00\"]').click()")
+    tab.type("value-6081-00", "-5 rpm")
+    until(lambda: not tab.named("write").is_enabled(), "a value that is refused before it is sent")
+    tab.type("value-6081-00", "432 rpm")
+    until(lambda: tab.named("write").is_enabled(), "a value that can be sent")
+    tab.press("write")
+    until(lambda: "(432 rpm)" in shown(tab, "6081:00"), "the new value")
+    tab.one("[data-test=restore-file] input[type=file]").send_keys(str(next(tmp_path.glob("*.toml"))))
+    until(lambda: "1 parameters were written" in tab.named("differences").text, "the restore")
+    tab.press("close-differences")
+    until(lambda: shown(tab, "6081:00") == before, "the value of before")
+
+
+def profile_velocity(tab):
+    """Return what is shown of 6081h once it has been found."""
+    tab.type("search", "profile vel")
+    until(lambda: "rpm" in shown(tab, "6081:00"), "the profile velocity")
+    return shown(tab, "6081:00")
+
+
+def shown(tab, name):
+    found = tab.all(f"[data-value='{name}']")
+    return found[0].text if found else ""
+
+
+def test_favourites_stay_in_the_browser(tab):
+    tab.open("/dictionary")
+    tab.driver.execute_script("localStorage.setItem('studio-favourites', '[]')")
+    tab.driver.execute_script("studioDictionary.toggle('6064:00')")
+    tab.open("/dictionary")
+    stored = json.loads(tab.driver.execute_script("return localStorage.getItem('studio-favourites')"))
+    assert stored == ["6064:00"]
+    tab.type("search", "6064")
+    until(lambda: tab.one("[data-key='6064:00'] .q-icon").text == "star", "its star")
+
+
+def test_compared_with_stored_nothing_differs(tab):
+    tab.open("/dictionary")
+    tab.press("stored")
+    until(lambda: "differ from stored" in tab.named("differences").text, "the comparison")
+    assert tab.named("differences").text.startswith("0 of")
+    tab.press("close-differences")

@@ -1,0 +1,128 @@
+"""Who may use the studio: hosts, origins, the token, by request and by websocket."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+import pytest
+
+pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
+
+from drive_env.studio.gate import COOKIE, StudioGate, checked_token, is_loopback, new_token
+from drive_env.studio.server import address, listen
+
+TOKEN = "a-token-of-sixteen"
+
+
+def ask(gate, kind="http", path="/axes", query="", **headers):
+    """Return what the gate sends, or "passed"."""
+    sent = []
+
+    async def receive():
+        return {"type": "websocket.connect"}
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {
+        "type": kind, "path": path, "query_string": query.encode(),
+        "headers": [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()],
+    }  # fmt: skip
+    asyncio.run(gate(scope, receive, send))
+    return sent
+
+
+def gate(host="127.0.0.1", token=None):
+    async def behind(scope, receive, send):
+        await send("passed")
+
+    return StudioGate(behind, host, 29640, token)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:29640", "localhost:29640", "LOCALHOST:29640", "[::1]:29640"])
+def test_a_name_of_this_computer_may_come(host):
+    assert ask(gate(), host=host) == ["passed"]
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example:29640", "127.0.0.1", "127.0.0.1:80", "localhost.evil.example:29640", ""]
+)
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+def test_a_name_that_is_not_ours_is_refused(host, kind):
+    """A page of another site that has pointed its own name at this computer: DNS rebinding."""
+    sent = ask(gate(), kind, host=host)
+    assert "passed" not in sent
+    assert sent[0].get("status") == 421 or sent[0]["type"] == "websocket.close"
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:8000", "https://localhost:1"])
+def test_a_page_of_another_site_is_refused(origin, kind):
+    sent = ask(gate(), kind, host="127.0.0.1:29640", origin=origin)
+    assert "passed" not in sent
+
+
+def test_our_own_page_may_come():
+    assert ask(gate(), "websocket", host="127.0.0.1:29640", origin="http://127.0.0.1:29640") == ["passed"]
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+@pytest.mark.parametrize("cookie", ["", f"{COOKIE}=wrong", f"other={TOKEN}", f"{COOKIE}={TOKEN}x"])
+def test_without_the_token_nobody_comes(kind, cookie):
+    sent = ask(gate("0.0.0.0", TOKEN), kind, host="machine:29640", cookie=cookie)
+    assert "passed" not in sent
+    assert sent[0].get("status") == 401 or sent[0]["type"] == "websocket.close"
+
+
+def test_the_token_in_the_address_becomes_a_cookie():
+    sent = ask(gate("0.0.0.0", TOKEN), path="/scope", query=f"axis=1&token={TOKEN}", host="machine:29640")
+    headers = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
+    assert sent[0]["status"] == 303 and headers["location"] == "/scope?axis=1"
+    assert "HttpOnly" in headers["set-cookie"]
+    cookie = headers["set-cookie"].partition(";")[0]
+    for kind in ("http", "websocket"):
+        assert ask(gate("0.0.0.0", TOKEN), kind, host="machine:29640", cookie=cookie) == ["passed"]
+
+
+def test_a_wrong_token_in_the_address_is_refused():
+    assert ask(gate("0.0.0.0", TOKEN), query="token=guess", host="machine:29640")[0]["status"] == 401
+
+
+def test_the_token_does_not_let_another_site_in():
+    sent = ask(gate("0.0.0.0", TOKEN), host="machine:29640", cookie=f"{COOKIE}={TOKEN}", origin="http://evil.example")
+    assert sent[0]["status"] == 403
+
+
+@pytest.mark.parametrize(("host", "is_it"), [
+    ("127.0.0.1", True), ("localhost", True), ("::1", True), ("127.5.5.5", True), ("0.0.0.0", False),
+    ("192.168.1.4", False), ("machine", False),
+])  # fmt: skip
+def test_what_a_loopback_address_is(host, is_it):
+    assert is_loopback(host) is is_it
+
+
+def test_tokens():
+    assert len(new_token()) >= 20 and new_token() != new_token()
+    assert checked_token(TOKEN) == TOKEN
+    for wrong in ("short", "with spaces in it", "x" * 11):
+        with pytest.raises(ValueError, match="12 or more"):
+            checked_token(wrong)
+
+
+def test_a_taken_port_is_told_with_what_to_do():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=rf"{port}: another program has it; .* --port"):
+            listen("127.0.0.1", port)
+
+
+def test_an_address_that_is_none_of_this_computer():
+    with pytest.raises(ValueError, match=r"cannot listen on 192\.0\.2\.1"):
+        listen("192.0.2.1", 0)
+
+
+def test_what_a_browser_opens():
+    assert address("127.0.0.1", 29640, None) == "http://127.0.0.1:29640/"
+    assert address("0.0.0.0", 29640, TOKEN).endswith(f":29640/?token={TOKEN}")
+    assert address("::1", 29640, None) == "http://[::1]:29640/"

@@ -1,0 +1,328 @@
+"""The session behind the studio: jobs, stops at once, what a page has set in motion, what is sampled."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from drive_env import EmulatedDrives, cia402, motion
+from drive_env.cia402 import State
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.description import describe
+from drive_env.studio import motion_jobs, presence
+from drive_env.studio.errors import JobEndedError
+from drive_env.studio.presence import Presence
+from drive_env.studio.sentences import sentence
+from drive_env.studio.session import Session
+
+FIRST = np.array([True])
+
+
+@pytest.fixture
+def session():
+    made = Session(lambda: EmulatedDrives(load="inertia", num_threads=1), "a machine", describe("tmcm1636", None))
+    made.presence.beat("page")
+    made.start()
+    until(lambda: made.state != "opening", 120.0)
+    assert made.state == "open", made.failure
+    yield made
+    made.close()
+
+
+def until(condition, patience=10.0):
+    end = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+class Beats:
+    """A page that is there as long as a block runs."""
+
+    def __init__(self, session, page="page", held=0):
+        self.session, self.page, self.held = session, page, held
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self):
+        while not self._end.wait(0.1):
+            self.session.presence.beat(self.page, self.held)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._end.set()
+        self._thread.join()
+
+
+def state_of(session):
+    return cia402.state_of(int(session.do(lambda drives: drives.read(cia402.STATUSWORD)[0], "look").result(10)))
+
+
+def speed_of(session):
+    return abs(int(session.do(lambda drives: drives.read(cia402.VELOCITY_ACTUAL)[0], "look").result(10)))
+
+
+def jogs(session, page="page", speed="300 rpm"):
+    """Have a page hold a jog; return its number once the axis turns."""
+    session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+    number = session.presence.begin(page, FIRST, held=True).number
+    session.do(motion_jobs.turn(session, 0, speed, number), "jog").result(10)
+    return number
+
+
+# --- jobs ---------------------------------------------------------------------------------------------------------
+def test_a_job_returns_what_its_function_returns(session):
+    assert session.do(lambda drives: drives.num_axes, "count").result(10) == 1
+
+
+def test_jobs_run_one_after_the_other(session):
+    order = []
+    futures = [session.do(lambda drives, k=k: order.append(k), "note") for k in range(5)]
+    [future.result(10) for future in futures]
+    assert order == list(range(5))
+
+
+def test_an_error_reaches_whoever_asked_and_the_session_goes_on(session):
+    with pytest.raises(ObjectAccessError):
+        session.do(lambda drives: drives.read(0x5FFE), "read").result(10)
+    assert session.do(lambda drives: drives.num_axes, "count").result(10) == 1
+
+
+def test_time_of_an_emulated_machine_passes_as_fast_as_ours(session):
+    before, begun = session.recorder.now, time.monotonic()
+    time.sleep(1.0)
+    assert session.recorder.now - before == pytest.approx(time.monotonic() - begun, abs=0.3)
+
+
+def test_a_job_in_a_hurry_is_not_paced(session):
+    begun = time.monotonic()
+    session.do(lambda drives: drives.advance(5.0), "five seconds", paced=False).result(30)
+    assert time.monotonic() - begun < 4.0
+
+
+def test_after_the_end_a_job_says_that_the_studio_is_closed(session):
+    session.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        session.do(lambda drives: None, "late").result(10)
+
+
+def test_drives_that_cannot_be_opened_are_told():
+    def fails():
+        raise ValueError("there is no such bus; plug it in")
+
+    made = Session(fails, "nothing", describe("tmcm1636", None))
+    made.start()
+    until(lambda: made.state == "failed")
+    assert made.failure == "there is no such bus; plug it in"
+    with pytest.raises(RuntimeError, match="plug it in"):
+        made.do(lambda drives: None, "late").result(10)
+
+
+# --- what a job does is sampled -----------------------------------------------------------------------------------
+def test_a_move_and_a_recording_of_a_job_are_seen_by_the_scope(session):
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pp"), "enable").result(10)
+        before = session.recorder.ring.total
+        session.do(motion_jobs.move(session, 0, "2 rev", "600 rpm", relative=True), "move").result(10)
+        rows = session.recorder.ring.read(before, session.recorder.ring.total)
+        assert np.ptp(rows.values[cia402.POSITION_ACTUAL, 0]) > 1.9 * 65536
+        assert np.allclose(np.diff(rows.t), 0.001)
+
+
+def test_a_recording_in_pieces_is_the_recording(session):
+    """What a job records, and plays, is what it gets without a studio."""
+    rows = np.repeat([0, 100_000, 0], [30, 70, 30])
+
+    def job(drives):
+        motion.enable(drives, mode="pv")
+        return drives.record(["Velocity actual value"], 0.13, play={"Target velocity": rows})
+
+    with EmulatedDrives(load="inertia", num_threads=1) as alone:
+        alone.advance(session.recorder.now)
+        with Beats(session):
+            got = session.do(lambda drives: (drives.machine.reset(), job(drives))[1], "record").result(10)
+        alone.machine.reset()
+        wanted = job(alone)
+    assert len(got) == len(wanted) == 130
+    assert np.allclose(got.t, wanted.t)
+    assert np.array_equal(got["Velocity actual value"], wanted["Velocity actual value"])
+
+
+def test_other_objects_can_be_sampled(session):
+    session.sample("page", [(0x6062, 0)])
+    until(lambda: (0x6062, 0) in session.recorder.ring.keys)
+    session.forget_samples("page")
+    until(lambda: (0x6062, 0) not in session.recorder.ring.keys)
+
+
+# --- stops --------------------------------------------------------------------------------------------------------
+def test_quick_stop_does_not_wait_for_a_long_job(session):
+    """The job computes and calls no drives: the command is given all the same."""
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        begun, goes_on = threading.Event(), threading.Event()
+
+        def job(drives):
+            drives.write(cia402.TARGET_VELOCITY, 300_000)
+            drives.advance(0.2)
+            begun.set()
+            goes_on.wait(10)
+            drives.advance(1.0)
+
+        future = session.do(job, "long")
+        begun.wait(10)
+        session.stop_now("the test")
+        drives = session._real  # the truth: no job could tell it now
+        assert not cia402.matches(int(drives.read(cia402.STATUSWORD)[0]), cia402.OPERATION_ENABLED)
+        goes_on.set()
+        with pytest.raises(JobEndedError, match="stopped: the test"):
+            future.result(10)
+        until(lambda: speed_of(session) == 0)
+
+
+def test_a_job_that_is_stopped_can_put_back_what_it_changed(session):
+    def job(drives):
+        before = int(drives.read("Profile velocity")[0])
+        drives.write("Profile velocity", 1234)
+        try:
+            drives.advance(60.0)
+        finally:
+            drives.write("Profile velocity", before)
+
+    before = int(session.do(lambda drives: drives.read("Profile velocity")[0], "read").result(10))
+    future = session.do(job, "changes a value")
+    until(lambda: session.job is not None and session.job.title == "changes a value")
+    time.sleep(0.1)
+    session.stop_now("the test")
+    with pytest.raises(JobEndedError):
+        future.result(10)
+    assert int(session.do(lambda drives: drives.read("Profile velocity")[0], "read").result(10)) == before
+
+
+def test_jobs_that_wait_are_not_begun_after_a_stop(session):
+    first = session.do(lambda drives: drives.advance(60.0), "long")
+    second = session.do(lambda drives: drives.num_axes, "waits")
+    until(lambda: session.job is not None)
+    session.stop_now("the test")
+    for future in (first, second):
+        with pytest.raises(JobEndedError):
+            future.result(10)
+
+
+# --- pages --------------------------------------------------------------------------------------------------------
+def test_a_jog_lasts_as_long_as_its_page_holds_it(session):
+    with Beats(session) as page:
+        page.held = jogs(session)
+        time.sleep(1.0)
+        assert speed_of(session) > 200_000
+        session.presence.end(page.held)
+        session.do(motion_jobs.end_turn(0), "release").result(10)
+        until(lambda: speed_of(session) == 0)
+        assert state_of(session) is State.OPERATION_ENABLED
+
+
+def test_a_page_that_is_silent_stops_its_jog(session):
+    with Beats(session) as page:
+        page.held = jogs(session)
+        time.sleep(0.3)
+        assert speed_of(session) > 200_000
+    time.sleep(presence.HOLD + 0.4)
+    assert speed_of(session) == 0
+    assert state_of(session) is not State.OPERATION_ENABLED
+    assert any("silent" in event.text for event in session.events)
+
+
+def test_a_page_that_holds_nothing_any_more_stops_its_jog(session):
+    """Its release was lost; its beats tell it."""
+    with Beats(session) as page:
+        page.held = jogs(session)
+        page.held = 0
+        time.sleep(presence.HOLD + 0.4)
+        assert speed_of(session) == 0
+
+
+def test_another_page_does_not_keep_a_jog_going(session):
+    with Beats(session, "other"):
+        jogs(session, "page")
+        time.sleep(presence.HOLD + 0.4)
+        assert speed_of(session) == 0
+
+
+def test_a_page_that_is_closed_stops_its_jog_at_once(session):
+    with Beats(session, "other"), Beats(session) as page:
+        page.held = jogs(session)
+        session.presence.leave("page")
+        time.sleep(0.2)
+        assert speed_of(session) < 50_000
+
+
+def test_a_release_that_overtakes_its_jog_wins(session):
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        number = session.presence.begin("page", FIRST, held=True).number
+        session.presence.end(number)
+        session.do(motion_jobs.turn(session, 0, "300 rpm", number), "jog").result(10)
+        time.sleep(0.2)
+        assert speed_of(session) == 0
+
+
+def test_without_any_page_an_axis_is_stopped_and_disabled(session, monkeypatch):
+    monkeypatch.setattr(presence, "ABANDONED", 0.6)
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        session.do(lambda drives: drives.write(cia402.TARGET_VELOCITY, 300_000), "turn").result(10)
+        time.sleep(1.0)
+        assert speed_of(session) > 200_000
+    time.sleep(1.5)
+    session.presence.beat("page")
+    assert state_of(session) is State.SWITCH_ON_DISABLED
+    assert speed_of(session) == 0
+    assert sum("last page" in event.text for event in session.events) == 1
+
+
+def test_presence_counts_pages_and_their_motions():
+    known = Presence()
+    known.beat("a")
+    known.beat("b")
+    assert known.pages() == 2
+    one = known.begin("a", FIRST, held=False)
+    assert known.moves() and known.is_on(one.number)
+    known.leave("a")
+    assert known.pages() == 1
+    assert [motion.why for motion in known.take_overdue()] == ["its page was closed"]
+    assert not known.moves()
+
+
+# --- texts --------------------------------------------------------------------------------------------------------
+def test_errors_are_sentences_for_people():
+    error = RuntimeError("axis 0 is in fault while waiting for target reached; see emergencies(), then reset_fault()")
+    assert sentence(error).endswith("see the faults on the page Axes, then reset them")
+
+
+def test_a_mistake_of_the_program_says_so(caplog):
+    assert "please report it" in sentence(KeyError("x"))
+    assert caplog.records
+
+
+@pytest.mark.parametrize(("speed", "direction", "text"), [
+    ("60 rpm", 1, "60 rpm"), ("60 rpm", -1, "-60 rpm"), ("-60 rpm", -1, "60 rpm"), ("+1 rev/s", -1, "-1 rev/s"),
+])  # fmt: skip
+def test_a_jog_backwards_turns_the_speed_round(speed, direction, text):
+    assert motion_jobs.turned_round(speed, direction) == text
+
+
+def test_faults_have_cause_and_remedy(session):
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        session.do(lambda drives: setattr(drives.machine, "supply", 3.0), "the supply sinks").result(10)
+        until(lambda: session.axes[0].is_in_fault)
+        until(lambda: session.axes[0].faults)
+        fault = session.axes[0].faults[-1]
+        assert fault.text.name == "undervoltage"
+        assert len(fault.text.cause) > 10 and len(fault.text.remedy) > 10
