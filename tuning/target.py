@@ -205,8 +205,10 @@ def of_machines(
     alone = one(made.load)
     own = way(alone)
     narrow_low, narrow_high = _ways(FREE if travel is None else travel, made.load.num_axes)
-    low = np.tile(np.maximum(own.low, narrow_low), made.num_machines)
-    high = np.tile(np.minimum(own.high, narrow_high), made.num_machines)
+    lanes, here = made.num_machines, np.asarray(made.machine.rotor_angle)
+    # The load's ends are places; a rotor that stands at one, or a little beyond, has no way to that side.
+    low = np.maximum(np.minimum(np.tile(own.low, lanes) - here, 0.0), np.tile(narrow_low, lanes))
+    high = np.minimum(np.maximum(np.tile(own.high, lanes) - here, 0.0), np.tile(narrow_high, lanes))
     volts = made.device.supply_of(made.motor) if supply is None else supply
     limits = _limits(made.motor, made.num_axes, volts, speed, current)
     return Target(

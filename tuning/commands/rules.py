@@ -123,7 +123,7 @@ def _as_json(target: Target, axis: AxisRules) -> dict[str, Any]:
                 "gains": dict(zip(target.device.gains.names, proposal.gains, strict=True)),
                 "wanted": dict(proposal.wanted),
                 "notes": list(proposal.notes),
-                "velocity_margins": velocity_margins(target, plant, proposal.gains)._asdict(),
+                "velocity_margins": velocity_margins(target.device, plant, proposal.gains)._asdict(),
             }
             for name, proposal in rows.items()
         },
@@ -142,7 +142,7 @@ def _print(target: Target, shown: AxisRules, axis: int | None) -> None:
     titles = (*_gain_titles(target.device.gains), "cross\nHz", "phase\ndeg", "gain\ndB")
     cells = []
     for name, proposal in rows.items():
-        found = velocity_margins(target, plant, proposal.gains)
+        found = velocity_margins(target.device, plant, proposal.gains)
         figures = (found.crossover_hz, found.phase_deg, found.gain_db)
         shown_figures = (f"{figure:.0f}" if math.isfinite(figure) else "-" for figure in figures)
         cells.append((name, *map(str, proposal.gains), *shown_figures))

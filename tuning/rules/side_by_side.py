@@ -15,6 +15,7 @@ from tuning.response.margins import margins
 from tuning.rules.rules_by_name import propose
 
 if TYPE_CHECKING:
+    from drive_env.devices import Device
     from tuning.response.margins import Margins
     from tuning.rules.proposal import Proposal
     from tuning.target import Target
@@ -78,7 +79,7 @@ def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | 
     return found
 
 
-def velocity_margins(target: Target, plant: Plant, gains: Sequence[int]) -> Margins:
+def velocity_margins(device: Device, plant: Plant, gains: Sequence[int]) -> Margins:
     """Return the margins of the velocity loop, as the model has them with gains."""
-    f = np.geomspace(0.5, 0.49 * target.device.velocity_rate, POINTS)
-    return margins(f, velocity_open_loop(target.device, plant, gains, f))
+    f = np.geomspace(0.5, 0.49 * device.velocity_rate, POINTS)
+    return margins(f, velocity_open_loop(device, plant, gains, f))
