@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks import bus, environments, ethercat, gain_tuning, sweeps, training
+from benchmarks import bus, environments, ethercat, gain_tuning, studio, sweeps, training
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import device_names, find_device
 from drive_env.dictionary.position_scale import velocity_ratio
@@ -242,7 +242,9 @@ def main() -> None:
     warnings.simplefilter("ignore", MisfitWarning)  # a load may be heavy for a motor: it is the time that counts
     sizes = SIZES[:-1] if options.quick else SIZES
     with Progress(console=console, transient=True) as progress:
-        parts = "firmware, bound, devices, arms, loads, bus, EtherCAT, environments, training, sweeps, construction"
+        parts = (
+            "firmware, bound, devices, arms, loads, bus, EtherCAT, studio, environments, training, sweeps, construction"
+        )
         parts += ", start-up"
         task = progress.add_task(parts, total=parts.count(",") + len(LOADS))
         result: dict[str, Any] = {"ns per drive and tick": ticks()}
@@ -260,6 +262,8 @@ def main() -> None:
         result["bus"] = bus.figures()
         progress.advance(task)
         result["EtherCAT"] = ethercat.figures()
+        progress.advance(task)
+        result["studio"] = studio.figures()
         progress.advance(task)
         result["environments"] = environments.figures() | gain_tuning.figures()
         progress.advance(task)
@@ -279,6 +283,7 @@ def main() -> None:
         "ns per drive and tick, by device, 8 lanes",
         "bus",
         "EtherCAT",
+        "studio",
         "environments",
         "training",
         "sweeps",

@@ -60,13 +60,13 @@ class DictionaryPanel:
     def build(self) -> None:
         """Make it."""
         with ui.element("div").classes("studio-dictionary"):
-            with ui.element("div").classes("studio-stack"):
-                self._find_card()
-                self._compare_card()
-                self._backup_card()
+            self._find_card()
             with ui.card().classes("studio-card studio-list"):
                 self._list_head = ui.row().classes("studio-buttons")
                 self._list = ui.element("div").classes("studio-rows").props('role="table" aria-label="Objects"')
+            with ui.element("div").classes("studio-stack"):
+                self._compare_card()
+                self._backup_card()
         ui.on("dictionary_visible", self._take_visible)
         ui.on("dictionary_favourites", self._take_favourites)
         ui.run_javascript("studioDictionary.start()")

@@ -14,6 +14,8 @@ from drive_env.trials.response import step_metrics
 
 COLOURS = ("#0072b2", "#d55e00", "#007a59", "#a3447f", "#8a6100", "#1f1f1f", "#3a86b8", "#7a3b12")
 
+LEAST_STEP = 0.3  # of all that a channel does between the cursors: less is no step but a pulse, or noise
+
 
 def as_csv(recording: ScopeRecording) -> bytes:
     """Return a table: times [s], then a column for each channel in its unit."""
@@ -105,9 +107,11 @@ def measure_step(
         raise ValueError("there are fewer than 10 samples between the cursors; place them farther apart")
     final = float(np.mean(values[max(first, last - max(3, (last - first) // 20)) : last]))
     height = final - float(values[first])
-    noise = float(np.std(values[: first + 1])) if first > 5 else 0.0
-    if abs(height) <= max(5.0 * noise, 1e-12):
-        raise ValueError(f"{channel.name} makes no step there: it ends where it began; place cursor A before the step")
+    if abs(height) <= max(LEAST_STEP * float(np.ptp(values[first:last])), 1e-12):
+        raise ValueError(
+            f"{channel.name} makes no step there: it ends where it began; place cursor A before a step, and B where it "
+            "has settled, or choose another channel"
+        )
     found = step_metrics(t[:last], values[:last], final, t_step=float(t[first]), initial=float(values[first]))
     return StepFigures(
         float(t[first]), height, float(found.rise_time), float(found.overshoot), float(found.settling_time),

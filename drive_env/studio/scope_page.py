@@ -198,6 +198,17 @@ class ScopePanel:
                 return
             self._want()
             draw()
+            names = [f"{one.key[0]:04X}:{one.key[1]:02X}" for one in channels if one.axis == self._visitor.axis]
+            ui.run_javascript(f"studioScope.keep({json.dumps(names)})")
+
+        def kept(event: GenericEventArguments) -> None:
+            """Show what this browser showed last, as far as the drive has it."""
+            keys = [(int(name[:4], 16), int(name[5:], 16)) for name in event.args]
+            there = [key for key in keys if key in self._entries][:MOST_CHANNELS]
+            if there:
+                self._view.channels = tuple(self._channel(key, self._visitor.axis) for key in there)
+                self._want()
+                draw()
 
         def added() -> None:
             if not add.value:
@@ -209,6 +220,7 @@ class ScopePanel:
                 change((*self._view.channels, channel))
 
         add.on_value_change(added)
+        ui.on("scope_channels", kept)
         draw()
 
     # --- trigger --------------------------------------------------------------------------------------------------
@@ -340,8 +352,8 @@ def _choices(session: Session) -> dict[tuple[int, int], Entry]:
 
 
 def _response(labels: list[str]) -> str | None:
-    """Return the channel whose step is measured most: the velocity."""
-    return next((one for one in labels if "elocity actual" in one), labels[0] if labels else None)
+    """Return the channel whose step is measured most: the position, which a move leaves at another place."""
+    return next((one for one in labels if "osition actual" in one), labels[0] if labels else None)
 
 
 page = StudioPage("/scope", "Scope", "show_chart", 20, build, attach=attach)

@@ -25,6 +25,7 @@ from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.master.parameters import read_parameters
 from drive_env.master.quantities import Scale
+from drive_env.safety.errors import SafetyError
 from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
 from drive_env.studio.presence import Presence
@@ -129,6 +130,7 @@ class Session:
         self._is_closing = False
         self._failed_at = self._told_at = -1e9
         self._sampled: dict[str, tuple[Key, ...]] = {}
+        self._told_reason = ""
         self._is_left = False  # whether an axis was switched off since no page is there
         self._thread = threading.Thread(target=self._run, name="drive studio", daemon=True)
 
@@ -294,7 +296,9 @@ class Session:
             self._refuse_all(RuntimeError(self.failure))
             return
         try:
-            self.recorder = ScopeRecorder(self._real.num_axes, self.recorder.period)
+            if self._real.bus is not None:
+                self.description = self._real.bus.description  # which knows the time between two SYNCs
+            self.recorder = ScopeRecorder(self._real.num_axes, self.description.cycle)
             self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear)
             self._states = AxisStates(self._real, self.description)
             self._choose_samples()
@@ -376,12 +380,18 @@ class Session:
             drives.emergencies()
         except JobStoppedError:
             pass
-        except Exception as error:
-            # An envelope that has stopped the drives, or a node that is gone: told, and tried again.
+        except SafetyError as error:  # the envelope has stopped the drives
+            self._tell_stop(error)
+        except Exception as error:  # a node that is gone: told, and tried again
             self._failed_at = time.monotonic()
             told = sentence(error)
             if not self.events or self.events[-1].text != told:
                 self.say("error", told)
+
+    def _tell_stop(self, error: SafetyError) -> None:
+        """Say why the envelope has stopped the drives, unless that was asked for a moment ago, and is told."""
+        if time.monotonic() - self._told_at > STOP_WAIT or not str(error).startswith(self._told_reason):
+            self.say("error", sentence(error))
 
     def _look(self) -> None:
         """See to everything that must not wait for a job: called before each call and after each piece of time."""
@@ -418,11 +428,11 @@ class Session:
     def _obey(self) -> None:
         """Do what `stop_now` asks of this thread."""
         reason, self._stop_asked = self._stop_asked, ""
-        self._stop(np.ones(self.num_axes, bool))
         now = time.monotonic()
         if now - self._told_at > TOLD_ONCE:  # a page has two ways to ask
             self.say("warning", f"quick stop: {reason}")
-        self._told_at = now
+        self._told_at, self._told_reason = now, reason
+        self._stop(np.ones(self.num_axes, bool))
 
     def _leave_alone(self, job: Job | None) -> None:
         """Stop and disable everything, since nobody looks at an axis that is enabled."""
@@ -443,7 +453,9 @@ class Session:
         try:
             with drives.lock:
                 _stop_live(real, axes)
-        except Exception as error:  # the envelope's own stop is under way, or the bus is gone: its watchdog acts
+        except SafetyError as error:  # the envelope stops them already
+            self._tell_stop(error)
+        except Exception as error:  # the bus is gone: the drive's watchdog acts
             self.say("error", sentence(error))
 
     def _bring_to_rest(self, real: Drives) -> None:

@@ -12,6 +12,7 @@
   const BOTTOM = 26;
   const GAP = 10;
   const CURSORS = ["A", "B"];
+  const CHANNELS = "studio-scope-channels"; // that this browser showed last
   const scope = (window.studioScope = { cursors: [null, null], active: 0, frames: 0, header: null });
   let canvas, pen, box, line, data, drawn = false;
   const ranges = new Map(); // unit -> [low, high], that do not jump with every frame
@@ -32,7 +33,14 @@
     open();
     new ResizeObserver(tell).observe(box);
     listen();
+    try {
+      const kept = JSON.parse(localStorage.getItem(CHANNELS) || "[]");
+      if (kept.length) emitEvent("scope_channels", kept);
+    } catch {
+      localStorage.removeItem(CHANNELS);
+    }
   };
+  scope.keep = (channels) => localStorage.setItem(CHANNELS, JSON.stringify(channels));
 
   function tell() {
     const columns = Math.max(50, Math.floor(box.clientWidth - LEFT - RIGHT));
@@ -91,8 +99,10 @@
     }
     if (!(high >= low)) return ranges.get(unit) || [0, 1];
     let span = high - low;
-    if (span < 1e-9 * Math.max(1, Math.abs(high))) span = Math.max(Math.abs(high) * 0.1, 1e-3);
-    const wanted = [low - 0.08 * span, high + 0.08 * span];
+    const isFlat = span < 1e-9 * Math.max(1, Math.abs(high));
+    if (isFlat) span = Math.max(Math.abs(high) * 0.1, 1);
+    const room = isFlat ? 0.5 : 0.08;
+    const wanted = [low - room * span, high + room * span];
     const old = ranges.get(unit);
     const keeps = old && old[0] <= low && old[1] >= high && old[1] - old[0] < 3 * (wanted[1] - wanted[0]);
     if (!keeps) ranges.set(unit, wanted);
@@ -159,7 +169,7 @@
     pen.lineWidth = 1;
     pen.strokeRect(LEFT + 0.5, Math.round(top) + 0.5, width - LEFT - RIGHT - 1, Math.round(tall) - 1);
     pen.textAlign = "right";
-    const step = nice(high - low, Math.max(2, tall / 46));
+    const step = nice(high - low, Math.max(2, tall / 34));
     const digits = Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9) + (String(step / 10 ** Math.floor(Math.log10(step))).startsWith("2.5") ? 1 : 0)));
     pen.globalAlpha = 0.7;
     pen.beginPath();
@@ -172,7 +182,7 @@
     pen.globalAlpha = 1;
     for (let value = Math.ceil(low / step) * step; value <= high; value += step) {
       const at = y(value);
-      if (at > top + 8 && at < top + tall - 2) pen.fillText(value.toFixed(digits), LEFT - 6, at + 4);
+      if (at > top + 8 && at < top + tall - 2) pen.fillText((Math.abs(value) < 1e-6 * step ? 0 : value).toFixed(digits), LEFT - 6, at + 4);
     }
     pen.save();
     pen.textAlign = "center";
@@ -264,13 +274,18 @@
       pen.fillText(CURSORS[k], x + 3, 12);
     });
   }
+  // A value came as an integer of 16 bits: what is less than one of its steps is 0.
+  function settled(trace, integer) {
+    const value = trace.low + (integer + trace.offset) * trace.step;
+    return Math.abs(value) < 0.51 * trace.step && trace.high > trace.low ? 0 : value;
+  }
   function valueAt(trace, t) {
     let first = 0;
     let start = trace.from;
     for (const [k, at] of trace.breaks) if (at <= t) [first, start] = [k, at];
     const k = first + Math.round((t - start) / trace.every);
     if (k < 0 || k >= trace.count) return null;
-    return trace.low + (0.5 * (trace.lows[k] + trace.highs[k]) + trace.offset) * trace.step;
+    return settled(trace, 0.5 * (trace.lows[k] + trace.highs[k]));
   }
   const number = (value) => (value === null ? "—" : Number(value.toPrecision(5)).toString());
   function readout() {
@@ -279,7 +294,7 @@
     const [a, b] = scope.cursors;
     const rows = data.channels.map((channel, k) => {
       const trace = data.traces.find((one) => one.channel === k);
-      const last = trace && trace.count ? trace.low + (trace.highs[trace.count - 1] + trace.offset) * trace.step : null;
+      const last = trace && trace.count ? settled(trace, trace.highs[trace.count - 1]) : null;
       const at = (t) => (t === null || !trace ? null : valueAt(trace, t));
       const [va, vb] = [at(a), at(b)];
       return [channel, number(last), number(va), number(vb), number(va === null || vb === null ? null : vb - va)];
