@@ -43,7 +43,9 @@ def build(panel: TunePanel) -> None:
                 return
             name = str(agent.value)
             store = not panel.desk.is_emulated
-            await panel.tuner.start(f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device))
+            await panel.tuner.start(
+                f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device)
+            )
 
         ui.button("Run the agent", icon="smart_toy", on_click=start).props("unelevated no-caps data-test=run-agent")
 
@@ -55,9 +57,7 @@ def columns_of(device: str) -> tuple[str, ...]:
     return ("Trial", *titles_of_trials(find_device(device).gains), "J (less is better)", "")
 
 
-def work_of(
-    policy: Any, name: str, store: bool
-) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
+def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
     """Return the agent's work: that of `drive-agent tune`, its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:

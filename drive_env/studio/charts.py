@@ -52,15 +52,13 @@ def options(
     top, room = 13.0, 100.0 - 13.0 - 10.0
     for k, panel in enumerate(panels):
         height = room / count
-        grid.append(
-            {"left": 66, "right": 14, "top": f"{top + k * height:.1f}%", "height": f"{height - 7.0:.1f}%"}
-        )
+        grid.append({"left": 66, "right": 14, "top": f"{top + k * height:.1f}%", "height": f"{height - 7.0:.1f}%"})
         last = k == count - 1
         x_axis.append(
             {
                 "type": "log" if logarithmic else "value", "gridIndex": k, "name": x_title if last else "",
-                "nameLocation": "middle", "nameGap": 24, "axisLabel": {"show": last}, "min": "dataMin", "max": "dataMax",
-                "splitLine": {"show": True}, "minorSplitLine": {"show": logarithmic},
+                "nameLocation": "middle", "nameGap": 24, "axisLabel": {"show": last}, "min": "dataMin",
+                "max": "dataMax", "splitLine": {"show": True}, "minorSplitLine": {"show": logarithmic},
             }
         )  # fmt: skip
         y_axis.append(

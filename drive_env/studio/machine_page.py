@@ -61,7 +61,8 @@ def attach(web: FastAPI, session: Session) -> None:
                     return
                 if picture:
                     await line.send_bytes(picture)
-                now = f"{1.0 / camera.period:.0f} pictures per second at most; one takes {1e3 * camera.cost:.0f} ms of a core"
+                rate, cost = 1.0 / camera.period, 1e3 * camera.cost
+                now = f"{rate:.0f} pictures per second at most; one takes {cost:.0f} ms of a core"
                 if now != told and camera.cost > 0.0:
                     told = now
                     await line.send_text(now)
@@ -119,7 +120,7 @@ class MachinePanel:
         self._visitor = visitor
         self._known = known
         self._values = session.glimpse(lambda machine: machine.parameters) or {}
-        self._rows: dict[str, tuple[ui.element, Any]] = {}
+        self._rows: dict[str, tuple[ui.slider, ui.number]] = {}
         self._is_setting = False
 
     def build(self) -> None:
@@ -248,7 +249,7 @@ class MachinePanel:
             slider, number = self._rows[name]
             value = float(now[name][0])
             for control in (slider, number):
-                control.set_value(value)  # type: ignore[attr-defined]
+                control.set_value(value)
         self._is_setting = False
 
     # --- faults ---------------------------------------------------------------------------------------------------
@@ -263,18 +264,21 @@ class MachinePanel:
                 when = ui.input("Begins when (empty: now)", placeholder="enabled, or speed > 100").props(
                     "dense outlined data-test=fault-when"
                 ).classes("grow")  # fmt: skip
-                ui.button("End all", icon="healing", on_click=lambda: self._do(jobs.end_fault(None), "End all faults")).props(
-                    "outline no-caps data-test=end-faults"
-                )
+                ui.button(
+                    "End all", icon="healing", on_click=lambda: self._do(jobs.end_fault(None), "End all faults")
+                ).props("outline no-caps data-test=end-faults")
             boxes: dict[str, ui.element] = {}
             switches: dict[str, ui.switch] = {}
             numbers: dict[str, list[int]] = {}
             for group in GROUPS:
                 names = [name for name in self._known.faults if FAULTS[name].group == group]
                 if names:
-                    with ui.expansion(group.capitalize(), value=group == "sensor").classes("w-full").props(
-                        f"data-test=faults-{group}"
-                    ), ui.element("div").classes("studio-faults"):
+                    with (
+                        ui.expansion(group.capitalize(), value=group == "sensor")
+                        .classes("w-full")
+                        .props(f"data-test=faults-{group}"),
+                        ui.element("div").classes("studio-faults"),
+                    ):
                         for name in names:
                             boxes[name] = self._fault(FAULTS[name], lasts, when, switches, numbers)
 

@@ -4,42 +4,12 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from fastapi import FastAPI
-
-    from drive_env.studio.session import Session
-    from drive_env.studio.visitor import Visitor
+from drive_env.studio.studio_page import StudioPage as StudioPage
 
 logger = logging.getLogger(__name__)
 
 ENTRY_POINTS = "drive_env.studio_pages"
-
-
-@dataclass(frozen=True)
-class StudioPage:
-    """A page.
-
-    Attributes:
-        path: Where it is: "/scope".
-        title: Its name in the navigation.
-        icon: The name of a Material icon.
-        order: Its place in the navigation, from above; those of this package have 10, 20, 30.
-        build: Makes its content, for one visitor, into the present element of NiceGUI.
-        emulated_only: Whether it needs emulated machines; it is left out for drives on a bus.
-        attach: Adds routes of its own to the web application, websockets for one; it is called once.
-    """
-
-    path: str
-    title: str
-    icon: str
-    order: int
-    build: Callable[[Session, Visitor], None]
-    emulated_only: bool = False
-    attach: Callable[[FastAPI, Session], None] | None = None
 
 
 def studio_pages(*, emulated: bool) -> list[StudioPage]:

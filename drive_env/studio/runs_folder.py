@@ -21,7 +21,9 @@ TEXTS = (".toml", ".json", ".csv", ".txt", ".md", ".yaml", ".yml", ".log")
 REPORTS = (".html",)
 EVENTS = "events.out.tfevents."  # what TensorBoard's files begin with
 # What a page of a run may do: show its own text, styles and pictures; no script, no form, nothing of elsewhere.
-POLICY = "sandbox; default-src 'none'; img-src data: 'self'; media-src 'self'; style-src 'unsafe-inline'; font-src data:"
+POLICY = (
+    "sandbox; default-src 'none'; img-src data: 'self'; media-src 'self'; style-src 'unsafe-inline'; font-src data:"
+)
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def certificate_of(run: Run, root: Path = RUNS) -> dict[str, Any]:
 def _run(path: Path, changed: float) -> Run:
     if path.is_file():
         return Run(path.name, changed, (RunFile("", kind_of(path), path.stat().st_size),))
-    files = []
+    files: list[RunFile] = []
     for one in sorted(path.rglob("*")):
         if len(files) >= MOST_FILES:
             break

@@ -77,7 +77,9 @@ class GainCard:
                 self._undo.props("data-test=undo")
                 self._back = ui.button("State before", icon="settings_backup_restore", on_click=self._restore)
                 self._back.props("outline no-caps data-test=restore-before")
-                self._back.tooltip("Stop and switch off the axes, and restore all parameters to before the first change")
+                self._back.tooltip(
+                    "Stop and switch off the axes, and restore all parameters to before the first change"
+                )
             self._told = ui.label("").classes("studio-hint").props("data-test=gain-history")
 
     def _row(self, column: int, gain: Gain) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from nicegui import ui
@@ -86,7 +87,9 @@ class RulesCard:
             ui.label(f"No rule proposes gains: {plant}")
             return
         known = find_device(self._panel.device)
-        ui.label("What each rule would give, with the margins of the velocity loop by the model").classes("studio-label")
+        ui.label("What each rule would give, with the margins of the velocity loop by the model").classes(
+            "studio-label"
+        )
         titles = (*known.gains.titles, "crossover [Hz]", "phase margin [°]", "gain margin [dB]")
         with ui.element("table").classes("studio-table"):
             with ui.element("thead"), ui.element("tr"):
@@ -119,7 +122,7 @@ class RulesCard:
         await panel.visitor.do(job, f"Apply {name.replace('_', ' ')}")
 
 
-def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+def table(head: Sequence[str], rows: Sequence[tuple[str, ...]]) -> None:
     """Make a table; the first column names its rows."""
     with ui.element("table").classes("studio-table"):
         with ui.element("thead"), ui.element("tr"):

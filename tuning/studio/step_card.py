@@ -25,11 +25,9 @@ def step_chart(steps: list[StepRecording]) -> dict[str, Any]:
     panels = [charts.ChartPanel(f"{what} [{newest.unit}]"), charts.ChartPanel("current [A]")]
     lines = [charts.ChartLine("demand", newest.t, newest.demand, 0, 7, 2, 1.5)]
     for age, step in enumerate(steps[: LAST + 1]):
-        looks = {"colour": age, "dashes": age, "width": 2.4 if age == 0 else 1.4, "faint": age > 2}
-        lines += [
-            charts.ChartLine(step.name, step.t, step.actual, 0, **looks),
-            charts.ChartLine(step.name, step.t, step.current, 1, **looks),
-        ]
+        for panel, values in enumerate((step.actual, step.current)):
+            width = 2.4 if age == 0 else 1.4
+            lines.append(charts.ChartLine(step.name, step.t, values, panel, age, age, width, faint=age > 2))
     return charts.options(panels, "t [s]", lines)
 
 

@@ -175,7 +175,7 @@ def record_move(desk: TuneDesk, axis: int, turns: float) -> Callable[[Drives], S
             rows = [np.concatenate([np.asarray(part[name])[:, axis] for part in parts]) for name in names]
             demand, unit = _in_unit(desk, axis, names[0], rows[0] - int(origin[axis]))
             actual, _ = _in_unit(desk, axis, names[1], rows[1] - int(origin[axis]))
-            t = np.arange(len(rows[0])) * CYCLE
+            t = np.arange(len(rows[0]), dtype=float) * CYCLE
             figures = _figures(t, actual, float(demand[-1]), unit)
             current = _current(drives, axis, np.tile(rows[2][:, None], drives.num_axes))
             return _keep(desk, StepRecording(axis, "position", gains, unit, t, demand, actual, current, figures))
@@ -195,8 +195,8 @@ def _direction(target: Target, where: Mask, way: float, what: str) -> Floats:
     if short.size:
         k = int(short[0])
         raise ValueError(
-            f"axis {k}: {what} takes {way / (2 * np.pi):.3g} turns, and there are {room[k] / (2 * np.pi):.3g}; make the "
-            "step smaller, or move the axis away from its end first"
+            f"axis {k}: {what} takes {way / (2 * np.pi):.3g} turns, and there are {room[k] / (2 * np.pi):.3g}; make "
+            "the step smaller, or move the axis away from its end first"
         )
     return np.where(forwards, 1.0, -1.0)
 

@@ -9,8 +9,8 @@ from nicegui import ui
 
 from drive_env.devices import find_device
 from drive_env.motors import MOTORS, find_motor
-from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
+from drive_env.studio.studio_page import StudioPage
 from drive_env.studio.visitor import Visitor
 from tuning.studio import tune_jobs
 from tuning.studio.gain_card import GainCard
@@ -87,6 +87,7 @@ class TunePanel:
                     "units it counts: make it a device (the page on file formats, section Device)."
                 )
             return
+        ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
         with ui.element("div").classes("studio-tune"):
             with ui.element("div").classes("studio-stack"):
                 self._machine_card()
@@ -128,8 +129,8 @@ class TunePanel:
         with self.card("Machine", "machine"):
             with ui.row().classes("studio-buttons"):
                 if not emulated:
-                    names = sorted(MOTORS)
-                    motor = ui.select(names, value=desk.entries.motor or find_device(self.device).default_motor,
+                    names, usual = sorted(MOTORS), find_device(self.device).default_motor
+                    motor = ui.select(names, value=desk.entries.motor or usual,
                                       label="Motor", with_input=True).props("dense outlined").classes("grow")  # fmt: skip
                     motor.on_value_change(lambda event: setattr(desk.entries, "motor", str(event.value or "")))
                 travel = ui.input(
@@ -143,9 +144,9 @@ class TunePanel:
                     supply = ui.number("Supply [V]", value=self.supply, min=1).props("dense outlined")
                     supply.on_value_change(lambda event: setattr(desk.entries, "supply", event.value))
             own = "; empty: as far as the load lets it" if emulated else ""
-            ui.label(
-                f"How far the rotor may turn from where it stands: LOW:HIGH, as -0.5:0.5, or free{own}."
-            ).classes("studio-hint")
+            ui.label(f"How far the rotor may turn from where it stands: LOW:HIGH, as -0.5:0.5, or free{own}.").classes(
+                "studio-hint"
+            )
 
 
 page = StudioPage("/tune", "Tune", "tune", 40, build)

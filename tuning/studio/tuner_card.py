@@ -119,7 +119,7 @@ class TunerCard:
 
 def _verdict(found: AxisVerdict) -> None:
     look, sign = LOOKS[found.verdict]
-    with ui.element("div").classes(f"studio-verdict {look}").props(f'data-test=verdict-{found.axis}'):
+    with ui.element("div").classes(f"studio-verdict {look}").props(f"data-test=verdict-{found.axis}"):
         ui.label(f"{sign} axis {found.axis}: {found.verdict}").classes("studio-strong")
         if found.reason:
             ui.label(f"{found.reason}; the gains from before are in the drive")

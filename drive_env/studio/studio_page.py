@@ -1,0 +1,36 @@
+"""A page of the studio: where it is, its name, and what makes its content."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+    from drive_env.studio.session import Session
+    from drive_env.studio.visitor import Visitor
+
+
+@dataclass(frozen=True)
+class StudioPage:
+    """A page.
+
+    Attributes:
+        path: Where it is: "/scope".
+        title: Its name in the navigation.
+        icon: The name of a Material icon.
+        order: Its place in the navigation, from above; those of this package have 10, 20, 30.
+        build: Makes its content, for one visitor, into the present element of NiceGUI.
+        emulated_only: Whether it needs emulated machines; it is left out for drives on a bus.
+        attach: Adds routes of its own to the web application, websockets for one; it is called once.
+    """
+
+    path: str
+    title: str
+    icon: str
+    order: int
+    build: Callable[[Session, Visitor], None]
+    emulated_only: bool = False
+    attach: Callable[[FastAPI, Session], None] | None = None
