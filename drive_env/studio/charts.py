@@ -17,6 +17,9 @@ from numpy.typing import ArrayLike
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6100", "#7f7f7f")
 DASHES: tuple[str | list[int], ...] = ("solid", [8, 4], [3, 3], [10, 3, 3, 3], [1, 3], [14, 4])
+# Lines of the axes, which are seen on white and on black.
+SPLIT = {"show": True, "lineStyle": {"color": "#8a97a3", "opacity": 0.3}}
+AXIS = {"lineStyle": {"color": "#8a97a3"}}
 MOST_POINTS = 800  # of a line; more are not seen
 
 
@@ -49,7 +52,7 @@ def options(
     """Return what ECharts takes; panels share their x axis."""
     count = max(1, len(panels))
     x_axis, y_axis, grid = [], [], []
-    top, room = 13.0, 100.0 - 13.0 - 10.0
+    top, room = 10.0, 100.0 - 10.0 - 5.0
     for k, panel in enumerate(panels):
         height = room / count
         grid.append({"left": 66, "right": 14, "top": f"{top + k * height:.1f}%", "height": f"{height - 7.0:.1f}%"})
@@ -58,13 +61,13 @@ def options(
             {
                 "type": "log" if logarithmic else "value", "gridIndex": k, "name": x_title if last else "",
                 "nameLocation": "middle", "nameGap": 24, "axisLabel": {"show": last}, "min": "dataMin",
-                "max": "dataMax", "splitLine": {"show": True}, "minorSplitLine": {"show": logarithmic},
+                "max": "dataMax", "splitLine": SPLIT, "minorSplitLine": SPLIT | {"show": logarithmic}, "axisLine": AXIS,
             }
         )  # fmt: skip
         y_axis.append(
             {
                 "type": "value", "gridIndex": k, "name": panel.title, "nameLocation": "middle", "nameGap": 50,
-                "scale": True, "min": panel.low, "max": panel.high, "splitNumber": 4,
+                "scale": True, "min": panel.low, "max": panel.high, "splitNumber": 4, "splitLine": SPLIT, "axisLine": AXIS,
             }
         )  # fmt: skip
     return {

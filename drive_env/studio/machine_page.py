@@ -185,7 +185,7 @@ class MachinePanel:
             slider.props(f'aria-label="{title} [{unit}]" data-test=slider-{name}')
             number = ui.number(value=float(f"{value:.6g}")).props("dense outlined")
             number.props(f'aria-label="{title} [{unit}]" data-test=value-{name}')
-            ui.label("" if unit == "1" else unit).classes("unit")
+            ui.label("1" if unit == "1" else unit.replace("*", "·")).classes("unit")
         last = [value]
 
         def slides() -> None:

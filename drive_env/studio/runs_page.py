@@ -192,7 +192,8 @@ def _report(run: Run, file: RunFile) -> None:
     address = url_of(run.name, file.path)
     ui.link(f"{file.path or run.name} in a tab of its own", address, new_tab=True).classes("studio-open")
     frame = ui.element("iframe").classes("studio-report")
-    frame.props(f'sandbox src="{address}" title="Report {file.path or run.name}" data-test=report')
+    frame.props["sandbox"] = ""  # no script, no form
+    frame.props(f'src="{address}" title="Report {file.path or run.name}" data-test=report')
 
 
 def _gallery(run: Run, files: list[RunFile]) -> None:

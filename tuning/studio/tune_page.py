@@ -92,12 +92,13 @@ class TunePanel:
             with ui.element("div").classes("studio-stack"):
                 self._machine_card()
                 self.gains.build()
+                self.tuner.build()
             with ui.element("div").classes("studio-stack"):
                 self.step.build()
                 self.response.build()
             with ui.element("div").classes("studio-stack"):
-                self.tuner.build()
-        self.rules.build()
+                self.tuner.build_run()
+                self.rules.build()
         self.visitor.hand_in(tune_jobs.look(self.desk), "Read the gains")
         ui.timer(REFRESH, self._show)
 
@@ -130,8 +131,8 @@ class TunePanel:
             with ui.row().classes("studio-buttons"):
                 if not emulated:
                     names, usual = sorted(MOTORS), find_device(self.device).default_motor
-                    motor = ui.select(names, value=desk.entries.motor or usual,
-                                      label="Motor", with_input=True).props("dense outlined").classes("grow")  # fmt: skip
+                    motor = ui.select(names, value=desk.entries.motor or usual, label="Motor", with_input=True)
+                    motor.props("dense outlined").classes("grow")
                     motor.on_value_change(lambda event: setattr(desk.entries, "motor", str(event.value or "")))
                 travel = ui.input(
                     "Travel [turns]", value=desk.entries.travel, placeholder="the load's" if emulated else "-0.5:0.5"

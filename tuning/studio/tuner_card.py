@@ -60,7 +60,10 @@ class TunerCard:
                 self._store.set_visibility(not panel.desk.is_emulated)
             for part in studio_parts("/tune"):
                 part.build(panel)
-        with panel.card("Run", "run"):
+
+    def build_run(self) -> None:
+        """Make the card that says what the run does and did."""
+        with self._panel.card("Run", "run"):
             self._head = ui.label("No run yet.").classes("studio-strong").props("role=status data-test=run-head")
             self._bar = ui.linear_progress(value=0.0, show_value=False).props('aria-label="Progress of the run"')
             self._bar.set_visibility(False)
@@ -138,4 +141,5 @@ def _certificate(run: TunerSession) -> None:
             ui.link("Certificate in a tab of its own", url_of(name, "report.html"), new_tab=True).classes("studio-open")
     if (Path(run.folder) / "report.html").is_file():
         frame = ui.element("iframe").classes("studio-report")
-        frame.props(f'sandbox src="{url_of(name, "report.html")}" title="Certificate of {run.title}" data-test=report')
+        frame.props["sandbox"] = ""  # no script, no form
+        frame.props(f'src="{url_of(name, "report.html")}" title="Certificate of {run.title}" data-test=report')
