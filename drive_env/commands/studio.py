@@ -18,6 +18,7 @@ from drive_env.commands.options import (
     Interface,
     Nodes,
     Timeout,
+    check_time,
     connect,
     cycle_for,
     errors_as_exit_codes,
@@ -54,6 +55,9 @@ def studio(
     token: Annotated[
         str | None, typer.Option(help="Token of other addresses, 12 letters or more; one is made if none is given.")
     ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
     """Show drives on a local web page: state, motion, scope, dictionary; and what tuning and agents add.
@@ -66,9 +70,10 @@ def studio(
         from drive_env.master.description import describe
         from drive_env.studio import server
         from drive_env.studio.gate import checked_token, is_loopback, new_token
-        from drive_env.studio.page import studio_pages
+        from drive_env.studio.pages import studio_pages
         from drive_env.studio.session import Session
 
+        check_time("--duration", duration)
         is_bus = names_a_bus(context) or eds is not None
         if wrong := [name for name in OF_EMULATED if was_typed(context, name) and is_bus]:
             raise ValueError(f"--{wrong[0]} is of an emulated machine, and a bus is named: leave one of them out")
@@ -99,7 +104,7 @@ def studio(
             if browser:
                 webbrowser.open(url)
 
-        server.serve_studio(session, pages, sock, listen, ticket, ready)
+        server.serve_studio(session, pages, sock, server.Terms(listen, ticket, duration), ready)
         if session.failure:
             raise RuntimeError(session.failure)
         print("drive-env: stopped", flush=True)

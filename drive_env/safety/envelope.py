@@ -395,8 +395,8 @@ class Envelope:
     def stop_at_once(self, reason: str) -> None:
         """Have what is live quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
 
-        Any thread may call it; it returns at once. The program is told by a SafetyError at its next call, or in the one
-        that is under way. An axis that a weight pulls is held, as after a limit was passed.
+        Any thread may call it; it returns at once. The program gets a SafetyError at its next call, or in the one that
+        is under way. An axis that a weight pulls is held, as after a limit was passed.
 
         Args:
             reason: What the error says.

@@ -9,7 +9,7 @@ from nicegui.events import GenericEventArguments
 
 from drive_env import cia402
 from drive_env.studio import motion_jobs
-from drive_env.studio.axis_states import MODE_NAMES, AxisState, Quantity
+from drive_env.studio.axis_states import MODE_NAMES, AxisState, ShownQuantity
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.state_diagram import diagram
@@ -124,7 +124,7 @@ class _Values:
         self._box = ui.element("div").classes("studio-values")
         self._rows: dict[str, tuple[ui.label, ui.label]] = {}
 
-    def show(self, quantities: tuple[Quantity, ...]) -> None:
+    def show(self, quantities: tuple[ShownQuantity, ...]) -> None:
         """Show quantities; the labels of new ones are added."""
         for one in quantities:
             if one.label not in self._rows:

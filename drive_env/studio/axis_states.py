@@ -34,7 +34,7 @@ NO_FAULT = ("fault_reset", "error_reset")
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ShownQuantity:
     """A value of an object as people read it: label, number, unit; the number is None where it is not known."""
 
     label: str
@@ -80,10 +80,10 @@ class AxisState:
     state: State | None = None
     mode: str = ""
     modes: tuple[str, ...] = ()
-    motion: tuple[Quantity, ...] = ()
+    motion: tuple[ShownQuantity, ...] = ()
     faults: tuple[AxisFault, ...] = ()
     inputs: dict[str, bool] = field(default_factory=dict)
-    slow: tuple[Quantity, ...] = ()
+    slow: tuple[ShownQuantity, ...] = ()
 
     @property
     def is_enabled(self) -> bool:
@@ -203,17 +203,17 @@ class AxisStates:
             self._unreadable.add(key)
             return None
 
-    def _quantity(self, key: Key, raw: int, axis: int) -> Quantity:
+    def _quantity(self, key: Key, raw: int, axis: int) -> ShownQuantity:
         return quantity_of(self._known.dictionary.find(key), raw, self.scales[axis])
 
 
-def quantity_of(entry: Entry, raw: int, scale: Scale) -> Quantity:
+def quantity_of(entry: Entry, raw: int, scale: Scale) -> ShownQuantity:
     """Return an integer of an object in the unit that people read."""
     unit = find_unit(entry.unit, scale)
     if unit is None:
-        return Quantity(entry.name, float(raw), entry.unit)
+        return ShownQuantity(entry.name, float(raw), entry.unit)
     shown = SHOWN[unit.dimension]
-    return Quantity(entry.name, raw * unit.factor / UNITS[shown].factor, shown)
+    return ShownQuantity(entry.name, raw * unit.factor / UNITS[shown].factor, shown)
 
 
 def axis_label(drives: Drives, description: Description, axis: int) -> str:
@@ -224,15 +224,15 @@ def axis_label(drives: Drives, description: Description, axis: int) -> str:
     return f"node {drives.bus.nodes[node]}" + (f" axis {part}" if description.num_axes > 1 else "")
 
 
-def _of_machine(drives: Drives, axis: int) -> tuple[Quantity, ...]:
+def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
     """Return what an emulated machine tells besides the drive, nothing of a real one."""
     if drives.machine is None:
         return ()
     winding, stage = drives.machine.temperatures
     return (
-        Quantity("Winding temperature (emulated)", round(float(winding[axis]), 1), "°C"),
-        Quantity("Stage temperature (emulated)", round(float(stage[axis]), 1), "°C"),
-        Quantity("Supply (emulated)", round(float(drives.machine.supply[axis]), 2), "V"),
+        ShownQuantity("Winding temperature (emulated)", round(float(winding[axis]), 1), "°C"),
+        ShownQuantity("Stage temperature (emulated)", round(float(stage[axis]), 1), "°C"),
+        ShownQuantity("Supply (emulated)", round(float(drives.machine.supply[axis]), 2), "V"),
     )
 
 

@@ -67,7 +67,8 @@ def options(
         y_axis.append(
             {
                 "type": "value", "gridIndex": k, "name": panel.title, "nameLocation": "middle", "nameGap": 50,
-                "scale": True, "min": panel.low, "max": panel.high, "splitNumber": 4, "splitLine": SPLIT, "axisLine": AXIS,
+                "scale": True, "min": panel.low, "max": panel.high, "splitNumber": 4, "splitLine": SPLIT,
+                "axisLine": AXIS,
             }
         )  # fmt: skip
     return {

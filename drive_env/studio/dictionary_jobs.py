@@ -109,7 +109,7 @@ def checked(entry: Entry, text: str, scale: Scale) -> Checked:
     """Return what a text means for an object, before anything is sent.
 
     Raises:
-        ValueError: For what is no number, or a unit that does not fit.
+        ValueError: For a text that is not a number, or a unit that does not fit.
         ObjectAccessError: For an object that cannot be written, or a value out of its range.
     """
     check_writable(entry)
@@ -143,13 +143,13 @@ def snapshot(known: Description, axis: int) -> Callable[[Drives], dict[Key, int]
 
 def factory(known: Description) -> dict[Key, int]:
     """Return the values that the EDS gives the parameters, where it gives any."""
-    described: Any = _Described(known)
+    described: Any = _DescriptionAlone(known)
     return {
         (entry.index, entry.sub): entry.default for entry in parameters(described) if isinstance(entry.default, int)
     }
 
 
-class _Described:
+class _DescriptionAlone:
     """What `parameters` asks of drives: their description."""
 
     def __init__(self, description: Description) -> None:

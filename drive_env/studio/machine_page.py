@@ -15,9 +15,9 @@ from nicegui import ui
 from drive_env.faults.table import FAULTS, GROUPS, FaultRow
 from drive_env.studio import machine_jobs as jobs
 from drive_env.studio.machine_camera import MachineCamera
+from drive_env.studio.page import StudioPage
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
-from drive_env.studio.studio_page import StudioPage
 from drive_env.studio.visitor import Visitor
 
 if TYPE_CHECKING:

@@ -120,6 +120,6 @@ class Presence:
             return sum(now - beat < ABANDONED for beat in self._beats.values())
 
     def is_abandoned(self) -> bool:
-        """Return whether no page has been there for so long that nobody looks."""
+        """Return whether no page has been there for so long that axes are not left enabled."""
         with self._lock:
             return time.monotonic() - self._last > ABANDONED

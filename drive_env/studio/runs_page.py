@@ -6,6 +6,7 @@ from fastapi import FastAPI
 from fastapi.responses import FileResponse, PlainTextResponse, Response
 from nicegui import ui
 
+from drive_env.studio.page import StudioPage
 from drive_env.studio.parts import studio_parts
 from drive_env.studio.runs_compare import compare, figures_of
 from drive_env.studio.runs_folder import (
@@ -24,7 +25,6 @@ from drive_env.studio.runs_folder import (
     url_of,
 )
 from drive_env.studio.session import Session
-from drive_env.studio.studio_page import StudioPage
 from drive_env.studio.visitor import Visitor
 
 REFRESH = 3.0  # s between two looks at the folder

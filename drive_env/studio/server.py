@@ -9,10 +9,11 @@ import logging
 import os
 import signal
 import socket
+import threading
 from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import uvicorn
 from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
@@ -182,23 +183,29 @@ def address(host: str, port: int, token: str | None) -> str:
     return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
 
 
+class Terms(NamedTuple):
+    """How it is served: on which address, with which token (None: none), for how long [s] (None: until a signal)."""
+
+    host: str
+    token: str | None = None
+    duration: float | None = None
+
+
 def serve_studio(
-    session: Session, pages: list[StudioPage], sock: socket.socket, host: str, token: str | None,
-    ready: Callable[[], None],
-) -> None:  # fmt: skip
+    session: Session, pages: list[StudioPage], sock: socket.socket, terms: Terms, ready: Callable[[], None]
+) -> None:
     """Serve a session until a signal comes; its drives are stopped and closed at the end, however it ends.
 
     Args:
         session: The drives; they are opened here.
         pages: What there is to see.
         sock: Listens already.
-        host: Its address.
-        token: What visitors must have, None for nothing.
+        terms: How.
         ready: Called before the first request is served.
     """
     port = sock.getsockname()[1]
     studio = Studio(session, pages)
-    web = web_app(studio, host, port, token)
+    web = web_app(studio, terms.host, port, terms.token)
     config = uvicorn.Config(web, log_level="warning", timeout_graceful_shutdown=GRACE, lifespan="on")
     server = StudioServer(config, session.stop_now)
     hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed ends it as Ctrl-C does
@@ -206,11 +213,16 @@ def serve_studio(
     if hang_up is not None and before is not signal.SIG_IGN:
         signal.signal(hang_up, server.handle_exit)
     session.start()
+    end = threading.Timer(terms.duration or 0.0, server.handle_exit, (signal.SIGTERM, None))
+    end.daemon = True
     try:
         ready()
+        if terms.duration is not None:
+            end.start()
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[sock])
     finally:
+        end.cancel()
         session.close()
         sock.close()
         if hang_up is not None:

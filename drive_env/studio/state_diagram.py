@@ -11,7 +11,7 @@ LEFT, WIDTH, HEIGHT = -46, 580, 458
 BOX = (168, 42)
 
 
-class Place(NamedTuple):
+class DiagramPlace(NamedTuple):
     """Where a state stands: the middle of its box."""
 
     x: int
@@ -32,14 +32,14 @@ class Arrow(NamedTuple):
 
 
 PLACES = {
-    State.NOT_READY_TO_SWITCH_ON: Place(110, 36, "Not ready to switch on"),
-    State.SWITCH_ON_DISABLED: Place(110, 126, "Switch on disabled"),
-    State.READY_TO_SWITCH_ON: Place(110, 226, "Ready to switch on"),
-    State.SWITCHED_ON: Place(110, 326, "Switched on"),
-    State.OPERATION_ENABLED: Place(110, 420, "Operation enabled"),
-    State.QUICK_STOP_ACTIVE: Place(440, 420, "Quick stop active"),
-    State.FAULT_REACTION_ACTIVE: Place(440, 226, "Fault reaction active"),
-    State.FAULT: Place(440, 126, "Fault"),
+    State.NOT_READY_TO_SWITCH_ON: DiagramPlace(110, 36, "Not ready to switch on"),
+    State.SWITCH_ON_DISABLED: DiagramPlace(110, 126, "Switch on disabled"),
+    State.READY_TO_SWITCH_ON: DiagramPlace(110, 226, "Ready to switch on"),
+    State.SWITCHED_ON: DiagramPlace(110, 326, "Switched on"),
+    State.OPERATION_ENABLED: DiagramPlace(110, 420, "Operation enabled"),
+    State.QUICK_STOP_ACTIVE: DiagramPlace(440, 420, "Quick stop active"),
+    State.FAULT_REACTION_ACTIVE: DiagramPlace(440, 226, "Fault reaction active"),
+    State.FAULT: DiagramPlace(440, 126, "Fault"),
 }
 ARROWS = (
     Arrow("1", State.NOT_READY_TO_SWITCH_ON, State.SWITCH_ON_DISABLED, None, "", "M110 57V103", (96, 82)),
@@ -79,7 +79,7 @@ def diagram(state: State | None) -> str:
     )
 
 
-def _box(state: State, place: Place, is_lit: bool) -> str:
+def _box(state: State, place: DiagramPlace, is_lit: bool) -> str:
     width, height = BOX
     lit = " is-lit" if is_lit else ""
     return (

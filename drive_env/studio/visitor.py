@@ -48,7 +48,7 @@ class Visitor:
     async def do(
         self, function: Callable[[Drives], T], title: str, *, paced: bool = True, quiet: bool = False
     ) -> T | None:
-        """Have a job run and return what it returns; None where it failed, which the page has been told then."""
+        """Have a job run and return what it returns; None where it failed, which the page shows then."""
         future = self.session.do(function, title, page=self.id, paced=paced, quiet=quiet)
         try:
             return await asyncio.wrap_future(future)
@@ -57,7 +57,7 @@ class Visitor:
             return None
 
     def hand_in(self, function: Callable[[Drives], T], title: str) -> None:
-        """Have a job run without waiting for it; the page is told if it fails. For the event loop's thread."""
+        """Have a job run without waiting for it; the page shows it if it fails. For the event loop's thread."""
         background_tasks.create(self.do(function, title), name=title)
 
     def say(self, text: str, kind: str = "info") -> None:

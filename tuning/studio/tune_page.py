@@ -9,8 +9,8 @@ from nicegui import ui
 
 from drive_env.devices import find_device
 from drive_env.motors import MOTORS, find_motor
+from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
-from drive_env.studio.studio_page import StudioPage
 from drive_env.studio.visitor import Visitor
 from tuning.studio import tune_jobs
 from tuning.studio.gain_card import GainCard
