@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fastapi import FastAPI
 from fastapi.responses import FileResponse, PlainTextResponse, Response
-from nicegui import ui
+from nicegui import run, ui
 
 from drive_env.studio.page import StudioPage
 from drive_env.studio.parts import studio_parts
@@ -69,7 +69,7 @@ class RunsPanel:
     def __init__(self, visitor: Visitor, chosen: str) -> None:
         self._visitor = visitor
         self._chosen, self._other = chosen, ""
-        self._known: list[tuple[str, float, int]] = []
+        self._known: list[tuple[str, float, int]] | None = None  # before the first look
 
     def build(self) -> None:
         """Make it."""
@@ -82,23 +82,23 @@ class RunsPanel:
                 self._list = ui.element("div").classes("studio-run-list")
             with ui.element("div").classes("studio-stack"):
                 self._detail = ui.card().classes("studio-card card-run")
-        self._look()
-        ui.timer(REFRESH, self._look)
+        ui.timer(REFRESH, self._look, immediate=True)
 
-    def _look(self) -> None:
+    async def _look(self) -> None:
         """Look at the folder, and show what is new."""
+        found = await run.io_bound(list_runs, RUNS)
         wanted = str(self._find.value or "").lower()
-        runs = [run for run in list_runs(RUNS) if wanted in run.name.lower()]
-        known = [(run.name, run.changed, len(run.files)) for run in runs]
-        if known == self._known and self._known:
+        runs = [one for one in found or [] if wanted in one.name.lower()]
+        known = [(one.name, one.changed, len(one.files)) for one in runs]
+        if known == self._known:
             return
         is_first = not self._known
-        before = {name: (changed, count) for name, changed, count in self._known}
+        before = {name: (changed, count) for name, changed, count in self._known or ()}
         self._known = known
         if not self._chosen and runs:
             self._chosen = runs[0].name
         self._draw_list(runs)
-        now = {run.name: (run.changed, len(run.files)) for run in runs}
+        now = {one.name: (one.changed, len(one.files)) for one in runs}
         if is_first or before.get(self._chosen) != now.get(self._chosen):
             self._draw()
 
@@ -109,37 +109,38 @@ class RunsPanel:
                 ui.label("None yet. Tune an axis, or run drive-tune or drive-agent in this folder.").classes(
                     "studio-hint"
                 )
-            for run in runs:
-                button = ui.button(on_click=lambda run=run: self._choose(run.name)).props("flat no-caps dense")
-                button.classes("w-full is-here" if run.name == self._chosen else "w-full")
-                button.props(f'data-run="{run.name}"')
-                if run.name == self._chosen:
+            for one in runs:
+                button = ui.button(on_click=lambda one=one: self._choose(one.name)).props("flat no-caps dense")
+                button.classes("w-full is-here" if one.name == self._chosen else "w-full")
+                button.props["data-run"] = one.name
+                if one.name == self._chosen:
                     button.props('aria-current="true"')
                 with button, ui.element("div").classes("studio-run-name"):
-                    ui.label(run.name)
-                    ui.html(f"<small>{run.when}, {_what(run)}</small>", sanitize=False)
+                    ui.label(one.name)
+                    ui.html(f"<small>{one.when}, {_what(one)}</small>", sanitize=False)
 
-    def _choose(self, name: str) -> None:
+    async def _choose(self, name: str) -> None:
         self._chosen = name
-        self._known = []
-        self._look()
+        self._known = None
+        await self._look()
 
     def _draw(self) -> None:
         self._detail.clear()
-        run = find_run(self._chosen, RUNS) if self._chosen else None
+        chosen = find_run(self._chosen, RUNS) if self._chosen else None
         with self._detail:
-            if run is None:
+            if chosen is None:
                 ui.label("No run is chosen.").classes("studio-hint")
                 return
-            ui.label(run.name).classes("studio-heading").props('role="heading" aria-level="2" data-test=run-name')
-            self._comparison(run)
+            ui.label(chosen.name).classes("studio-heading").props('role="heading" aria-level="2" data-test=run-name')
+            self._comparison(chosen)
             if self._other and (other := find_run(self._other, RUNS)) is not None:
-                _show_comparison(run, other)
+                _show_comparison(chosen, other)
                 return
-            _show_run(run)
+            _show_run(chosen)
 
-    def _comparison(self, run: Run) -> None:
-        others = {"": "none", **{one.name: one.name for one in list_runs(RUNS) if one.name != run.name}}
+    def _comparison(self, shown: Run) -> None:
+        names = [name for name, *_ in self._known or () if name != shown.name]
+        others = {"": "none", **{name: name for name in names}}
         if self._other not in others:
             self._other = ""
         chosen = ui.select(others, value=self._other, label="Compare with", with_input=True).props("dense outlined")
@@ -193,7 +194,8 @@ def _report(run: Run, file: RunFile) -> None:
     ui.link(f"{file.path or run.name} in a tab of its own", address, new_tab=True).classes("studio-open")
     frame = ui.element("iframe").classes("studio-report")
     frame.props["sandbox"] = ""  # no script, no form
-    frame.props(f'src="{address}" title="Report {file.path or run.name}" data-test=report')
+    frame.props["src"], frame.props["title"] = address, f"Report {file.path or run.name}"
+    frame.props("data-test=report")
 
 
 def _gallery(run: Run, files: list[RunFile]) -> None:
@@ -204,10 +206,11 @@ def _gallery(run: Run, files: list[RunFile]) -> None:
             address, name = url_of(run.name, file.path), file.path or run.name
             with ui.element("figure"):
                 if file.kind == "film":
-                    film = ui.element("video").props(f'controls muted loop src="{address}" data-test=film')
-                    film.props(f'aria-label="{name}"')
+                    film = ui.element("video").props("controls muted loop data-test=film")
+                    film.props["src"], film.props["aria-label"] = address, name
                 else:
-                    ui.element("img").props(f'src="{address}" alt="{name}" loading=lazy data-test=picture')
+                    picture = ui.element("img").props("loading=lazy data-test=picture")
+                    picture.props["src"], picture.props["alt"] = address, name
                 with ui.element("figcaption"):
                     ui.link(name, address, new_tab=True)
 

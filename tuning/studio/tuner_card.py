@@ -142,4 +142,5 @@ def _certificate(run: TunerSession) -> None:
     if (Path(run.folder) / "report.html").is_file():
         frame = ui.element("iframe").classes("studio-report")
         frame.props["sandbox"] = ""  # no script, no form
-        frame.props(f'src="{url_of(name, "report.html")}" title="Certificate of {run.title}" data-test=report')
+        frame.props["src"], frame.props["title"] = url_of(name, "report.html"), f"Certificate of {run.title}"
+        frame.props("data-test=report")
