@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import subprocess
+import sys
 
 import pytest
 
 pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
+from typer.testing import CliRunner
+
+from drive_env.commands import studio
+from drive_env.commands.cli import app
 from drive_env.studio.gate import COOKIE, StudioGate, checked_token, is_loopback, new_token
 from drive_env.studio.server import address, listen
 
@@ -126,3 +132,47 @@ def test_what_a_browser_opens():
     assert address("127.0.0.1", 29640, None) == "http://127.0.0.1:29640/"
     assert address("0.0.0.0", 29640, TOKEN).endswith(f":29640/?token={TOKEN}")
     assert address("::1", 29640, None) == "http://[::1]:29640/"
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+def run(*options):
+    return CliRunner().invoke(app, ["studio", "--no-browser", *options])
+
+
+def test_a_taken_port_ends_the_command_with_one_line():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        found = run("--port", str(port))
+    assert found.exit_code == 2
+    assert found.output.strip().startswith(f"drive-env: cannot listen on 127.0.0.1:{port}: another program has it")
+    assert "Traceback" not in found.output
+
+
+def test_without_the_extra_the_command_says_how_to_install_it(monkeypatch):
+    monkeypatch.setattr(studio.importlib.util, "find_spec", lambda name: None)
+    found = run()
+    assert found.exit_code == 2
+    assert "pip install 'drive-env[studio]'" in found.output
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    (("--channel", "socket://127.0.0.1:1", "--load", "belt"), "--load is of an emulated machine"),
+    (("--port", "70000"), "must be 0 to 65535"),
+    (("--listen", ""), "must be an address"),
+    (("--token", "short"), "12 or more"),
+    (("--load", "no such load"), "no such load"),
+    (("--device", "no such device"), "no such device"),
+    (("--motor", "no such motor"), "no such motor"),
+    (("--duration", "0"), "above 0 s"),
+])  # fmt: skip
+def test_mistakes_are_told_before_anything_is_opened(options, says):
+    found = run(*options)
+    assert found.exit_code == 2 and says in found.output, found.output
+
+
+def test_a_bus_that_is_not_there_ends_the_command_with_one_line():
+    command = [sys.executable, "-c", "from drive_env.programs import drive_env; drive_env()", "studio"]
+    options = ["--no-browser", "--port", "0", "--channel", "socket://127.0.0.1:1"]
+    found = subprocess.run([*command, *options], capture_output=True, text=True, timeout=60, check=False)
+    assert found.returncode == 2
+    assert "nobody answers at socket://127.0.0.1:1" in found.stderr and "Traceback" not in found.stderr, found.stderr

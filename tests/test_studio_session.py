@@ -262,6 +262,31 @@ def test_a_page_that_is_closed_stops_its_jog_at_once(session):
         assert speed_of(session) < 50_000
 
 
+def test_a_target_lasts_as_long_as_its_page_is_there(session, monkeypatch):
+    monkeypatch.setattr(presence, "ASLEEP", 0.8)
+    with Beats(session, "other"):
+        with Beats(session):
+            session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+            session.presence.begin("page", FIRST, held=False)
+            session.do(lambda drives: drives.write(cia402.TARGET_VELOCITY, 300_000), "turn").result(10)
+            time.sleep(1.2)
+            assert speed_of(session) > 200_000
+        time.sleep(1.3)
+        assert speed_of(session) == 0
+
+
+def test_a_transition_that_enables_moves_to_no_target_of_before(session):
+    with Beats(session):
+        session.do(motion_jobs.select_mode(0, "pv"), "mode").result(10)
+        session.do(lambda drives: drives.write(cia402.TARGET_VELOCITY, 300_000), "a target").result(10)
+        for word in cia402.ENABLING:
+            session.do(motion_jobs.command(0, word), "transition").result(10)
+            time.sleep(0.05)
+        time.sleep(0.3)
+        assert state_of(session) is State.OPERATION_ENABLED
+        assert speed_of(session) == 0
+
+
 def test_a_release_that_overtakes_its_jog_wins(session):
     with Beats(session):
         session.do(motion_jobs.enable(0, "pv"), "enable").result(10)

@@ -34,7 +34,7 @@ FLAGS = (
 )  # fmt: skip
 QUALITY = 82  # of WebP
 SIZES = {360: 780, 1280: 900, 2560: 1440}
-SETTLE = 2.0  # s until a page shows what it has
+SETTLE = 3.0  # s until a page shows what it has
 
 
 class Shot(NamedTuple):

@@ -87,7 +87,7 @@ def scope(
     with errors_as_exit_codes():
         _check_times(duration=duration, before=before, wait=wait, period=period)
         table, picture = new_files(out)
-        _listen(interface, channel, node, bitrate)
+        refuse_other_masters(interface, channel, node, bitrate)
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
@@ -130,7 +130,9 @@ def new_files(out: Path) -> tuple[Path, Path]:
     return table, picture
 
 
-def _listen(interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None) -> None:
+def refuse_other_masters(
+    interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None
+) -> None:
     """Raise OtherMastersError where another master is at work; nothing is sent."""
     from drive_env.master.can.other_masters import OtherMasters
     from drive_env.master.can.port import Port, open_bus

@@ -25,6 +25,7 @@ from drive_env.commands.options import (
     names_a_bus,
     was_typed,
 )
+from drive_env.commands.scope import refuse_other_masters
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
@@ -105,6 +106,8 @@ def studio(
                 webbrowser.open(url)
 
         server.serve_studio(session, pages, sock, server.Terms(listen, ticket, duration), ready)
+        if session.error is not None:
+            raise session.error
         if session.failure:
             raise RuntimeError(session.failure)
         print("drive-env: stopped", flush=True)
@@ -143,8 +146,13 @@ def _bus(
     eds: Path | None,
     **options: Any,
 ) -> Callable[[], Drives]:
-    """Return what opens drives of a bus, with the envelope."""
-    return lambda: connect(interface, channel, nodes, device, eds, cycle=cycle_for(described), **options)
+    """Return what opens drives of a bus, with the envelope; where another master commands them it raises."""
+
+    def open_bus() -> Drives:
+        refuse_other_masters(interface, channel, nodes, options["bitrate"])
+        return connect(interface, channel, nodes, device, eds, cycle=cycle_for(described), **options)
+
+    return open_bus
 
 
 def _title(described: Description, interface: str | None, channel: str | None, nodes: list[int] | None) -> str:

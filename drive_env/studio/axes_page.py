@@ -8,11 +8,12 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from drive_env import cia402
+from drive_env.cia402 import State
 from drive_env.studio import motion_jobs
 from drive_env.studio.axis_states import MODE_NAMES, AxisState, ShownQuantity
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
-from drive_env.studio.state_diagram import diagram
+from drive_env.studio.state_diagram import ARROWS, diagram
 from drive_env.studio.visitor import Visitor
 
 REFRESH = 0.1  # s
@@ -74,7 +75,8 @@ def _state_card(session: Session, visitor: Visitor) -> None:
                 "data-test=enable"
             )
             ui.button("Disable", icon="power_off", on_click=disable).props("outline no-caps").props("data-test=disable")
-        ui.label("Press a lit arrow for a single transition.").classes("studio-hint")
+        ui.label("Single transitions, also by a lit arrow:").classes("studio-label")
+        single = ui.row().classes("studio-buttons")
     shown: list[object] = [object()]
 
     def show() -> None:
@@ -82,8 +84,21 @@ def _state_card(session: Session, visitor: Visitor) -> None:
         if state is not None and state.state is not shown[0]:
             shown[0] = state.state
             picture.set_content(diagram(state.state))
+            single.clear()
+            with single:
+                _single_transitions(state.state)
 
     ui.timer(REFRESH, show)
+
+
+def _single_transitions(state: State | None) -> None:
+    """Make a button for each transition that leaves a state by a command."""
+    leaving = [arrow for arrow in ARROWS if arrow.start is state and arrow.word is not None]
+    for arrow in leaving:
+        button = ui.button(f"{arrow.numbers} {arrow.name}").props("outline no-caps dense").classes("studio-transition")
+        button.props(f"data-command={arrow.word}")
+    if not leaving:
+        ui.label("None from this state: the drive goes on by itself.").classes("studio-hint")
 
 
 def _modes(state: AxisState | None) -> tuple[str, ...]:

@@ -35,6 +35,11 @@ if TYPE_CHECKING:
     from drive_env.master.description import Description
 
 Key = tuple[int, int]
+# Targets by which an axis turns without an end.
+ON_AND_ON = (
+    cia402.TARGET_VELOCITY, cia402.VL_TARGET_VELOCITY, cia402.TARGET_TORQUE, cia402.VELOCITY_OFFSET,
+    cia402.TORQUE_OFFSET,
+)  # fmt: skip
 AREAS = {
     "communication": ("Communication (1000h to 1FFFh)", range(0x1000, 0x2000)),
     "manufacturer": ("Manufacturer (2000h to 5FFFh)", range(0x2000, 0x6000)),

@@ -13,6 +13,7 @@ from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.master.parameters import Difference
 from drive_env.studio import dictionary_jobs as jobs
+from drive_env.studio import motion_jobs
 from drive_env.studio.page import StudioPage
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
@@ -233,6 +234,7 @@ class DictionaryPanel:
             found = look()
             if found is None:
                 return
+            self._note_motion(entry, found.raw)
             back = await self._visitor.do(jobs.write(entry, found.raw, self._axis), f"Write {entry.label}")
             if back is None:
                 return
@@ -246,6 +248,15 @@ class DictionaryPanel:
         send.on_click(write)
         dialog.on("hide", dialog.delete)
         dialog.open()
+
+    def _note_motion(self, entry: Entry, raw: int) -> None:
+        """Have a target that turns an axis on and on last as long as this page is there, and awake."""
+        if cia402.of_first_axis(entry.index) not in jobs.ON_AND_ON:
+            return
+        presence, axes = self._session.presence, motion_jobs.masks_of(self._session.num_axes, self._axis)
+        presence.end_of_page(self._visitor.id, axes)
+        if raw:
+            presence.begin(self._visitor.id, axes, held=False)
 
     # --- comparing ------------------------------------------------------------------------------------------------
     def _compare_card(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives
@@ -73,13 +74,15 @@ def reset_fault(axis: int) -> MotionJob:
 
 
 def command(axis: int, word: int) -> MotionJob:
-    """Return the job that writes a controlword of the state machine."""
+    """Return the job that writes a controlword of the state machine; one that enables moves to no target of before."""
 
     def job(drives: Drives) -> None:
         if word == cia402.FAULT_RESET:
             motion.reset_fault(drives, where=only(drives, axis))
         else:
             motion.take_command(drives, where=only(drives, axis))
+            if word == cia402.ENABLE_OPERATION:
+                _stay(drives, only(drives, axis), _mode_of(drives, axis))
             drives.write(cia402.CONTROLWORD, word, where=only(drives, axis))
 
     return job
@@ -175,6 +178,15 @@ def _check_enabled(drives: Drives, axis: int) -> None:
     status = int(drives.read(cia402.STATUSWORD)[axis])
     if not cia402.matches(status, cia402.OPERATION_ENABLED):
         raise RuntimeError(f"axis {axis} is not enabled and cannot move: statusword {status:04X}h; enable it first")
+
+
+def _mode_of(drives: Drives, axis: int) -> str:
+    """Return the mode of operation of an axis by its abbreviation, "" for none."""
+    try:
+        number = int(drives.read(cia402.MODE_DISPLAY)[axis])
+    except ObjectAccessError:  # a drive that does not show it
+        number = int(drives.read(cia402.MODE)[axis])
+    return next((name for name, one in cia402.MODES.items() if one == number), "")
 
 
 def _stay(drives: Drives, where: Mask, mode: str) -> None:

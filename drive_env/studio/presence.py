@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 
 HOLD = 0.5  # s without a beat after which what a page holds is stopped
+ASLEEP = 2.0  # s without a beat after which what a page has set in motion for as long as it is there is stopped
 ABANDONED = 5.0  # s without any page after which an axis that is enabled is stopped and disabled
 
 
@@ -83,6 +84,14 @@ class Presence:
                 motion.why = "released"
             return motion
 
+    def end_of_page(self, page: str, axes: Mask) -> None:
+        """Take note that a page has ended what it had set in motion for as long as it is there, on some axes."""
+        with self._lock:
+            for number, motion in list(self._motions.items()):
+                if motion.page == page and not motion.held and np.any(motion.axes & axes):
+                    del self._motions[number]
+                    motion.why = motion.why or "ended"
+
     def end_all(self, axes: Mask) -> None:
         """Take note that axes are stopped: nothing of them goes on."""
         with self._lock:
@@ -106,7 +115,7 @@ class Presence:
         now = time.monotonic()
         with self._lock:
             for motion in self._motions.values():
-                if not motion.why and now - motion.beat > HOLD:
+                if not motion.why and now - motion.beat > (HOLD if motion.held else ASLEEP):
                     motion.why = f"its page was silent for {now - motion.beat:.1f} s"
             overdue = [motion for motion in self._motions.values() if motion.why]
             for motion in overdue:

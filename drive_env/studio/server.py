@@ -212,6 +212,7 @@ def serve_studio(
     before = None if hang_up is None else signal.getsignal(hang_up)
     if hang_up is not None and before is not signal.SIG_IGN:
         signal.signal(hang_up, server.handle_exit)
+    session.when_not_opened = lambda: server.handle_exit(signal.SIGTERM, None)
     session.start()
     end = threading.Timer(terms.duration or 0.0, server.handle_exit, (signal.SIGTERM, None))
     end.daemon = True

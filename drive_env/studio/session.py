@@ -97,6 +97,8 @@ class Session:
     Attributes:
         state: "opening", "open", "failed", "closed".
         failure: Why it failed.
+        error: What was raised where the drives could not be opened.
+        when_not_opened: Called then, by the drives' thread.
         presence: The pages there are.
         recorder: What is sampled.
         stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
@@ -114,6 +116,8 @@ class Session:
         self.description = description
         self.state = "opening"
         self.failure = ""
+        self.error: BaseException | None = None
+        self.when_not_opened: Callable[[], None] = lambda: None
         self.presence = Presence()
         self.recorder = ScopeRecorder(1, description.cycle)
         self.stored: dict[int, dict[Key, int]] = {}
@@ -291,15 +295,16 @@ class Session:
         try:
             self._real = self._open()
         except BaseException as error:
-            self.failure = sentence(error)
+            self.failure, self.error = sentence(error), error
             self.state = "failed"
             self._refuse_all(RuntimeError(self.failure))
+            self.when_not_opened()
             return
         try:
             if self._real.bus is not None:
                 self.description = self._real.bus.description  # which knows the time between two SYNCs
             self.recorder = ScopeRecorder(self._real.num_axes, self.description.cycle)
-            self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear)
+            self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear, self.presence.moves)
             self._states = AxisStates(self._real, self.description)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here

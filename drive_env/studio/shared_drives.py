@@ -46,6 +46,7 @@ class SharedDrives:
         recorder: Keeps what is sampled.
         look: Called between two pieces of time, by the thread whose calls these are; it may raise, which ends them.
         hear: Called with emergencies, whoever asked for them.
+        moves: Returns whether a page moves an axis by a button that it holds, or as long as it is there.
 
     Attributes:
         lock: Held while emulated drives are called: a stop from another thread waits for a piece at most.
@@ -58,6 +59,7 @@ class SharedDrives:
         recorder: ScopeRecorder,
         look: Callable[[], None],
         hear: Callable[[Sequence[EmergencyMessage]], None],
+        moves: Callable[[], bool],
     ) -> None:
         self.lock = threading.RLock()
         self.paced = True
@@ -65,6 +67,7 @@ class SharedDrives:
         self._recorder = recorder
         self._look = look
         self._hear = hear
+        self._moves = moves
         self._refused: set[tuple[Key, ...]] = set()  # what cannot be sampled at once
         self._due = time.perf_counter()
         self._start = time.monotonic()
@@ -137,6 +140,8 @@ class SharedDrives:
         asked = tuple(object_names(objects))
         if self._drives.time_waits:
             return self._in_pieces(asked, duration, play, period, PIECE)
+        if play and self._moves():  # set-points go out in one piece, in which no page's silence would be noticed
+            raise RuntimeError("a page moves an axis; end its jog, or its target, before set-points are played")
         return self._in_pieces(asked, duration, play, period, duration if play else BUS_PIECE)
 
     def emergencies(self) -> list[EmergencyMessage]:
