@@ -319,7 +319,7 @@ class MachinePanel:
                     switches[row.name] = switch
             with ui.row().classes("studio-buttons"):
                 for key, parameter in row.parameters.items():
-                    unit = "share" if parameter.unit == "1" else parameter.unit
+                    unit = parameter.unit
                     fields[key] = ui.number(
                         f"{key} [{unit}]", value=parameter.default, min=parameter.low, max=parameter.high
                     ).props("dense outlined")
