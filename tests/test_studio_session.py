@@ -97,7 +97,8 @@ def test_an_error_reaches_whoever_asked_and_the_session_goes_on(session):
 def test_time_of_an_emulated_machine_passes_as_fast_as_ours(session):
     before, begun = session.recorder.now, time.monotonic()
     time.sleep(1.0)
-    assert session.recorder.now - before == pytest.approx(time.monotonic() - begun, abs=0.3)
+    passed, ours = session.recorder.now - before, time.monotonic() - begun
+    assert 0.3 * ours < passed < ours + 0.1  # on a busy computer less: what is late is not made up for
 
 
 def test_a_job_in_a_hurry_is_not_paced(session):
@@ -122,6 +123,18 @@ def test_drives_that_cannot_be_opened_are_told():
     assert made.failure == "there is no such bus; plug it in"
     with pytest.raises(RuntimeError, match="plug it in"):
         made.do(lambda drives: None, "late").result(10)
+
+
+def test_a_job_that_its_page_has_given_up_is_not_begun_and_harms_nobody(session):
+    begun = []
+    first = session.do(lambda drives: drives.advance(0.3), "long")
+    second = session.do(lambda drives: begun.append(1), "given up")
+    third = session.do(lambda drives: drives.advance(60.0), "stopped before it begins")
+    assert second.cancel() and third.cancel()
+    first.result(10)
+    session.stop_now("the test")
+    assert session.do(lambda drives: drives.num_axes, "count").result(10) == 1
+    assert begun == []
 
 
 # --- what a job does is sampled -----------------------------------------------------------------------------------

@@ -185,7 +185,8 @@ class DictionaryPanel:
         self._is_reading = True
         try:
             first = self._next % len(visible)
-            keys = (visible + visible)[first : first + min(MOST_READ, len(visible))]
+            most = max(4, MOST_READ // max(1, self._session.num_axes))  # each is read of every axis
+            keys = (visible + visible)[first : first + min(most, len(visible))]
             self._next = first + len(keys)
             entries = [self._known.dictionary.find(key) for key in keys]
             job = jobs.values_of(entries, self._axis, self._scale)

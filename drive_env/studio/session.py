@@ -7,6 +7,7 @@ the job that is under way ends at its next call.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -20,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
-from drive_env.master.parameters import read_parameters
+from drive_env.master.parameters import parameters
 from drive_env.master.quantities import Scale
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.axis_states import AxisState, AxisStates
@@ -83,6 +85,11 @@ class Job:
     told: str = ""
     stopped: str = ""
     is_told: bool = False  # whether it has been stopped by an exception: what it puts back then must get through
+
+    def refuse(self, error: BaseException) -> None:
+        """End it before it begins; whoever asked for it may have given it up."""
+        if self.future.set_running_or_notify_cancel():
+            self.future.set_exception(error)
 
 
 class Session:
@@ -172,7 +179,7 @@ class Session:
         job = Job(function, title, page, paced, quiet)
         with self._waiting:
             if self._is_closing or self.state in ("failed", "closed"):
-                job.future.set_exception(RuntimeError(self.failure or "the drives are closed; start the studio again"))
+                job.refuse(RuntimeError(self.failure or "the drives are closed; start the studio again"))
                 return job.future
             self._jobs.append(job)
             self._waiting.notify_all()
@@ -206,7 +213,7 @@ class Session:
             if self._current is not None and not self._current.stopped:
                 self._current.stopped = reason
         for job in waiting:
-            job.future.set_exception(JobEndedError(f"it was not begun: {reason}"))
+            job.refuse(JobEndedError(f"it was not begun: {reason}"))
         real, shared = self._real, self._drives
         if real is None or shared is None:
             return
@@ -325,9 +332,13 @@ class Session:
     def _read_stored(self) -> None:
         """Read the parameters of every axis: after a start they are what the drive has stored."""
         assert self._drives is not None
-        axes = SingleAxes(self._drives, self.description).as_bus()
-        for axis in range(self.num_axes):
-            self.stored[axis] = read_parameters(axes, axis)
+        drives = self._drives
+        self.stored = {axis: {} for axis in range(self.num_axes)}
+        for entry in parameters(SingleAxes(drives, self.description).as_bus()):
+            key = (entry.index, entry.sub)
+            with contextlib.suppress(ObjectAccessError):
+                for axis, value in enumerate(drives.read(key).tolist()):
+                    self.stored[axis][key] = int(value)
 
     def _end(self) -> None:
         real = self._real
@@ -345,7 +356,7 @@ class Session:
         with self._waiting:
             waiting, self._jobs = list(self._jobs), deque()
         for job in waiting:
-            job.future.set_exception(error)
+            job.refuse(error)
 
     def _next(self) -> Job | None:
         with self._waiting:
@@ -357,6 +368,10 @@ class Session:
     def _work(self, job: Job) -> None:
         drives = self._drives
         assert drives is not None
+        if not job.future.set_running_or_notify_cancel():  # its page has given it up
+            with self._waiting:
+                self._current = None
+            return
         drives.paced = job.paced
         try:
             result = job.function(drives)
