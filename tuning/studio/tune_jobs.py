@@ -40,8 +40,10 @@ def look(desk: TuneDesk) -> Callable[[Drives], None]:
     """Return the job that reads the gains of every axis."""
 
     def job(drives: Drives) -> None:
-        desk.gains = read_gains(drives)
-        desk.touch()
+        found = read_gains(drives)
+        if desk.gains is None or not np.array_equal(found, desk.gains):
+            desk.gains = found
+            desk.touch()
 
     return job
 

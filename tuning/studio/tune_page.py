@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ from tuning.studio.tuner_card import TunerCard
 from tuning.target import AXES
 
 REFRESH = 0.2  # s
+REREAD = 2.0  # s between two readings of the gains, which another page or another master may write
 COUPLING = {
     "apart": "separate machines", "coupled": "joints of one machine", "linked": "they drive one part, as a gantry",
 }  # fmt: skip
@@ -101,6 +104,7 @@ class TunePanel:
                 self.rules.build()
         self.visitor.hand_in(tune_jobs.look(self.desk), "Read the gains")
         ui.timer(REFRESH, self._show)
+        ui.timer(REREAD, self._reread)
 
     def card(self, title: str, name: str) -> ui.card:
         """Return a card with a heading."""
@@ -122,6 +126,13 @@ class TunePanel:
         self.response.show(tuple(self.gains.wanted))
         self.rules.show()
         self.tuner.show()
+
+    async def _reread(self) -> None:
+        """Read the gains again, unless something is under way."""
+        if self.session.job is None and not self.session.waiting:
+            future = self.session.do(tune_jobs.look(self.desk), "Read the gains", page=self.visitor.id, quiet=True)
+            with contextlib.suppress(Exception):  # the next one may get through; what is wrong, other pages tell
+                await asyncio.wrap_future(future)
 
     def _machine_card(self) -> None:
         """Ask what no bus tells: motor, travel, supply, coupling."""
