@@ -149,7 +149,11 @@ class GainCard:
         self._back.set_enabled(desk.before is not None)
         kept = "" if desk.before_file is None else f" The state before is in {desk.before_file}."
         count = sum(one.axis == axis for one in desk.changes)
-        last = "Nothing changed yet." if change is None else f"{count} changes; the last: {change.what}."
+        last = (
+            "Nothing changed yet."
+            if change is None
+            else f"{count} change{'s' * (count != 1)}; the last: {change.what}."
+        )
         self._told.set_text(last + kept)
 
     def _units(self, gains: tuple[int, ...]) -> None:

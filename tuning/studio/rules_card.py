@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tuning.rules.side_by_side import AxisRules
     from tuning.studio.tune_page import TunePanel
 
+LONG = 14  # letters from which a cell is a text rather than a figure
+
 
 def identified_rows(found: Identification) -> list[tuple[str, str, str]]:
     """Return title, value with unit, and interval or the reason why there is none."""
@@ -135,5 +137,6 @@ def table(head: Sequence[str], rows: Sequence[tuple[str, ...]]) -> None:
                     with ui.element("th"):
                         ui.label(first)
                     for text in others:
-                        with ui.element("td"):
+                        is_text = any(letter.isalpha() for letter in text) and len(text) > LONG
+                        with ui.element("td").classes("text" if is_text else ""):
                             ui.label(text)
