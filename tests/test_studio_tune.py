@@ -301,3 +301,84 @@ def test_rules_are_side_by_side_once_an_axis_is_identified(desk):
     gains = desk.rules[0].rows["simc"].gains
     do(desk, tune_jobs.set_gains(desk, 0, dict(enumerate(gains)), "simc"))
     assert gains_of(desk) == gains
+
+
+# --- drives of a bus ----------------------------------------------------------------------------------------------
+@pytest.fixture
+def bus_desk(tmp_path, monkeypatch):
+    """A desk on a node that is served, whose time waits for SYNCs; and the emulated drives behind it."""
+    from drive_env.bus.hub import Hub
+    from drive_env.bus.server import Server
+    from drive_env.bus.world import World
+    from drive_env.master.open_drives import open_drives
+
+    monkeypatch.chdir(tmp_path)
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated:
+        emulated.advance(0.001)  # compiled before anybody waits for an answer
+        world, hub = World(), Hub()
+        world.add(emulated, [1])
+        address = {"interface": "slcan", "channel": hub.channel, "nodes": [1], "pace": "lockstep"}
+        with Server(world, hub):
+            made = Session(
+                lambda: open_drives("tmcm1636", **address, timeout=30.0), "a node", describe("tmcm1636", None), address
+            )
+            made.presence.beat("page")
+            made.start()
+            until(lambda: made.state != "opening", 60.0)
+            assert made.state == "open", made.failure
+            yield TuneDesk(made), emulated
+            made.close()
+        world.close()
+
+
+def test_without_its_travel_nothing_moves_on_a_bus(bus_desk):
+    desk, emulated = bus_desk
+    with pytest.raises(ValueError, match="the travel is missing"):
+        do(desk, tune_jobs.record_velocity_step(desk, 0, 300.0, 0.1))
+    assert float(emulated.machine.rotor_speed[0]) == 0.0
+
+
+def test_a_step_on_a_bus_and_the_envelope_afterwards(bus_desk):
+    desk, emulated = bus_desk
+    desk.entries.travel = "-2:2"
+    limits = do(desk, lambda drives: drives.safety.limits)
+    before = tuple(map(int, read_gains(emulated)[0]))
+    do(desk, tune_jobs.set_gains(desk, 0, {VELOCITY_P: 700}, "velocity P"))
+    assert read_gains(emulated)[0, VELOCITY_P] == 700
+    step = do(desk, tune_jobs.record_velocity_step(desk, 0, 300.0, 0.1), paced=False)
+    assert np.median(step.actual[(step.t > 0.05) & (step.t < 0.1)]) == pytest.approx(300.0, rel=0.05)
+    assert do(desk, lambda drives: drives.safety.limits) == limits
+    assert desk.before.bus["channel"] == desk.session.address["channel"]
+    do(desk, tune_jobs.undo(desk, 0))
+    assert tuple(map(int, read_gains(emulated)[0])) == before
+
+
+@pytest.mark.slow
+def test_auto_on_a_bus_comes_to_its_certificate_and_the_way_back_is_a_file(bus_desk, tmp_path):
+    desk, emulated = bus_desk
+    desk.entries.travel = "free"
+    before = tuple(map(int, read_gains(emulated)[0]))
+    run, future = started(desk, tmp_path / "auto")
+    wait(desk, future.done)
+    future.result(0)
+    (verdict,) = run.verdicts
+    assert verdict.verdict in ("accepted", "accepted with reservations"), verdict.reason
+    assert tuple(map(int, read_gains(emulated)[0])) == verdict.after != before
+    assert load_snapshot(tmp_path / "auto" / "before.toml").bus["nodes"] == [1]
+    do(desk, tune_jobs.restore_before(desk))
+    assert tuple(map(int, read_gains(emulated)[0])) == before
+    assert float(emulated.machine.rotor_speed[0]) == pytest.approx(0.0, abs=0.5)
+
+
+def test_auto_on_a_bus_is_stopped_and_the_gains_are_back(bus_desk, tmp_path):
+    desk, emulated = bus_desk
+    desk.entries.travel = "free"
+    before = tuple(map(int, read_gains(emulated)[0]))
+    run, future = started(desk, tmp_path / "auto")
+    wait(desk, lambda: abs(float(emulated.machine.rotor_speed[0])) > 5.0)
+    desk.session.stop_now("a page")
+    wait(desk, future.done, 30.0)
+    assert run.is_over and "the gains from before are back" in run.failure
+    assert tuple(map(int, read_gains(emulated)[0])) == before
+    wait(desk, lambda: abs(float(emulated.machine.rotor_speed[0])) < 0.5, 5.0)
+    assert not cia402.is_live(int(emulated.read(cia402.STATUSWORD)[0]))
