@@ -259,6 +259,14 @@ def test_figures_between_the_cursors():
     assert found.overshoot == pytest.approx(0.15, abs=0.05)
 
 
+def test_a_cursor_before_the_step_does_not_lengthen_it():
+    rolling = step_recording()
+    rolling = ScopeRecording(rolling.t - 2.0, rolling.values)  # no trigger: times up to now
+    found = measure_step(rolling, CHANNEL, -2.08, -1.4)
+    assert found.at == pytest.approx(-2.0, abs=0.003)
+    assert found.settling == pytest.approx(3.91 * 0.02, abs=0.004)
+
+
 def test_no_step_is_told():
     flat = ScopeRecording(np.arange(200) * 0.001, ((CHANNEL, np.zeros(200)),))
     with pytest.raises(ValueError, match="makes no step"):

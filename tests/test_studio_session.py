@@ -12,7 +12,7 @@ from drive_env import EmulatedDrives, cia402, motion
 from drive_env.cia402 import State
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.description import describe
-from drive_env.studio import motion_jobs, presence
+from drive_env.studio import dictionary_jobs, motion_jobs, presence
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.presence import Presence
 from drive_env.studio.sentences import sentence
@@ -364,3 +364,25 @@ def test_faults_have_cause_and_remedy(session):
         fault = session.axes[0].faults[-1]
         assert fault.text.name == "undervoltage"
         assert len(fault.text.cause) > 10 and len(fault.text.remedy) > 10
+
+
+def test_a_backup_is_restored_where_a_machine_has_fewer_axes_than_its_device():
+    known = describe("tmcm6212", None)
+    made = Session(lambda: EmulatedDrives("tmcm6212", load="inertia", num_threads=1), "a stepper", known)
+    made.start()
+    until(lambda: made.state != "opening", 120.0)
+    try:
+        text = made.do(dictionary_jobs.backup(known, 0), "backup").result(20)
+        entry = known.dictionary.find(cia402.PROFILE_VELOCITY)
+        before = int(made.do(lambda drives: drives.read(cia402.PROFILE_VELOCITY)[0], "read").result(20))
+        assert made.do(dictionary_jobs.write(entry, before + 1, 0), "write").result(20) == before + 1
+        job = dictionary_jobs.restore(known, text.encode(), "backup.toml", 0, unchecked=False, other_drive=False)
+        assert [change.entry.label for change in made.do(job, "restore").result(20)] == [entry.label]
+        changed = dictionary_jobs.restore(
+            known, text.replace("format", "# \nformat", 1).replace(f"= {before} ", f"= {before + 5} ").encode(),
+            "changed.toml", 0, unchecked=False, other_drive=False,
+        )  # fmt: skip
+        with pytest.raises(ValueError, match="was changed since it was written"):
+            made.do(changed, "restore").result(20)
+    finally:
+        made.close()

@@ -91,7 +91,8 @@ def measure_step(
     Args:
         recording: The picture.
         channel: The response.
-        begin: When the step comes [s]; None: at the trigger, or where the channel first leaves its beginning.
+        begin: From when on it is looked at [s]; None: from the beginning of the picture. The step comes at the trigger,
+            if that lies there, else where the channel first leaves its beginning.
         end: Up to when it is looked at [s]; None: to the end of the picture.
 
     Raises:
@@ -100,11 +101,12 @@ def measure_step(
     values, t = recording.of(channel), recording.t
     if values is None or len(t) < 10:
         raise ValueError(f"{channel.name} is not in the picture, or there are too few samples; record a step first")
-    first = _start(t, values) if begin is None else int(np.searchsorted(t, begin, side="right")) - 1
+    first = 0 if begin is None else int(np.searchsorted(t, begin, side="right")) - 1
     last = len(t) if end is None else int(np.searchsorted(t, end, side="right"))
     first = max(0, first)
     if last - first < 10:
         raise ValueError("there are fewer than 10 samples between the cursors; place them farther apart")
+    first = _start(t, values, first, last)
     final = float(np.mean(values[max(first, last - max(3, (last - first) // 20)) : last]))
     height = final - float(values[first])
     if abs(height) <= max(LEAST_STEP * float(np.ptp(values[first:last])), 1e-12):
@@ -119,12 +121,13 @@ def measure_step(
     )  # fmt: skip
 
 
-def _start(t: np.ndarray, values: np.ndarray) -> int:
+def _start(t: np.ndarray, values: np.ndarray, first: int, last: int) -> int:
     """Return the sample at the trigger, or before the channel first leaves its beginning."""
-    if t[0] < 0.0 < t[-1]:
+    if t[first] < 0.0 < t[last - 1]:
         return int(np.searchsorted(t, 0.0, side="right")) - 1
-    away = np.abs(values - values[0]) > 0.02 * float(np.ptp(values))
-    return max(0, int(np.argmax(away)) - 1)
+    shown = values[first:last]
+    away = np.abs(shown - shown[0]) > 0.02 * float(np.ptp(shown))
+    return first + max(0, int(np.argmax(away)) - 1)
 
 
 def in_words(figures: StepFigures, unit: str) -> str:

@@ -5,6 +5,7 @@ What is written goes through the Drives interface, and so through its envelope.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -27,9 +28,10 @@ class SingleAxes:
 
     def __init__(self, drives: Drives, description: Description) -> None:
         self._drives = drives
-        self.description = description
+        # A machine may have fewer axes than a node of its device.
+        per_node = min(description.num_axes, drives.num_axes)
+        self.description = replace(description, num_axes=per_node)
         self.num_axes = drives.num_axes
-        per_node = description.num_axes
         bus = drives.bus
         self.nodes: tuple[int, ...] = (
             tuple(range(1, 1 + -(-drives.num_axes // per_node))) if bus is None else tuple(bus.nodes)
