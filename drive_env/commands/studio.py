@@ -105,7 +105,7 @@ def studio(
             if browser:
                 webbrowser.open(url)
 
-        server.serve_studio(session, pages, sock, server.Terms(listen, ticket, duration), ready)
+        server.serve_studio(session, pages, sock, server.ServingTerms(listen, ticket, duration), ready)
         if session.error is not None:
             raise session.error
         if session.failure:

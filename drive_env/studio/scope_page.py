@@ -153,7 +153,11 @@ class ScopePanel:
             else:
                 view.run()
 
+        late = ui.label("").classes("studio-hint studio-figures")
+        late.tooltip("Times are the nominal ones of the SYNCs; a busy computer sends them late")
+
         def show() -> None:
+            late.set_text(self._session.lateness)
             run_button.set_text("Halt" if view.is_running else "Run")
             run_button.set_icon("pause" if view.is_running else "play_arrow")
 

@@ -183,7 +183,7 @@ def address(host: str, port: int, token: str | None) -> str:
     return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
 
 
-class Terms(NamedTuple):
+class ServingTerms(NamedTuple):
     """How it is served: on which address, with which token (None: none), for how long [s] (None: until a signal)."""
 
     host: str
@@ -192,7 +192,7 @@ class Terms(NamedTuple):
 
 
 def serve_studio(
-    session: Session, pages: list[StudioPage], sock: socket.socket, terms: Terms, ready: Callable[[], None]
+    session: Session, pages: list[StudioPage], sock: socket.socket, terms: ServingTerms, ready: Callable[[], None]
 ) -> None:
     """Serve a session until a signal comes; its drives are stopped and closed at the end, however it ends.
 

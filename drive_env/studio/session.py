@@ -45,6 +45,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 Mask = NDArray[np.bool_]
 
+BUS_IDLE = 0.05  # s of a bus that are sampled at once between two looks for jobs
 RETRY = 0.5  # s after which a bus that failed is asked again
 STOP_WAIT = 3.0  # s that axes get to come to rest before their voltage is taken away
 KEPT = 200  # events
@@ -293,6 +294,15 @@ class Session:
             self._states.forget_faults(axis)
 
     @property
+    def lateness(self) -> str:
+        """How many SYNCs of a bus were late since the start, in words; "" for none, and for emulated drives."""
+        bus = None if self._real is None else self._real.bus
+        if bus is None or not bus.total_timing.late:
+            return ""
+        cycles, late, worst = bus.total_timing
+        return f"{100.0 * late / cycles:.1f} % of the SYNCs were late, the worst by {1e3 * worst:.0f} ms"
+
+    @property
     def num_axes(self) -> int:
         """Number of axes; 0 before the drives are open."""
         return 0 if self._real is None else self._real.num_axes
@@ -395,7 +405,7 @@ class Session:
                 self._waiting.wait(PIECE)
             return
         try:
-            drives.advance(PIECE)
+            drives.advance(PIECE if drives.time_waits else BUS_IDLE)
             states.refresh(drives, self.recorder)
             drives.emergencies()
         except JobStoppedError:
