@@ -140,9 +140,10 @@ def tune(driver: Chrome) -> None:
 
 
 def fail(driver: Chrome) -> None:
-    """Have the encoder stuck for a moment."""
+    """Have the encoder stuck; what comes after would suffer from it."""
     press(driver, "[data-test=fault-encoder_stuck]")
     time.sleep(1.0)
+    driver.execute_script("document.activeElement.blur(); window.scrollTo(0, 420)")
 
 
 def nothing(driver: Chrome) -> None:
@@ -153,10 +154,10 @@ SHOTS = (
     Shot("axes", "/axes", 1280, 860, False, enable),
     Shot("scope", "/scope", 1280, 960, False, move),
     Shot("dictionary", "/dictionary", 1280, 860, False, find),
-    Shot("machine", "/machine", 1280, 960, False, fail),
     Shot("tune", "/tune", 1920, 1500, False, tune),
     Shot("runs", "/runs", 1280, 960, False, nothing),
     Shot("axes-phone", "/axes", 360, 780, True, nothing),
+    Shot("machine", "/machine", 1280, 960, False, fail),
 )
 
 

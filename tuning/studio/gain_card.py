@@ -63,6 +63,7 @@ class GainCard:
         self._shown: tuple[int, ...] = ()
         self._is_setting = False
         self.wanted: list[int] = []  # as the sliders stand, before they are let go
+        self._moved: set[int] = set()  # columns of sliders that are being moved: what is read leaves them alone
         self._controls: list[tuple[Gain, ui.slider, ui.number, ui.label]] = []
 
     def build(self) -> None:
@@ -92,7 +93,7 @@ class GainCard:
             number.props(f'aria-label="{name}, 0 to {gain.highest}" data-test=gain-{gain.name}')
             unit = ui.label("").classes("unit")
         slider.on_value_change(lambda event: self._slides(column, int(event.value)))
-        slider.on("change", lambda: self._apply(column, self.wanted[column] if self.wanted else None))
+        slider.on("change", lambda event: self._apply(column, value_at(int(event.args), gain.highest)))
         number.on("blur", lambda: self._apply(column, number.value))
         number.on("keydown.enter", lambda: self._apply(column, number.value))
         self._controls.append((gain, slider, number, unit))
@@ -103,6 +104,7 @@ class GainCard:
             return
         gain, _, number, _ = self._controls[column]
         self.wanted[column] = value_at(place, gain.highest)
+        self._moved.add(column)
         self._is_setting = True
         number.set_value(self.wanted[column])
         self._is_setting = False
@@ -110,12 +112,19 @@ class GainCard:
         self._panel.gains_slide()
 
     async def _apply(self, column: int, value: float | None) -> None:
-        if self._is_setting or value is None or not self._shown or int(value) == self._shown[column]:
+        if self._is_setting or value is None or not self._shown:
+            return
+        if int(value) == self._shown[column]:
+            if int(value) == self.wanted[column]:
+                self._moved.discard(column)
             return
         panel, gain = self._panel, self._controls[column][0]
         what = f"{gain.title} {self._shown[column]} to {int(value)}"
         job = tune_jobs.set_gains(panel.desk, panel.axis, {column: int(value)}, what)
+        self.wanted[column] = int(value)
         await panel.visitor.do(job, f"{gain.title} {int(value)}")
+        if self.wanted[column] == int(value):  # not moved on meanwhile
+            self._moved.discard(column)
         self.show(force=True)
 
     async def _undo_last(self) -> None:
@@ -137,13 +146,16 @@ class GainCard:
             return
         now = tuple(map(int, desk.gains[axis]))
         if now != self._shown or force:
-            self._shown, self.wanted = now, list(now)
+            old = self.wanted or list(now)
+            self._shown = now
+            self.wanted = [old[k] if k in self._moved else value for k, value in enumerate(now)]
             self._is_setting = True
-            for (gain, slider, number, _), value in zip(self._controls, now, strict=True):
-                slider.set_value(place_of(value, gain.highest))
-                number.set_value(value)
+            for column, (gain, slider, number, _) in enumerate(self._controls):
+                if column not in self._moved:
+                    slider.set_value(place_of(now[column], gain.highest))
+                    number.set_value(now[column])
             self._is_setting = False
-            self._units(now)
+            self._units(tuple(self.wanted))
         change = desk.last_change(axis)
         self._undo.set_enabled(change is not None)
         self._back.set_enabled(desk.before is not None)
