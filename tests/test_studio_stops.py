@@ -128,6 +128,7 @@ def test_the_studio_is_killed(driver, bench):
     driver.get("about:blank")
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_studio_is_ended_by_a_signal(driver, bench, number):
     world, made = bench
