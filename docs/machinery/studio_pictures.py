@@ -143,7 +143,7 @@ def fail(driver: Chrome) -> None:
     """Have the encoder stuck; what comes after would suffer from it."""
     press(driver, "[data-test=fault-encoder_stuck]")
     time.sleep(1.0)
-    driver.execute_script("document.activeElement.blur(); window.scrollTo(0, 420)")
+    driver.execute_script("document.activeElement.blur(); window.scrollTo(0, 0)")
 
 
 def nothing(driver: Chrome) -> None:
@@ -157,7 +157,7 @@ SHOTS = (
     Shot("tune", "/tune", 1920, 1500, False, tune),
     Shot("runs", "/runs", 1280, 960, False, nothing),
     Shot("axes-phone", "/axes", 360, 780, True, nothing),
-    Shot("machine", "/machine", 1280, 960, False, fail),
+    Shot("machine", "/machine", 1280, 1400, False, fail),
 )
 
 
