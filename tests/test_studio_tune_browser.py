@@ -65,7 +65,10 @@ def tab(driver, served):
 
 
 def text_of(tab, name):
-    return tab.named(name).text
+    """The text of an element; cards are drawn anew whenever there is something new."""
+    tab.named(name)
+    script = "const one = document.querySelector(arguments[0]); return one ? one.innerText : ''"
+    return tab.driver.execute_script(script, f"[data-test={name}]")
 
 
 def body(tab):
@@ -235,6 +238,7 @@ def test_auto_comes_to_its_certificate_and_its_run_is_in_runs(tab, folder):
     tab.press("run-auto")
     until(lambda: "done" in text_of(tab, "run-head"), "the end of auto", 400.0)
     assert "accepted" in text_of(tab, "verdict-0")
+    time.sleep(1.0)  # the card is drawn for the last time
     frame = tab.named("report")
     assert frame.get_attribute("sandbox") == ""
     tab.driver.switch_to.frame(frame)
@@ -246,7 +250,7 @@ def test_auto_comes_to_its_certificate_and_its_run_is_in_runs(tab, folder):
     name = next(one.name for one in (folder / "runs").iterdir() if one.name.endswith("-auto"))
     tab.open("/runs")
     until(lambda: tab.all(f"[data-run='{name}']"), "the run in its list")
-    tab.driver.execute_script("arguments[0].click()", tab.one(f"[data-run='{name}']"))
+    tab.driver.execute_script("document.querySelector(arguments[0]).click()", f"[data-run='{name}']")
     until(lambda: text_of(tab, "run-name") == name, "the run")
     until(lambda: tab.all("[data-test=report]"), "its report")
     tab.open("/tune")
