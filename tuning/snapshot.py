@@ -118,18 +118,22 @@ def take(target: Target) -> Snapshot:
 
     Take it before the drives record anything: that maps PDOs on a bus, which are parameters, too.
     """
-    drives = target.drives
+    return take_of(target.drives, target.bus)
+
+
+def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
+    """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
     identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
-    return Snapshot(target.device.name, _read_axes(target), target.bus, identities=tuple(identities))
+    return Snapshot(device_of(drives).name, _read_axes(drives), address, identities=tuple(identities))
 
 
-def _read_axes(target: Target) -> tuple[Mapping[Key, int], ...]:
-    drives = _per_axis(target.drives)
+def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
+    drives = _per_axis(of)
     # The dictionary of a module lists the objects of all its axes: each axis has its own, by those of the first.
     others = drives.description.of_further_axes()
     return tuple(
         {key: value for key, value in read_parameters(drives, axis).items() if key not in others}
-        for axis in range(target.num_axes)
+        for axis in range(of.num_axes)
     )
 
 
@@ -361,7 +365,7 @@ class Transaction:
         """Return the axes that somebody else runs and that were let alone, as they are in a run that refuses them."""
         if not self._ran.any():
             return self._ran
-        now = _read_axes(self._target)
+        now = _read_axes(self._target.drives)
         same = [_settings(one) == _settings(other) for one, other in zip(now, self.before.axes, strict=True)]
         untouched: Mask = self._ran & same
         return untouched

@@ -23,6 +23,7 @@ from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.drives.speeds import per_increment
 
 if TYPE_CHECKING:
+    from drive_env import EmulatedDrives
     from drive_env.devices import Device
     from drive_env.motors import Motor
     from mechanics.load import Load
@@ -162,8 +163,6 @@ def emulated(
         ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
     """
     from drive_env import EmulatedDrives
-    from mechanics.shaft import one, way
-    from tuning.identify.linked_axes import are_linked
 
     drives = EmulatedDrives(
         device,
@@ -175,22 +174,52 @@ def emulated(
         supply=supply,
         **options,
     )
-    alone = one(drives.load)
+    return of_machines(drives, drives, supply=supply, travel=travel, speed=speed, current=current)
+
+
+def of_machines(
+    drives: Drives,
+    made: EmulatedDrives,
+    *,
+    supply: float | None = None,
+    travel: Travel | Iterable[Travel] | None = None,
+    speed: float | None = None,
+    current: float | None = None,
+) -> Target:
+    """Return emulated machines that are there already as a target.
+
+    Args:
+        drives: By which the tuner reaches them.
+        made: What they were made as: its device, motor and load count.
+        supply: Supply voltage [V]; the motor's by default.
+        travel: How far the rotors may turn [rad], as `emulated` takes it.
+        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
+        current: Limit of what excites [A]; the motor's rated current by default.
+
+    Raises:
+        ValueError: For a travel that does not hold 0.
+    """
+    from mechanics.shaft import one, way
+    from tuning.identify.linked_axes import are_linked
+
+    alone = one(made.load)
     own = way(alone)
-    narrow_low, narrow_high = _ways(FREE if travel is None else travel, drives.load.num_axes)
-    low = np.tile(np.maximum(own.low, narrow_low), num_machines)
-    high = np.tile(np.minimum(own.high, narrow_high), num_machines)
-    volts = drives.device.supply_of(drives.motor) if supply is None else supply
-    limits = _limits(drives.motor, drives.num_axes, volts, speed, current)
+    narrow_low, narrow_high = _ways(FREE if travel is None else travel, made.load.num_axes)
+    lanes, here = made.num_machines, np.asarray(made.machine.rotor_angle)
+    # The load's ends are places; a rotor that stands at one, or a little beyond, has no way to that side.
+    low = np.maximum(np.minimum(np.tile(own.low, lanes) - here, 0.0), np.tile(narrow_low, lanes))
+    high = np.minimum(np.maximum(np.tile(own.high, lanes) - here, 0.0), np.tile(narrow_high, lanes))
+    volts = made.device.supply_of(made.motor) if supply is None else supply
+    limits = _limits(made.motor, made.num_axes, volts, speed, current)
     return Target(
         drives,
-        drives.device,
-        drives.motor,
+        made.device,
+        made.motor,
         low=low,
         high=high,
-        axes_per_machine=drives.load.num_axes,
+        axes_per_machine=made.load.num_axes,
         linked=are_linked(alone),
-        machine=drives.load.name,
+        machine=made.load.name,
         **limits,
     )
 
@@ -230,8 +259,7 @@ def on_bus(
     Raises:
         ValueError: For an unknown name or a travel that does not hold 0; BusError if a node does not answer.
     """
-    if axes not in AXES:
-        raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
+    check_coupling(axes)
     from drive_env.devices import find_device
     from drive_env.master.open_drives import default_nodes, open_drives
     from drive_env.motors import find_motor
@@ -240,21 +268,60 @@ def on_bus(
     numbers = default_nodes(interface) if nodes is None else tuple(nodes)
     drives = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
     try:
-        low, high = _ways(travel, drives.num_axes)
-        assert drives.device is not None, "a device of a name is known"
-        volts = drives.device.supply_of(row) if supply is None else supply
-        limits = _limits(row, drives.num_axes, volts, speed, current)
-        bus = _address(interface, channel, numbers, options)
-        machine = f"{bus.get('channel', 'a bus')}, node {', '.join(map(str, numbers))}"
-        lanes = 1 if axes == "apart" else drives.num_axes
-        target = Target(drives, drives.device, row, low=low, high=high, axes_per_machine=lanes,
-                        linked=axes == "linked", machine=machine, bus=bus, **limits)  # fmt: skip
+        target = of_bus(
+            drives, row, address_of(interface, channel, numbers, options), supply=supply, travel=travel, speed=speed,
+            current=current, axes=axes,
+        )  # fmt: skip
         if "safety" not in options:
-            _hold_to_travel(target)
+            hold_to_travel(target)
     except BaseException:
         drives.close()
         raise
     return target
+
+
+def of_bus(
+    drives: Drives,
+    motor: Motor,
+    address: Mapping[str, Any],
+    *,
+    supply: ArrayLike | None = None,
+    travel: Travel | Iterable[Travel],
+    speed: float | None = None,
+    current: float | None = None,
+    axes: str = "apart",
+) -> Target:
+    """Return drives of a bus that are open already as a target; `hold_to_travel` has their envelope know of it.
+
+    Args:
+        drives: The drives.
+        motor: What every node turns.
+        address: How they are opened again: what `CanDrives` takes.
+        supply: Supply voltage [V], one value or one per axis; the motor's by default.
+        travel: How far the rotors may turn from where they stand [rad], as `on_bus` takes it.
+        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
+        current: Limit of what excites [A]; the motor's rated current by default.
+        axes: How the nodes' axes belong together, one of `AXES`.
+
+    Raises:
+        ValueError: For a travel that does not hold 0.
+    """
+    check_coupling(axes)
+    low, high = _ways(travel, drives.num_axes)
+    device = drives.device
+    assert device is not None, "a device of a name is known"
+    volts = device.supply_of(motor) if supply is None else supply
+    limits = _limits(motor, drives.num_axes, volts, speed, current)
+    machine = f"{address.get('channel', 'a bus')}, node {', '.join(map(str, address.get('nodes', ())))}"
+    lanes = 1 if axes == "apart" else drives.num_axes
+    return Target(drives, device, motor, low=low, high=high, axes_per_machine=lanes, linked=axes == "linked",
+                  machine=machine, bus=address, **limits)  # fmt: skip
+
+
+def check_coupling(axes: str) -> None:
+    """Raise ValueError for a word that is none of `AXES`."""
+    if axes not in AXES:
+        raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
 
 
 @contextmanager
@@ -305,7 +372,7 @@ def _limits(
     }
 
 
-def _address(
+def address_of(
     interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return what opens these drives again; what a file cannot hold, such as an open bus, is left out."""
@@ -322,7 +389,7 @@ def _address(
 _ADDRESS = ("bitrate", "pace")
 
 
-def _hold_to_travel(target: Target) -> None:
+def hold_to_travel(target: Target) -> None:
     """Have the envelope hold each axis to its own travel, by more than a move overshoots, and to its motor's speed."""
     from drive_env.safety.limits import Limits
 

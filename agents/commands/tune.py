@@ -28,7 +28,6 @@ from drive_env.commands.options import DeviceName, Yes, look_first, names_a_bus
 from drive_env.commands.tables import print_lines
 from tuning.commands.options import DriveOptions, MotorName, Supply, TravelRange, ask_to_turn, open_target
 
-MOST_TRIALS = 10_000
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
 
 if TYPE_CHECKING:
@@ -79,7 +78,9 @@ def tune(
         bus = names_a_bus(context)
         if bus and seed is not None:
             raise ValueError("--seed draws an emulated machine; leave it out on a bus")
-        policy = _tuner(agent, device, trials)
+        from agents.tuner.open_tuner import open_tuner
+
+        policy = open_tuner(agent, device, trials)
         folder = new_folder(out, "agent-tune")
         with ExitStack() as stack:
             if not bus:
@@ -100,33 +101,6 @@ def tune(
                 ask_to_turn(node, yes, interface)
             result = _run(target, policy, folder, agent, store, json)
         _report(result, folder, json, bus)
-
-
-def _tuner(agent: str, device: str, trials: int | None) -> Any:
-    """Return the agent's policy, with so many trials if they are given; ValueError unless it can tune the device."""
-    from agents.policies.policy import load_policy
-    from agents.shipped import find_agent
-
-    if trials is not None and not 1 <= trials <= MOST_TRIALS:
-        raise ValueError(f"--trials {trials} must be 1 or more, and {MOST_TRIALS} at most: each turns the motor")
-    policy = load_policy(find_agent(agent))
-    if policy.bundle.environment != "ServoDrive/GainTuning-v0":
-        raise ValueError(f"agent {agent} acts in {policy.bundle.environment}; a tuner acts in ServoDrive/GainTuning-v0")
-    _check_gains(policy, device)
-    if trials is not None:
-        policy.bundle.configuration["trials"] = trials
-    return policy
-
-
-def _check_gains(policy: Any, device: str) -> None:
-    """Raise ValueError unless agent and verification support the drive's loops, before anything moves."""
-    from agents.tuner.tune_target import gains_for
-    from drive_env.devices import find_device
-    from drive_env.gains import check_linear_model
-
-    known = find_device(device)
-    gains_for(policy.bundle.configuration, known)
-    check_linear_model(known)
 
 
 @contextmanager
@@ -216,26 +190,20 @@ def _what_is_written(group: list[Any]) -> str:
 
 
 def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> TunerRun:
+    from agents.tuner.open_tuner import remark, titles_of_trials
     from agents.tuner.tuning_run import run
     from tuning.certificate.certificate_files import certificate_files
 
     known = target.device.gains
     outer = known.columns_of("velocity", "position")
-    titles = [known.titles[k] for k in outer]
+    titles = titles_of_trials(known)
     widths = [max(len(title) + 1, 11) for title in titles]
 
     def show(trial: TrialShown) -> None:
         if json:
             return
-        mark = "better" if trial.better[0] else ""
-        if trial.number == 0:
-            mark = "the baseline rule's gains, where the agent starts"
-        if trial.aborted[0]:
-            told = ", ".join(name.replace("_", " ") for name in trial.faults[0])
-            rule = f"; {mark}" if trial.number == 0 else ""
-            mark = f"stopped: it oscillated or went into fault{told and f'; the drive reported {told}'}{rule}"
         figures = "".join(f" {value:>{width}}" for value, width in zip(trial.gains[0, outer], widths, strict=True))
-        print_lines([f"{trial.number or 'rule':>5}{figures} {trial.measured[0]:>8.3f}  {mark}".rstrip()])
+        print_lines([f"{trial.number or 'rule':>5}{figures} {trial.measured[0]:>8.3f}  {remark(trial)}".rstrip()])
 
     def say(what: str) -> None:
         if not json:

@@ -51,9 +51,11 @@ class Shot(NamedTuple):
 @contextmanager
 def served() -> Iterator[str]:
     """Yield the address of a studio."""
+    folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)  # where it leaves its runs
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, "studio", "--no-browser", "--port", "0"], stdout=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-c", PROGRAM, "studio", "--no-browser", "--port", "0"], stdout=subprocess.PIPE, text=True,
+        cwd=folder.name,
+    )  # fmt: skip
     try:
         assert process.stdout is not None
         found = next(found for line in process.stdout if (found := re.search(r"(http://\S+?)/?\s", line)))
@@ -61,6 +63,7 @@ def served() -> Iterator[str]:
     finally:
         process.terminate()
         process.wait(20)
+        folder.cleanup()
 
 
 @contextmanager
@@ -123,6 +126,26 @@ def find(driver: Chrome) -> None:
     time.sleep(SETTLE)
 
 
+def tune(driver: Chrome) -> None:
+    """Have auto tune the axis, with a step before and after it, and a response."""
+    press(driver, "[data-test=record-step]")
+    time.sleep(3.0)
+    press(driver, "[data-test=run-auto]")
+    while "done" not in driver.find_element(By.CSS_SELECTOR, "[data-test=run-head]").text:
+        time.sleep(1.0)
+    for what in ("record-step", "measure-response"):
+        press(driver, f"[data-test={what}]")
+        time.sleep(8.0)
+    driver.execute_script("for (const one of document.querySelectorAll('.q-notification')) one.remove()")
+
+
+def fail(driver: Chrome) -> None:
+    """Have the encoder stuck; what comes after would suffer from it."""
+    press(driver, "[data-test=fault-encoder_stuck]")
+    time.sleep(1.0)
+    driver.execute_script("document.activeElement.blur(); window.scrollTo(0, 0)")
+
+
 def nothing(driver: Chrome) -> None:
     """Do nothing."""
 
@@ -131,7 +154,10 @@ SHOTS = (
     Shot("axes", "/axes", 1280, 860, False, enable),
     Shot("scope", "/scope", 1280, 960, False, move),
     Shot("dictionary", "/dictionary", 1280, 860, False, find),
+    Shot("tune", "/tune", 1920, 1500, False, tune),
+    Shot("runs", "/runs", 1280, 960, False, nothing),
     Shot("axes-phone", "/axes", 360, 780, True, nothing),
+    Shot("machine", "/machine", 1280, 1400, False, fail),
 )
 
 
@@ -156,7 +182,7 @@ def photograph(driver: Chrome, base: str, shot: Shot, folder: Path) -> Path:
     return file
 
 
-def every(pages: tuple[str, ...] = ("axes", "scope", "dictionary")) -> list[Shot]:
+def every(pages: tuple[str, ...] = ("axes", "scope", "dictionary", "tune", "machine", "runs")) -> list[Shot]:
     """Return every page at every size, light and dark."""
     acts = {"scope": nothing, "axes": nothing, "dictionary": nothing}
     return [

@@ -89,7 +89,8 @@ def studio(
             else _machine(device, load, motor, factory, seed)
         )
         title = _title(described, interface, channel, node) if is_bus else f"{device}, emulated, load {load}"
-        session = Session(opener, title, described)
+        address = {"interface": interface, "channel": channel, "nodes": node, "bitrate": bitrate} if is_bus else {}
+        session = Session(opener, title, described, {name: one for name, one in address.items() if one is not None})
         pages = studio_pages(emulated=not is_bus)
         if is_loopback(listen) and token is None:
             ticket = None

@@ -330,6 +330,7 @@ class EmulatedDrives:
         single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self._kind, self.device, self.motor, self.load, defaults)
+        self._parameter_rows = table
         self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal, wired_as_known=wired_as_known)
         seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
         self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever

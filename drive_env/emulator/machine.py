@@ -17,11 +17,13 @@ from drive_env.emulator.parameters import check_known, check_parameter
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
+from drive_env.faults.table import FAULTS
 from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.record import get_lanes, set_lanes
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.emulator.parameters import MachineParameter
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -59,6 +61,11 @@ class Machines:
     def parameters(self) -> dict[str, Floats]:
         """True parameters by name [SI], each of shape (num_machines,)."""
         return {name: values.copy() for name, values in self._drives._parameters.items()}
+
+    @property
+    def parameter_rows(self) -> Mapping[str, MachineParameter]:
+        """What each parameter is by name: unit, default, and the range in which random machines have it."""
+        return self._drives._parameter_rows
 
     @property
     def diverged(self) -> Mask:
@@ -419,6 +426,18 @@ class Machines:
     def faults(self) -> list[InjectedFault]:
         """Return the faults that are still to come or are there; one that has ended everywhere is forgotten."""
         return self._drives._faults.listing()
+
+    @property
+    def possible_faults(self) -> list[str]:
+        """Names of the faults that these machines can have, in the order of the table."""
+        found = []
+        for name in FAULTS:
+            try:
+                self._drives._faults.check(Order(name))
+            except ValueError:
+                continue
+            found.append(name)
+        return found
 
     def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
         """End a fault or call it off, None all of them; ValueError if there is none of that number."""

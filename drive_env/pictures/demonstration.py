@@ -220,12 +220,17 @@ def _load_torque(row: Demonstration, drives: EmulatedDrives) -> float:
         return row.load_torque
     if row.mode == "cst":
         return 0.0  # nothing would hold against it
+    return -LOAD_SHARE * rated_load_torque(drives)
+
+
+def rated_load_torque(drives: EmulatedDrives) -> float:
+    """Return the torque on the load [N*m; N on what moves in a line] that takes the rated torque of a motor."""
     from mechanics.shaft import way
 
     packed = drives.inside.groups[0].load
     # The disturbance's speed per speed of each rotor; the axis that feels it most.
     lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0])
-    return -LOAD_SHARE * drives.motor.rated_torque / float(lever.max())
+    return drives.motor.rated_torque / float(lever.max())
 
 
 # --- the TOML ---------------------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ class Picture:
             load.mjcf,
             self._left,
             form.height - self._layout.header - self._layout.footer,
-            _reachable(load) if poses is None else poses,
+            reachable_poses(load) if poses is None else poses,
         )
         self._scope: tuple[Recording, ScopePicture] | None = None
 
@@ -216,7 +216,7 @@ def _samples(recording: Recording, cycles: int) -> range:
     return range(0, len(recording.t), cycles)
 
 
-def _reachable(load: Load) -> NDArray[np.float64]:
+def reachable_poses(load: Load) -> NDArray[np.float64]:
     """Return the rest position, and one pose for either end of each axis that has one, shape (n, D)."""
     from mechanics.shaft import one, way
 

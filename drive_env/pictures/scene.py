@@ -28,7 +28,7 @@ _SURROUNDINGS = """
   <visual>
     <headlight ambient="0.5 0.5 0.5" diffuse="0.28 0.28 0.28" specular="0.1 0.1 0.1"/>
     <rgba haze="0.93 0.94 0.96 1"/>
-    <quality shadowsize="2048" offsamples="4" numslices="64"/>
+    <quality shadowsize="{shadows}" offsamples="{samples}" numslices="64"/>
   </visual>
   <asset>
     <texture name="sky" type="skybox" builtin="gradient" rgb1="0.97 0.975 0.985" rgb2="0.9 0.915 0.94" width="64"
@@ -60,14 +60,19 @@ class Scene:
         height: Of the picture [pixels].
         poses: Joint positions [rad or m] that the camera must hold, shape (n, D); by default the rest position and
             what limited joints reach.
+        quick: Leave out shadows and smooth edges: a tenth of the time where no graphics card draws.
 
     Raises:
         ValueError: If the MJCF has nothing that can be seen.
         OpenGLError: If there is no OpenGL to draw with.
     """
 
-    def __init__(self, mjcf: str | Path, width: int = 480, height: int = 480, poses: ArrayLike | None = None) -> None:
+    def __init__(
+        self, mjcf: str | Path, width: int = 480, height: int = 480, poses: ArrayLike | None = None, *,
+        quick: bool = False,
+    ) -> None:  # fmt: skip
         self._mujoco: Any = import_mujoco()
+        self._quick = quick
         bare = load_model(mjcf)
         chosen = _joint_limits(self._mujoco, bare) if poses is None else np.atleast_2d(np.asarray(poses, float))
         self._check_shape(bare, chosen)
@@ -128,6 +133,8 @@ class Scene:
         light = 0.5 * (low + high) - size * LIGHT_DIRECTION
         has_floor = bool(np.any(bare.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)))
         text = _SURROUNDINGS.format(
+            shadows=256 if self._quick else 2048,
+            samples=0 if self._quick else 4,
             repeat=1.0 / self.grid,
             light="" if bare.nlight else _LIGHT.format(pos=" ".join(map(str, light))),
             # A little below the machine, so that what lies on the floor does not flicker.
@@ -153,6 +160,9 @@ class Scene:
         self._context = new_context(width, height)
         self._options = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(self.model, maxgeom=10_000)
+        if self._quick:
+            for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+                self._scene.flags[flag] = 0
         try:
             self._renderer = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except mujoco.FatalError as error:

@@ -21,7 +21,7 @@ class StudioPage:
         path: Where it is: "/scope".
         title: Its name in the navigation.
         icon: The name of a Material icon.
-        order: Its place in the navigation, from above; those of this package have 10, 20, 30.
+        order: Its place in the navigation, from above; ours have 10 to 60.
         build: Makes its content, for one visitor, into the present element of NiceGUI.
         emulated_only: Whether it needs emulated machines; it is left out for drives on a bus.
         attach: Adds routes of its own to the web application, websockets for one; it is called once.

@@ -7,13 +7,15 @@ import logging
 
 from drive_env.studio.axes_page import page as axes
 from drive_env.studio.dictionary_page import page as dictionary
+from drive_env.studio.machine_page import page as machine
 from drive_env.studio.page import StudioPage
+from drive_env.studio.runs_page import page as runs
 from drive_env.studio.scope_page import page as scope
 
 logger = logging.getLogger(__name__)
 
 ENTRY_POINTS = "drive_env.studio_pages"
-OWN = (axes, scope, dictionary)
+OWN = (axes, scope, dictionary, machine, runs)
 
 
 def studio_pages(*, emulated: bool) -> list[StudioPage]:

@@ -12,7 +12,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -37,6 +37,7 @@ from drive_env.studio.shared_drives import PIECE, SharedDrives
 from drive_env.studio.single_axes import SingleAxes
 
 if TYPE_CHECKING:
+    from drive_env.emulator.machine import Machines
     from drive_env.master.description import Description
 
 logger = logging.getLogger(__name__)
@@ -99,6 +100,7 @@ class Session:
         open_drives: Opens the drives, in the thread that will use them.
         title: What they are, for people.
         description: Of the device.
+        address: How drives of a bus were opened: interface, channel, nodes, bitrate; empty for emulated ones.
 
     Attributes:
         state: "opening", "open", "failed", "closed".
@@ -110,8 +112,15 @@ class Session:
         stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
     """
 
-    def __init__(self, open_drives: Callable[[], Drives], title: str, description: Description) -> None:
+    def __init__(
+        self,
+        open_drives: Callable[[], Drives],
+        title: str,
+        description: Description,
+        address: Mapping[str, Any] | None = None,
+    ) -> None:
         self.title = title
+        self.address = dict(address or {})
         self.description = description
         self.state = "opening"
         self.failure = ""
@@ -223,6 +232,31 @@ class Session:
         """Say how far the present job is; called by the job itself."""
         if self._current is not None:
             self._current.told, self._current.progress = text, progress
+
+    def check(self) -> None:
+        """End the present job if it was stopped; called by a job that computes for long between two calls of drives.
+
+        Raises:
+            JobStoppedError: If it was.
+        """
+        self._look()
+
+    def glimpse(self, function: Callable[[Machines], T], patience: float = 1.0) -> T | None:
+        """Return what a function reads of emulated machines between two pieces of time; None if there is no moment.
+
+        Any thread may call it. It only looks: what changes a machine is a job.
+
+        Args:
+            function: It must be quick, since time stands still meanwhile.
+            patience: How long a moment is waited for [s].
+        """
+        shared = self._drives
+        if shared is None or shared.machine is None or not shared.lock.acquire(timeout=patience):
+            return None
+        try:
+            return function(shared.machine)
+        finally:
+            shared.lock.release()
 
     def say(self, level: str, text: str) -> None:
         """Add to what happened: level info, warning or error."""
@@ -403,7 +437,23 @@ class Session:
             self._leave_alone(job)
         if job is not None and job.stopped and not job.is_told:
             job.is_told = True
+            self._await_rest()
             raise JobStoppedError(job.stopped)
+
+    def _await_rest(self) -> None:
+        """Let emulated axes come to rest: what a stopped job puts back takes their voltage away, and they would coast.
+
+        Drives of a bus are brought to rest by the supervisor of their envelope.
+        """
+        real, drives = self._real, self._drives
+        assert real is not None and drives is not None
+        if not real.time_waits or real.safety is not None:
+            return
+        with drives.lock:
+            live = np.asarray(cia402.is_live(real.read(cia402.STATUSWORD)))
+            waited = 0.0
+            while live.any() and waited < STOP_WAIT and _turns(real, live):
+                waited += PIECE
 
     def _obey(self) -> None:
         """Do what `stop_now` asks of this thread."""

@@ -80,8 +80,8 @@ def auto(
 
 def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> TriedGains:
     """Search gains on digital twins, and try the best few on the drives."""
-    say("searching gains on digital twins", 0.3)
-    candidates = compute(bench, basis)
+    searching = "searching gains on digital twins"
+    candidates = compute(bench, basis, lambda share: say(searching, 0.3 + 0.4 * share))
     say("trying gains on the drives", 0.7)
     return prove(bench, basis, candidates)
 

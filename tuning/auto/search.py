@@ -35,6 +35,7 @@ SETS, GENERATIONS = 16, 24  # of a search on twins: sets of gains at once, and h
 SEARCHES = 3  # side by side
 FINALISTS = 4  # of each of them, that are scored again
 OTHER_GENERATIONS, OTHER_WIDTH = 12, 0.5  # of a search on other twins, from what was found, and how wide it begins
+RUNS = GENERATIONS + 2 + 2 * (OTHER_GENERATIONS + 1)  # of twins in all, for who waits
 SOFT = "margin_60"  # the rule that is tried when nothing faster passes: 60 degrees and 20 dB
 # The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
@@ -87,8 +88,15 @@ def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
     return Basis(identified, bench.before, reference, fallbacks, tuple(unsafe))
 
 
-def compute(bench: AutoBench, basis: Basis) -> Candidates:
-    """Search gains on twins, from what the rules propose."""
+def compute(bench: AutoBench, basis: Basis, progress: Callable[[float], None] = lambda share: None) -> Candidates:
+    """Search gains on twins, from what the rules propose.
+
+    Args:
+        bench: The drives.
+        basis: What is known of them.
+        progress: Called between two runs of the twins with the share done; what it raises ends the search.
+    """
+    told = _Told(progress)
     target, chosen = bench.target, np.flatnonzero(bench.going).tolist()
     known = basis.identified.twins(chosen, bench.reach())
     starts = []
@@ -97,14 +105,17 @@ def compute(bench: AutoBench, basis: Basis) -> Candidates:
         proposals = (propose(name, target.device, target.motor, plant) for name in RULES)
         starts.append(np.array([basis.reference[axis], *(proposal.gains for proposal in proposals)], np.int64))
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
-    found = _search_apart(bench, known, np.array(starts), scaler)
+    found = _search_apart(bench, known, np.array(starts), scaler, told)
     gains, cost = np.ones_like(bench.before), np.full(target.num_axes, np.nan)
     others = np.tile(gains, (len(OTHERS), 1, 1))
     gains[chosen], cost[chosen] = found.gains[:, 0], found.cost[:, 0]
     # What the drive itself then tells apart: what is best on other twins.
     for number, worlds in {BOLD: WORLDS[:1], SLIPPERY: SLIPPERY_WORLDS}.items():
         with Twins(target.device, target.motor, known, scaler, SETS, worlds=worlds) as twins:
-            other = search(twins, found.gains, bench.rng, generations=OTHER_GENERATIONS, width=OTHER_WIDTH)
+            other = search(
+                twins, found.gains, bench.rng, generations=OTHER_GENERATIONS, width=OTHER_WIDTH,
+                score=told.of(twins),
+            )  # fmt: skip
         others[number, chosen] = other.gains[:, 0]
     for axis in chosen:
         plant, _ = basis.identified.known(axis)
@@ -113,19 +124,38 @@ def compute(bench: AutoBench, basis: Basis) -> Candidates:
     return Candidates(gains, others, cost)
 
 
-def _search_apart(bench: AutoBench, known: Sequence[Known], starts: Integers, scaler: Floats) -> Optimum:
+class _Told:
+    """Tells how much of a search is done, whenever twins have run."""
+
+    def __init__(self, progress: Callable[[float], None]) -> None:
+        self._progress = progress
+        self._runs = 0
+
+    def of(self, twins: Twins) -> Callable[[Integers], Floats]:
+        """Return what scores gains on twins, and tells."""
+
+        def score(gains: Integers) -> Floats:
+            self._progress(min(1.0, self._runs / RUNS))
+            self._runs += 1
+            return twins.score(gains)
+
+        return score
+
+
+def _search_apart(bench: AutoBench, known: Sequence[Known], starts: Integers, scaler: Floats, told: _Told) -> Optimum:
     """Run several searches at the same time, and return the best of each axis.
 
     On an elastic axis the robust cost has several local minima, and a search stays in the first that it reaches.
     """
     target, n = bench.target, len(known)
     with Twins(target.device, target.motor, [*known] * SEARCHES, np.tile(scaler, SEARCHES), SETS) as twins:
-        found = search(twins, np.tile(starts, (SEARCHES, 1, 1)), bench.rng, generations=GENERATIONS)
+        every = np.tile(starts, (SEARCHES, 1, 1))
+        found = search(twins, every, bench.rng, generations=GENERATIONS, score=told.of(twins))
     # The least cost of hundreds of runs is partly luck: the best few of each search are run again with other noises.
     by_axis = found.gains[:, :FINALISTS].reshape(SEARCHES, n, -1, found.gains.shape[-1]).swapaxes(0, 1)
     few = by_axis.reshape(n, -1, found.gains.shape[-1])
     with Twins(target.device, target.motor, known, scaler, few.shape[1], repeats=REPEATS) as twins:
-        cost = twins.score(few)
+        cost = told.of(twins)(few)
     order = cost.argsort(axis=1, kind="stable")
     start = found.start.reshape(SEARCHES, n).min(axis=0)
     return Optimum(np.take_along_axis(few, order[:, :, None], axis=1), np.take_along_axis(cost, order, axis=1), start)

@@ -64,40 +64,24 @@ def auto(
 
 
 def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
-    from tuning.auto.certify import certificate
-    from tuning.auto.one_button import auto as tune
-    from tuning.certificate.certificate_files import certificate_files
+    from tuning.auto.run_to_files import BEFORE, auto_to_files
 
-    file = folder / "before.toml"
     try:
         with progress_bar("tuning") as show:
-            return tune(
-                target, file, seed=seed, keep=store, progress=lambda what, share: show(share),
-                files=lambda result: certificate_files(certificate(target, result, seed), folder),
-            )  # fmt: skip
+            return auto_to_files(target, folder, lambda what, share: show(share), seed=seed, keep=store)
     except KeyboardInterrupt:
-        fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)
+        fail(f"interrupted; {_left_behind(target, folder / BEFORE)}", INTERRUPTED)
 
 
 def _stepper(target: Target, folder: Path, store: bool, json: bool) -> None:
     """Commission an open-loop stepper."""
-    from tuning.stepper.commissioning import check_stepper, commission
-    from tuning.stepper.result import certificate_file
+    from tuning.auto.run_to_files import BEFORE, commission_to_files
 
-    check_stepper(target)
-    if target.drives.safety is not None:
-        from tuning.commands.optimise import leave_oscillations_to_trials
-
-        leave_oscillations_to_trials(target.drives)
-    file = folder / "before.toml"
     try:
         with progress_bar("commissioning") as show:
-            result = commission(
-                target, file, keep=store, progress=lambda what, share: show(share),
-                files=lambda result: certificate_file(result, folder),
-            )  # fmt: skip
+            result = commission_to_files(target, folder, lambda what, share: show(share), keep=store)
     except KeyboardInterrupt:
-        fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)
+        fail(f"interrupted; {_left_behind(target, folder / BEFORE)}", INTERRUPTED)
     _report_stepper(target, result, folder, json)
     if not result.accepted.all():
         raise typer.Exit(REFUSED)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drive_env.commands.tables import Column, print_lines, print_table
-from drive_env.drives.interface import Drives
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from tuning.search.optimise import Settings
 
 MOST_SEARCHES = 10_000
-STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
 
 
 def _from_file(context: typer.Context, path: Path | None) -> Path | None:
@@ -255,6 +253,7 @@ def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options:
     A search whose results cannot be written has failed.
     """
     from tuning.search.optimise import optimise as search
+    from tuning.search.trial_bench import leave_oscillations_to_trials
     from tuning.snapshot import put_back
 
     leave_oscillations_to_trials(target.drives)
@@ -271,14 +270,6 @@ def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options:
         _save(found, settings, folder, options)
         transaction.commit()
     return found
-
-
-def leave_oscillations_to_trials(drives: Drives) -> None:
-    """Keep the envelope from ending a search where a trial stops an axis itself, or the sampler computes for long."""
-    from dataclasses import replace
-
-    if drives.safety is not None:
-        drives.safety.change(replace(drives.safety.limits, oscillation=False, stall=STALL))
 
 
 def _save(found: Any, settings: Any, folder: Path, options: dict[str, Any]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,12 +29,11 @@ from tuning.commands.options import (
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
     from tuning.response.linear_model import Plant
-    from tuning.rules.proposal import Proposal
+    from tuning.rules.side_by_side import AxisRules
     from tuning.snapshot import Transaction
     from tuning.target import Target
 
 MEASURED = "relay, measured"
-POINTS = 1500  # frequencies at which margins are looked for
 
 
 @takes(TargetOptions)
@@ -65,6 +63,7 @@ def rules(
     """
     with errors_as_exit_codes():
         from tuning.rules.rules_by_name import RULES
+        from tuning.rules.side_by_side import AxisRules, identified_plants, proposals, swung_proposals
         from tuning.runs.provenance import run_folder
         from tuning.snapshot import check_place
 
@@ -83,13 +82,14 @@ def rules(
             check_place(file)  # written before the motor turns; of emulated drives, before their gains change
         before = file if drive.bus else None
         with drive.open() as target, unchanged(target, before) as transaction:
-            plants = _identified(target)
+            with progress_bar("identifying") as show:
+                plants = identified_plants(target, show)
             known = [plant for plant in plants if not isinstance(plant, str)]
-            swung = _swing(target, known) if relay and len(known) == len(plants) else [""] * len(plants)
-            axes = [_AxisRules(plant) for plant in plants]
+            swung = swung_proposals(target, known) if relay and len(known) == len(plants) else [""] * len(plants)
+            axes = [AxisRules(plant) for plant in plants]
             for axis, measured in zip(axes, swung, strict=True):
                 if not isinstance(axis.plant, str):
-                    axis.rows |= _propose(target, axis.plant, chosen)
+                    axis.rows |= proposals(target, axis.plant, chosen)
                 if isinstance(measured, str):
                     axis.unswung = measured
                 else:
@@ -108,77 +108,10 @@ def rules(
             tell_before(before)
 
 
-@dataclass
-class _AxisRules:
-    """The results of an axis: its model, or why there is none, and the rules' proposals."""
-
-    plant: Plant | str
-    rows: dict[str, Proposal] = field(default_factory=dict)
-    unswung: str = ""  # why the relay says nothing
-
-
-def _identified(target: Target) -> list[Plant | str]:
-    """Return the axes' models, or why there is none: the inertia was not identified."""
-    from drive_env.safety.envelope import swinging_allowed
-    from tuning.identify.identification import identify
-    from tuning.response.linear_model import Plant
-
-    with progress_bar("identifying") as show, swinging_allowed(target.drives):
-        found = identify(target, progress=lambda what, share: show(share))
-    plants: list[Plant | str] = []
-    for axis, one in enumerate(found):
-        try:
-            supply = float(target.supply[axis])
-            plants.append(Plant.from_identification(target.device, target.motor, supply, one))
-        except ValueError as error:
-            plants.append(str(error))
-    return plants
-
-
-def _propose(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
-    from tuning.rules.rules_by_name import propose
-
-    return {name: propose(name, target.device, target.motor, plant) for name in names}
-
-
-def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
-    """Return the relay experiments' proposals, with the current loops that the rule computes, or why there is none."""
-    import numpy as np
-
-    from drive_env.gains import write_gains
-    from tuning.rules.relay import gains_from_swing, relay_experiment, relay_rule
-    from tuning.search.trial_bench import read_gains
-
-    before = read_gains(target)
-    gains = [relay_rule(target.device, target.motor, plant).gains for plant in plants]
-    write_gains(target.drives, np.array(gains, np.int64))
-    try:
-        swing = relay_experiment(target)
-    finally:
-        write_gains(target.drives, before)
-    found: list[Proposal | str] = []
-    for axis, plant in enumerate(plants):
-        try:
-            if reason := swing.reason[axis]:
-                raise ValueError(reason)
-            found.append(gains_from_swing(target.device, plant, float(swing.slope[axis]), swing.ultimate(axis)))
-        except ValueError as error:  # also from gains_from_swing: it was the load's resonance that swung
-            found.append(str(error))
-    return found
-
-
-def _margins(target: Target, plant: Plant, proposal: Proposal) -> Any:
-    import numpy as np
-
-    from tuning.response.linear_model import velocity_open_loop
-    from tuning.response.margins import margins
-
-    f = np.geomspace(0.5, 0.49 * target.device.velocity_rate, POINTS)
-    return margins(f, velocity_open_loop(target.device, plant, proposal.gains, f))
-
-
-def _as_json(target: Target, axis: _AxisRules) -> dict[str, Any]:
+def _as_json(target: Target, axis: AxisRules) -> dict[str, Any]:
     from dataclasses import asdict
+
+    from tuning.rules.side_by_side import velocity_margins
 
     plant, rows = axis.plant, axis.rows
     if isinstance(plant, str):
@@ -190,14 +123,16 @@ def _as_json(target: Target, axis: _AxisRules) -> dict[str, Any]:
                 "gains": dict(zip(target.device.gains.names, proposal.gains, strict=True)),
                 "wanted": dict(proposal.wanted),
                 "notes": list(proposal.notes),
-                "velocity_margins": _margins(target, plant, proposal)._asdict(),
+                "velocity_margins": velocity_margins(target.device, plant, proposal.gains)._asdict(),
             }
             for name, proposal in rows.items()
         },
     } | ({"no_relay": axis.unswung} if axis.unswung else {})
 
 
-def _print(target: Target, shown: _AxisRules, axis: int | None) -> None:
+def _print(target: Target, shown: AxisRules, axis: int | None) -> None:
+    from tuning.rules.side_by_side import velocity_margins
+
     head, plant, rows = "" if axis is None else f"axis {axis}: ", shown.plant, shown.rows
     if isinstance(plant, str):
         print_lines([f"{head}{plant}"])
@@ -207,7 +142,7 @@ def _print(target: Target, shown: _AxisRules, axis: int | None) -> None:
     titles = (*_gain_titles(target.device.gains), "cross\nHz", "phase\ndeg", "gain\ndB")
     cells = []
     for name, proposal in rows.items():
-        found = _margins(target, plant, proposal)
+        found = velocity_margins(target.device, plant, proposal.gains)
         figures = (found.crossover_hz, found.phase_deg, found.gain_db)
         shown_figures = (f"{figure:.0f}" if math.isfinite(figure) else "-" for figure in figures)
         cells.append((name, *map(str, proposal.gains), *shown_figures))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import machine_of
+from drive_env.drives.interface import Drives, machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
@@ -40,8 +41,15 @@ MOST_STOPS = 3  # by the safety envelope, one trial after the other, before the 
 BEYOND = 0.1  # how fast the cost grows where J has come to its end
 E_D_EXPONENT = 0.4  # of E_d/E_0 in J (drive_env/trials/score.py)
 _UNCUT = 1e-3
+STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
 
 OBJECTIVES = ("speed", "robustness", "current")
+
+
+def leave_oscillations_to_trials(drives: Drives) -> None:
+    """Keep the envelope from ending a search where a trial stops an axis itself, or the sampler computes for long."""
+    if drives.safety is not None:
+        drives.safety.change(replace(drives.safety.limits, oscillation=False, stall=STALL))
 
 
 class Tried(NamedTuple):

@@ -1,0 +1,1 @@
+"""What agents add to the studio: the trained tuner on the page Tune, learning curves on the page Runs."""

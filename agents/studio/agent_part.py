@@ -1,0 +1,93 @@
+"""The part of the page Tune that has a trained agent tune the axes, trial by trial."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from nicegui import ui
+
+from drive_env.devices import find_device
+from drive_env.studio.parts import StudioPart
+from drive_env.studio.sentences import sentence
+
+if TYPE_CHECKING:
+    from agents.tuner.tune_target import TrialShown
+    from tuning.studio.tune_desk import TunerSession
+    from tuning.studio.tune_page import TunePanel
+    from tuning.target import Target
+
+TRIALS_SHARE = (0.3, 0.78)  # of a run's progress: where its trials begin and end
+
+
+def build(panel: TunePanel) -> None:
+    """Make it into the card of tuners."""
+    from agents.shipped import TUNER
+    from agents.tuner.open_tuner import open_tuner
+
+    ui.separator()
+    ui.label(
+        "A trained agent tries gains on the axes, trial by trial, and then goes through the same checks as auto. "
+        "PyTorch is not needed."
+    ).classes("studio-hint")
+    with ui.row().classes("studio-buttons"):
+        agent = ui.input("Agent (a name, or a file .npz)", value=TUNER).props("dense outlined data-test=agent")
+        agent.classes("grow")
+        trials = ui.number("Trials (empty: its own)", min=1, max=10_000).props("dense outlined data-test=trials")
+
+        async def start() -> None:
+            try:
+                policy = open_tuner(str(agent.value), panel.device, int(trials.value) if trials.value else None)
+            except Exception as error:
+                panel.visitor.say(sentence(error), "error")
+                return
+            name = str(agent.value)
+            store = not panel.desk.is_emulated
+            await panel.tuner.start(
+                f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device)
+            )
+
+        ui.button("Run the agent", icon="smart_toy", on_click=start).props("unelevated no-caps data-test=run-agent")
+
+
+def columns_of(device: str) -> tuple[str, ...]:
+    """Return the titles of a trial's columns."""
+    from agents.tuner.open_tuner import titles_of_trials
+
+    return ("Trial", *titles_of_trials(find_device(device).gains), "J (less is better)", "")
+
+
+def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
+    """Return the agent's work: that of `drive-agent tune`, its files in the run's folder."""
+
+    def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
+        from agents.tuner import tuning_run
+        from agents.tuner.open_tuner import remark
+        from tuning.certificate.certificate_files import certificate_files
+
+        outer = target.device.gains.columns_of("velocity", "position")
+        low, high = TRIALS_SHARE
+        count = int(policy.bundle.configuration["trials"])
+        share = 0.0
+
+        def say(what: str) -> None:
+            progress(what, max(share, low if what == "trials" else share))
+
+        def show(trial: TrialShown) -> None:
+            nonlocal share
+            share = low + (high - low) * trial.number / max(1, count)
+            figures = [str(value) for value in trial.gains[0, outer]]
+            run.trials.append((str(trial.number or "rule"), *figures, f"{trial.measured[0]:.3f}", remark(trial)))
+            progress("trials", share)
+
+        run.folder.mkdir(parents=True, exist_ok=True)
+        done = tuning_run.run(
+            target, policy, run.folder / "before.toml", name=name, keep=store, show=show, say=say,
+            files=lambda certificate: certificate_files(certificate, run.folder),
+        )  # fmt: skip
+        return done.result
+
+    return work
+
+
+part = StudioPart("/tune", 10, build)

@@ -1,0 +1,51 @@
+"""Curves of a training from TensorBoard's event files, also while they are written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+EVENTS = "events.out.tfevents."
+MOST_POINTS = 20_000  # of a curve that are read
+
+Curves = Mapping[str, tuple[list[int], list[float]]]
+
+
+def read_curves(folder: Path) -> Curves:
+    """Return each scalar of a folder's event files by its tag: steps, and values.
+
+    A file whose end is being written is read up to there.
+
+    Raises:
+        ImportError: If TensorBoard, of the extra `agents`, is not installed.
+    """
+    from tensorboard.backend.event_processing.event_file_loader import LegacyEventFileLoader
+
+    found: dict[str, tuple[list[int], list[float]]] = {}
+    for path in sorted(folder.rglob(f"{EVENTS}*")):
+        if path.is_symlink():
+            continue
+        for step, tag, value in _scalars(LegacyEventFileLoader(str(path))):
+            steps, values = found.setdefault(tag, ([], []))
+            if len(steps) < MOST_POINTS and math.isfinite(value):
+                steps.append(step)
+                values.append(value)
+    return found
+
+
+def _scalars(loader: object) -> Iterator[tuple[int, str, float]]:
+    """Give step, tag and value of each scalar of a file."""
+    events = loader.Load()  # type: ignore[attr-defined]
+    while True:
+        try:
+            event = next(events)
+        except StopIteration:
+            return
+        except Exception:  # whatever a broken file makes of the protocol: what came before it is good
+            return
+        for one in event.summary.value:
+            if one.HasField("simple_value"):
+                yield int(event.step), str(one.tag), float(one.simple_value)
+            elif one.HasField("tensor") and one.tensor.float_val:
+                yield int(event.step), str(one.tag), float(one.tensor.float_val[0])

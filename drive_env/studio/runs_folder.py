@@ -1,0 +1,180 @@
+"""The folder `runs/` for web pages: its runs, their files, and no way out of it."""
+
+from __future__ import annotations
+
+import json
+import mimetypes
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+RUNS = Path("runs")
+ROUTE = "/studio/runs/"
+MOST_RUNS = 500  # that are listed; the newest
+MOST_FILES = 400  # of a run
+MOST_TEXT = 200_000  # bytes of a text that are shown
+PICTURES, FILMS = (".png", ".jpg", ".jpeg", ".svg", ".webp", ".gif"), (".mp4", ".webm")
+TEXTS = (".toml", ".json", ".csv", ".txt", ".md", ".yaml", ".yml", ".log")
+REPORTS = (".html",)
+EVENTS = "events.out.tfevents."  # what TensorBoard's files begin with
+# What a page of a run may do: show its own text, styles and pictures; no script, no form, nothing of elsewhere.
+POLICY = (
+    "sandbox; default-src 'none'; img-src data: 'self'; media-src 'self'; style-src 'unsafe-inline'; font-src data:"
+)
+
+
+@dataclass(frozen=True)
+class RunFile:
+    """A file of a run: its path inside the run, its kind ("report", "picture", "film", "text", "other"), its bytes."""
+
+    path: str
+    kind: str
+    size: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run: its name, when it was changed last [s since 1970], and its files."""
+
+    name: str
+    changed: float
+    files: tuple[RunFile, ...]
+
+    @property
+    def when(self) -> str:
+        """Date and time."""
+        return time.strftime("%Y-%m-%d %H:%M", time.localtime(self.changed))
+
+    def of(self, kind: str) -> list[RunFile]:
+        """Return its files of a kind."""
+        return [file for file in self.files if file.kind == kind]
+
+    @property
+    def has_events(self) -> bool:
+        """Whether a training writes or wrote its curves here."""
+        return any(Path(file.path).name.startswith(EVENTS) for file in self.files)
+
+
+def kind_of(path: Path) -> str:
+    """Return what a file is, by its ending."""
+    ending = path.suffix.lower()
+    for kind, endings in (("report", REPORTS), ("picture", PICTURES), ("film", FILMS), ("text", TEXTS)):
+        if ending in endings:
+            return kind
+    return "other"
+
+
+def list_runs(root: Path = RUNS) -> list[Run]:
+    """Return the runs, the newest first: folders of `root`, and single files in it as one run each."""
+    if not root.is_dir():
+        return []
+    found = []
+    for one in root.iterdir():
+        if one.name.startswith(".") or one.is_symlink():
+            continue
+        found.append((_changed(one), one))
+    found.sort(key=lambda pair: (-pair[0], pair[1].name))
+    return [_run(one, changed) for changed, one in found[:MOST_RUNS]]
+
+
+def find_run(name: str, root: Path = RUNS) -> Run | None:
+    """Return the run of a name, None if there is none."""
+    try:
+        path = confined(name, root)
+    except ValueError:
+        return None
+    if path.parent != root.resolve() or not path.exists():
+        return None
+    return _run(path, _changed(path))
+
+
+def confined(name: str, root: Path = RUNS) -> Path:
+    """Return a path inside the folder of runs.
+
+    Raises:
+        ValueError: For one that leads out of it, by dots or by a link.
+    """
+    base = root.resolve()
+    path = (base / name).resolve()
+    if path == base or not path.is_relative_to(base) or "\0" in name:
+        raise ValueError(f"{name} is not in {root}")
+    return path
+
+
+def url_of(run: str, path: str = "") -> str:
+    """Return the address of a file of a run."""
+    return ROUTE + quote(f"{run}/{path}" if path else run)
+
+
+def media_type(path: Path) -> str:
+    """Return the type under which a file is sent; nothing that a browser would run."""
+    if kind_of(path) == "text":
+        return "text/plain; charset=utf-8"
+    found, _ = mimetypes.guess_type(path.name)
+    kinds = ("picture", "film", "report")
+    return found if found and kind_of(path) in kinds else "application/octet-stream"
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a file, its beginning if it is long."""
+    with path.open("rb") as file:
+        content = file.read(MOST_TEXT + 1)
+    text = content[:MOST_TEXT].decode("utf-8", "replace")
+    return text if len(content) <= MOST_TEXT else text + "\n… (the file goes on)"
+
+
+def settings_of(run: Run, root: Path = RUNS) -> dict[str, str]:
+    """Return the settings of a run as flat names and texts; empty where it has none."""
+    found: dict[str, str] = {}
+    for file in run.files:
+        if Path(file.path).name in ("settings.toml", "config.toml", "args.toml") and file.size < MOST_TEXT:
+            try:
+                found |= _flat(tomllib.loads(confined(f"{run.name}/{file.path}", root).read_text("utf-8")))
+            except (OSError, ValueError):
+                continue
+    return found
+
+
+def certificate_of(run: Run, root: Path = RUNS) -> dict[str, Any]:
+    """Return the certificate of a run as its JSON has it; empty where it has none that can be read."""
+    for file in run.files:
+        if Path(file.path).name in ("certificate.json", "stepper-certificate.json"):
+            try:
+                data = json.loads(confined(f"{run.name}/{file.path}", root).read_text("utf-8"))
+            except (OSError, ValueError, RecursionError):
+                continue
+            if isinstance(data, dict):
+                return data
+    return {}
+
+
+def _run(path: Path, changed: float) -> Run:
+    if path.is_file():
+        return Run(path.name, changed, (RunFile("", kind_of(path), path.stat().st_size),))
+    files: list[RunFile] = []
+    for one in sorted(path.rglob("*")):
+        if len(files) >= MOST_FILES:
+            break
+        if one.is_file() and not one.is_symlink() and not any(p.startswith(".") for p in one.relative_to(path).parts):
+            files.append(RunFile(one.relative_to(path).as_posix(), kind_of(one), one.stat().st_size))
+    return Run(path.name, changed, tuple(files))
+
+
+def _changed(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, value in table.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = str(value)
+    return found

@@ -1,0 +1,56 @@
+"""A whole run of auto that leaves its files in a folder: the state before, the certificate, the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tuning.auto.result import Result
+    from tuning.stepper.result import StepperResult
+    from tuning.target import Target
+
+BEFORE = "before.toml"
+
+Progress = Callable[[str, float], None]
+
+
+def auto_to_files(target: Target, folder: Path, progress: Progress, *, seed: int = 0, keep: bool = True) -> Result:
+    """Tune axes with closed loops; before.toml, certificate.json and report.html are in the folder afterwards.
+
+    Args:
+        target: The drives, as `tuning.auto.one_button.auto` takes them.
+        folder: New or empty.
+        progress: Called with the present step and the share done.
+        seed: Of the run.
+        keep: Whether drives on a bus store the gains.
+
+    Raises:
+        BusError, OSError: As `auto` does.
+    """
+    from tuning.auto.certify import certificate
+    from tuning.auto.one_button import auto
+    from tuning.certificate.certificate_files import certificate_files
+
+    return auto(
+        target, folder / BEFORE, seed=seed, keep=keep, progress=progress,
+        files=lambda result: certificate_files(certificate(target, result, seed), folder),
+    )  # fmt: skip
+
+
+def commission_to_files(target: Target, folder: Path, progress: Progress, *, keep: bool = True) -> StepperResult:
+    """Commission open-loop steppers; before.toml and stepper-certificate.json are in the folder afterwards.
+
+    Raises:
+        ValueError: For a drive without load detection, before anything is done; else as `commission`.
+    """
+    from tuning.search.trial_bench import leave_oscillations_to_trials
+    from tuning.stepper.commissioning import check_stepper, commission
+    from tuning.stepper.result import certificate_file
+
+    check_stepper(target)
+    leave_oscillations_to_trials(target.drives)
+    return commission(
+        target, folder / BEFORE, keep=keep, progress=progress, files=lambda result: certificate_file(result, folder)
+    )

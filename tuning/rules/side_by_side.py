@@ -1,0 +1,85 @@
+"""Rules side by side: what each proposes for an axis as it was identified, with the margins that it would have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drive_env.gains import write_gains
+from drive_env.safety.envelope import swinging_allowed
+from tuning.response.linear_model import Plant, velocity_open_loop
+from tuning.response.margins import margins
+from tuning.rules.rules_by_name import propose
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.response.margins import Margins
+    from tuning.rules.proposal import Proposal
+    from tuning.target import Target
+
+POINTS = 1500  # frequencies at which margins are looked for
+
+
+@dataclass
+class AxisRules:
+    """The results of an axis: its model, or why there is none, and the rules' proposals.
+
+    unswung: Why the relay says nothing.
+    """
+
+    plant: Plant | str
+    rows: dict[str, Proposal] = field(default_factory=dict)
+    unswung: str = ""
+
+
+def identified_plants(target: Target, progress: Callable[[float], None]) -> list[Plant | str]:
+    """Return the axes' models, or why there is none: the inertia was not identified."""
+    from tuning.identify.identification import identify
+
+    with swinging_allowed(target.drives):
+        found = identify(target, progress=lambda what, share: progress(share))
+    plants: list[Plant | str] = []
+    for axis, one in enumerate(found):
+        try:
+            supply = float(target.supply[axis])
+            plants.append(Plant.from_identification(target.device, target.motor, supply, one))
+        except ValueError as error:
+            plants.append(str(error))
+    return plants
+
+
+def proposals(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
+    """Return what rules propose."""
+    return {name: propose(name, target.device, target.motor, plant) for name in names}
+
+
+def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
+    """Return the relay experiments' proposals, with the current loops that the rule computes, or why there is none."""
+    from tuning.rules.relay import gains_from_swing, relay_experiment, relay_rule
+    from tuning.search.trial_bench import read_gains
+
+    before = read_gains(target)
+    gains = [relay_rule(target.device, target.motor, plant).gains for plant in plants]
+    write_gains(target.drives, np.array(gains, np.int64))
+    try:
+        swing = relay_experiment(target)
+    finally:
+        write_gains(target.drives, before)
+    found: list[Proposal | str] = []
+    for axis, plant in enumerate(plants):
+        try:
+            if reason := swing.reason[axis]:
+                raise ValueError(reason)
+            found.append(gains_from_swing(target.device, plant, float(swing.slope[axis]), swing.ultimate(axis)))
+        except ValueError as error:  # also from gains_from_swing: it was the load's resonance that swung
+            found.append(str(error))
+    return found
+
+
+def velocity_margins(device: Device, plant: Plant, gains: Sequence[int]) -> Margins:
+    """Return the margins of the velocity loop, as the model has them with gains."""
+    f = np.geomspace(0.5, 0.49 * device.velocity_rate, POINTS)
+    return margins(f, velocity_open_loop(device, plant, gains, f))

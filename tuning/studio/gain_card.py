@@ -1,0 +1,173 @@
+"""The card of gains: a slider and a number for each, what it is in SI, undo, and the way back to the state before."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from nicegui import ui
+
+from drive_env.devices import find_device
+from drive_env.gains import as_chip, gains_in_si, per_chip
+from tuning.certificate.certificate import SI_UNITS
+from tuning.studio import tune_jobs
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.devices.gain_set import Gain
+    from tuning.studio.tune_page import TunePanel
+
+STOPS = 400  # of a slider, from the least to the greatest integer in equal ratios
+
+
+def place_of(value: int, highest: int) -> int:
+    """Return where a slider stands for a gain; 0 is the gain 0, the rest goes in equal ratios from 1 on."""
+    if value <= 0:
+        return 0
+    return 1 + round((STOPS - 1) * math.log(min(value, highest)) / math.log(max(2, highest)))
+
+
+def value_at(place: int, highest: int) -> int:
+    """Return the gain of a slider's place; the inverse of `place_of` as far as there are places."""
+    if place <= 0:
+        return 0
+    return min(highest, round(math.exp((place - 1) / (STOPS - 1) * math.log(max(2, highest)))))
+
+
+def si_texts(device: Device, supply: float, gains: tuple[int, ...]) -> list[str]:
+    """Return each gain in SI with its unit, "" where nothing is known of it."""
+    try:
+        parts, chip = list(per_chip(device)), as_chip(device, gains)
+        values = dict(zip(SI_UNITS, gains_in_si(device, supply, gains), strict=True))
+    except (ValueError, ZeroDivisionError):
+        return [""] * len(gains)
+    del chip
+    texts = []
+    for part in parts:
+        value, unit = values[part], SI_UNITS[part]
+        what = "T_i = " if part[1] == "I" else ""
+        texts.append(f"{what}{value:.4g} {unit}" if math.isfinite(value) else "off" if value == math.inf else "")
+    return texts
+
+
+class GainCard:
+    """The gains of the axis of one page.
+
+    Args:
+        panel: The page.
+    """
+
+    def __init__(self, panel: TunePanel) -> None:
+        self._panel = panel
+        self._device = find_device(panel.device)
+        self._shown: tuple[int, ...] = ()
+        self._is_setting = False
+        self.wanted: list[int] = []  # as the sliders stand, before they are let go
+        self._moved: set[int] = set()  # columns of sliders that are being moved: what is read leaves them alone
+        self._controls: list[tuple[Gain, ui.slider, ui.number, ui.label]] = []
+
+    def build(self) -> None:
+        """Make it."""
+        panel = self._panel
+        with panel.card("Gains", "gains"):
+            with ui.element("div").classes("studio-gains"):
+                for column, gain in enumerate(self._device.gains.rows):
+                    self._row(column, gain)
+            with ui.row().classes("studio-buttons"):
+                self._undo = ui.button("Undo", icon="undo", on_click=self._undo_last).props("outline no-caps")
+                self._undo.props("data-test=undo")
+                self._back = ui.button("State before", icon="settings_backup_restore", on_click=self._restore)
+                self._back.props("outline no-caps data-test=restore-before")
+                self._back.tooltip(
+                    "Stop and switch off the axes, and restore all parameters to before the first change"
+                )
+            self._told = ui.label("").classes("studio-hint").props("data-test=gain-history")
+
+    def _row(self, column: int, gain: Gain) -> None:
+        name = f"{gain.title}, raw"
+        with ui.element("div").classes("studio-gain"):
+            ui.label(gain.title).classes("name")
+            slider = ui.slider(min=0, max=STOPS, value=0, step=1)
+            slider.props(f'aria-label="{name}" data-test=slider-{gain.name}')
+            number = ui.number("raw", min=0, max=gain.highest, step=1, format="%d").props("dense outlined")
+            number.props(f'aria-label="{name}, 0 to {gain.highest}" data-test=gain-{gain.name}')
+            unit = ui.label("").classes("unit")
+        slider.on_value_change(lambda event: self._slides(column, int(event.value)))
+        slider.on("change", lambda event: self._apply(column, value_at(int(event.args), gain.highest)))
+        number.on("blur", lambda: self._apply(column, number.value))
+        number.on("keydown.enter", lambda: self._apply(column, number.value))
+        self._controls.append((gain, slider, number, unit))
+
+    def _slides(self, column: int, place: int) -> None:
+        """Show what a slider means while it is moved; written when it is let go."""
+        if self._is_setting or not self.wanted:
+            return
+        gain, _, number, _ = self._controls[column]
+        self.wanted[column] = value_at(place, gain.highest)
+        self._moved.add(column)
+        self._is_setting = True
+        number.set_value(self.wanted[column])
+        self._is_setting = False
+        self._units(tuple(self.wanted))
+        self._panel.gains_slide()
+
+    async def _apply(self, column: int, value: float | None) -> None:
+        if self._is_setting or value is None or not self._shown:
+            return
+        if int(value) == self._shown[column]:
+            if int(value) == self.wanted[column]:
+                self._moved.discard(column)
+            return
+        panel, gain = self._panel, self._controls[column][0]
+        what = f"{gain.title} {self._shown[column]} to {int(value)}"
+        job = tune_jobs.set_gains(panel.desk, panel.axis, {column: int(value)}, what)
+        self.wanted[column] = int(value)
+        await panel.visitor.do(job, f"{gain.title} {int(value)}")
+        if self.wanted[column] == int(value):  # not moved on meanwhile
+            self._moved.discard(column)
+        self.show(force=True)
+
+    async def _undo_last(self) -> None:
+        panel = self._panel
+        what = await panel.visitor.do(tune_jobs.undo(panel.desk, panel.axis), "Undo")
+        if what is not None:
+            panel.visitor.say(f"taken back: {what}", "done")
+
+    async def _restore(self) -> None:
+        panel = self._panel
+        count = await panel.visitor.do(tune_jobs.restore_before(panel.desk), "Restore the state before")
+        if count is not None:
+            panel.visitor.say(f"{count} parameters restored; the axes are off", "done")
+
+    def show(self, *, force: bool = False) -> None:
+        """Show the gains as they are."""
+        desk, axis = self._panel.desk, self._panel.axis
+        if desk.gains is None or axis >= len(desk.gains):
+            return
+        now = tuple(map(int, desk.gains[axis]))
+        if now != self._shown or force:
+            old = self.wanted or list(now)
+            self._shown = now
+            self.wanted = [old[k] if k in self._moved else value for k, value in enumerate(now)]
+            self._is_setting = True
+            for column, (gain, slider, number, _) in enumerate(self._controls):
+                if column not in self._moved:
+                    slider.set_value(place_of(now[column], gain.highest))
+                    number.set_value(now[column])
+            self._is_setting = False
+            self._units(tuple(self.wanted))
+        change = desk.last_change(axis)
+        self._undo.set_enabled(change is not None)
+        self._back.set_enabled(desk.before is not None)
+        kept = "" if desk.before_file is None else f" The state before is in {desk.before_file}."
+        count = sum(one.axis == axis for one in desk.changes)
+        last = (
+            "Nothing changed yet."
+            if change is None
+            else f"{count} change{'s' * (count != 1)}; the last: {change.what}."
+        )
+        self._told.set_text(last + kept)
+
+    def _units(self, gains: tuple[int, ...]) -> None:
+        for (*_, unit), text in zip(self._controls, si_texts(self._device, self._panel.supply, gains), strict=True):
+            unit.set_text(text)

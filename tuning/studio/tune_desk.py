@@ -1,0 +1,246 @@
+"""What the page Tune knows of a session: gains and their history, recordings, the present run of a tuner."""
+
+from __future__ import annotations
+
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.drives.interface import Drives, device_of
+from drive_env.studio.runs_folder import RUNS
+from tuning.runs.provenance import run_folder
+from tuning.snapshot import Snapshot, check_place, load_snapshot, take_of
+from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machines
+
+if TYPE_CHECKING:
+    from drive_env.studio.session import Session
+    from tuning.identify.estimate import Identification
+    from tuning.response.measured_loop import MeasuredLoop
+    from tuning.rules.side_by_side import AxisRules
+
+Floats = NDArray[np.float64]
+
+LAST = 5  # step responses under the present one
+MOST_STEPS = 1000  # changes of gains that can be taken back one by one
+
+
+@dataclass(frozen=True)
+class GainChange:
+    """A change of an axis' gains that can be taken back: raw integers before and after, and what it was."""
+
+    axis: int
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+    what: str
+
+
+@dataclass(frozen=True)
+class StepRecording:
+    """A step that was recorded with the gains of its time.
+
+    Attributes:
+        axis: Of the axis.
+        kind: "velocity" or "position".
+        gains: Raw, of the axis.
+        unit: Of demand and actual.
+        t: [s], shape (n,).
+        demand, actual: Shape (n,).
+        current: [A], shape (n,).
+        figures: In words: rise, overshoot, settling.
+        at: When [s since 1970].
+    """
+
+    axis: int
+    kind: str
+    gains: tuple[int, ...]
+    unit: str
+    t: Floats
+    demand: Floats
+    actual: Floats
+    current: Floats
+    figures: str
+    at: float = field(default_factory=time.time)
+
+    @property
+    def name(self) -> str:
+        """Time of day and gains, which tell it from others."""
+        return f"{time.strftime('%H:%M:%S', time.localtime(self.at))}  {', '.join(map(str, self.gains))}"
+
+
+@dataclass(frozen=True)
+class AxisVerdict:
+    """What a run made of an axis, for people."""
+
+    axis: int
+    verdict: str
+    reason: str
+    reservations: tuple[str, ...]
+    notes: tuple[str, ...]
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+
+
+@dataclass
+class TunerSession:
+    """A run of a tuner, under way or over.
+
+    Attributes:
+        title: Which tuner.
+        folder: Where its files go.
+        lines: What it said, in order.
+        columns: Titles of the trials' columns.
+        trials: Rows of them, as they come.
+        share: How much is done.
+        is_over: Whether it has ended.
+        verdicts: Of the axes, once it came to its end.
+        failure: Why it did not.
+    """
+
+    title: str
+    folder: Path
+    lines: list[str] = field(default_factory=list)
+    columns: tuple[str, ...] = ()
+    trials: list[tuple[str, ...]] = field(default_factory=list)
+    share: float = 0.0
+    is_over: bool = False
+    verdicts: tuple[AxisVerdict, ...] = ()
+    failure: str = ""
+
+
+@dataclass
+class MachineEntries:
+    """What people say of the machine: the motor, how far it may turn, supply, how axes belong together."""
+
+    motor: str = ""
+    travel: str = ""
+    supply: float | None = None
+    axes: str = "apart"
+
+
+class TuneDesk:
+    """What the pages of one session share.
+
+    Args:
+        session: The drives.
+
+    Attributes:
+        entries: What people say of the machine.
+        gains: Of every axis as they were read or written last, shape (num_axes, count); None before.
+        changes: Of gains, the newest last.
+        before: The parameters before this page first changed anything.
+        before_file: Where they are.
+        version: Grows whenever something that is shown has changed.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.entries = MachineEntries()
+        self.gains: NDArray[np.int64] | None = None
+        self.changes: list[GainChange] = []
+        self.before: Snapshot | None = None
+        self.before_file: Path | None = None
+        self.steps: deque[StepRecording] = deque(maxlen=10 * (LAST + 1))
+        self.responses: dict[tuple[str, int], MeasuredLoop] = {}
+        self.identified: list[Identification] = []
+        self.rules: list[AxisRules] = []
+        self.run: TunerSession | None = None
+        self.version = 0
+        self._lock = threading.Lock()
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether there are machines behind the drives."""
+        return self.session.is_emulated
+
+    def touch(self) -> None:
+        """Take note that something has changed."""
+        with self._lock:
+            self.version += 1
+
+    def last_steps(self, axis: int, kind: str) -> list[StepRecording]:
+        """Return the present step of an axis and the last five before it, the newest first."""
+        mine = [step for step in self.steps if (step.axis, step.kind) == (axis, kind)]
+        return mine[::-1][: LAST + 1]
+
+    def note(self, axis: int, before: Sequence[int], after: Sequence[int], what: str) -> None:
+        """Add a change to the history; one that changes nothing is none."""
+        old, new = tuple(map(int, before)), tuple(map(int, after))
+        if old != new:
+            self.changes.append(GainChange(axis, old, new, what))
+            del self.changes[:-MOST_STEPS]
+        self.touch()
+
+    def last_change(self, axis: int) -> GainChange | None:
+        """Return the newest change of an axis."""
+        return next((change for change in reversed(self.changes) if change.axis == axis), None)
+
+    # --- for jobs, in the thread of the drives ----------------------------------------------------------------------
+    def address(self) -> Mapping[str, Any]:
+        """Return how the drives of the bus are opened again, empty for emulated ones."""
+        if self.is_emulated:
+            return {}
+        from drive_env.master.open_drives import default_nodes
+
+        given = dict(self.session.address)
+        interface = given.pop("interface", None)
+        nodes = tuple(given.pop("nodes", None) or default_nodes(interface))
+        return address_of(interface, given.pop("channel", None), nodes, given)
+
+    def keep_before(self, drives: Drives) -> Snapshot:
+        """Return the parameters before the first change, which are in a file before anything is changed."""
+        if self.before is None or self.before_file is None:
+            file = run_folder("studio", RUNS) / "before.toml"
+            check_place(file)
+            taken = take_of(drives, self.address())
+            taken.save(file)
+            self.before, self.before_file = load_snapshot(file), file
+            self.touch()
+        return self.before
+
+    @contextmanager
+    def target(self, drives: Drives) -> Iterator[Target]:
+        """Give the drives as tuners take them; on a bus the envelope holds them to their travel meanwhile.
+
+        Raises:
+            ValueError: For a motor, a travel or a coupling that cannot be.
+        """
+        from tuning.commands.options import parse_travels
+
+        entries, machine = self.entries, drives.machine
+        ways = parse_travels(entries.travel) if entries.travel.strip() else None
+        if machine is not None:
+            yield of_machines(drives, machine.drives, supply=entries.supply, travel=ways)
+            return
+        from drive_env.motors import find_motor
+
+        if ways is None:
+            raise ValueError("the travel is missing: give how far the motor may turn, LOW:HIGH in turns, or free")
+        motor = find_motor(entries.motor or device_of(drives).default_motor)
+        target = of_bus(drives, motor, self.address(), supply=entries.supply, travel=ways, axes=entries.axes)
+        envelope = drives.safety
+        limits = None if envelope is None else envelope.limits
+        hold_to_travel(target)
+        try:
+            yield target
+        finally:
+            if envelope is not None and limits is not None:
+                envelope.change(limits)
+
+
+_desks: weakref.WeakKeyDictionary[Session, TuneDesk] = weakref.WeakKeyDictionary()
+
+
+def desk_of(session: Session) -> TuneDesk:
+    """Return the desk of a session, the same for all of its pages."""
+    if session not in _desks:
+        _desks[session] = TuneDesk(session)
+    return _desks[session]

@@ -1,0 +1,403 @@
+"""What the page Tune asks of the drives, each a job: a function of the drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.drives import motion
+from drive_env.drives.interface import Drives, device_of
+from drive_env.gains import read_gains, write_gains
+from drive_env.studio.motion_jobs import disable, only, select_mode
+from drive_env.studio.scope_view import channel_of
+from drive_env.studio.sentences import sentence
+from drive_env.trials.response import step_metrics
+from tuning.snapshot import restore
+from tuning.studio.tune_desk import AxisVerdict, StepRecording, TuneDesk, TunerSession
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectName
+    from tuning.response.measured_loop import MeasuredLoop
+    from tuning.target import Target
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+
+CYCLE = 0.001  # s
+QUIET, LONGEST = 0.02, 10.0  # s before a step; of a move
+AFTER = 0.15  # s that a step is looked at once it is over
+SAFE_TO_STOP = 0.95  # share of a run from which it is written down and kept: nothing stops it any more
+
+
+# --- gains ------------------------------------------------------------------------------------------------------------
+def look(desk: TuneDesk) -> Callable[[Drives], None]:
+    """Return the job that reads the gains of every axis."""
+
+    def job(drives: Drives) -> None:
+        found = read_gains(drives)
+        if desk.gains is None or not np.array_equal(found, desk.gains):
+            desk.gains = found
+            desk.touch()
+
+    return job
+
+
+def set_gains(desk: TuneDesk, axis: int, wanted: dict[int, int], what: str) -> Callable[[Drives], None]:
+    """Return the job that writes some gains of an axis, by their columns, as one step of the history.
+
+    Raises:
+        ValueError: In the job, for an integer outside the gain's range; nothing is written then.
+    """
+
+    def job(drives: Drives) -> None:
+        known = device_of(drives).gains
+        for column, value in wanted.items():
+            row = known.rows[column]
+            if not 0 <= value <= row.highest:
+                raise ValueError(f"{row.title} {value} must be 0 to {row.highest}")
+        desk.keep_before(drives)
+        before = read_gains(drives)[axis]
+        try:
+            for column, value in wanted.items():
+                drives.write(known.keys[column], value, where=only(drives, axis))
+        finally:
+            desk.gains = read_gains(drives)
+            desk.note(axis, before, desk.gains[axis], what)
+
+    return job
+
+
+def undo(desk: TuneDesk, axis: int) -> Callable[[Drives], str]:
+    """Return the job that takes back the newest change of an axis' gains."""
+
+    def job(drives: Drives) -> str:
+        change = desk.last_change(axis)
+        if change is None:
+            raise ValueError("there is no change to take back")
+        now = read_gains(drives)
+        now[axis] = change.before
+        try:
+            write_gains(drives, now, only(drives, axis))
+        finally:
+            desk.gains = read_gains(drives)
+        desk.changes.remove(change)
+        desk.touch()
+        return change.what
+
+    return job
+
+
+def restore_before(desk: TuneDesk) -> Callable[[Drives], int]:
+    """Return the job that brings every axis to rest, and back to the parameters before the first change.
+
+    It returns how many parameters were changed.
+    """
+
+    def job(drives: Drives) -> int:
+        before = desk.before
+        if before is None:
+            raise ValueError("this page has changed nothing yet")
+        for axis in range(drives.num_axes):
+            if cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis])):
+                disable(axis)(drives)
+        old = read_gains(drives)
+        try:
+            changed = restore(drives, before, whole=False)
+        finally:
+            desk.gains = read_gains(drives)
+            for axis in range(drives.num_axes):
+                desk.note(axis, old[axis], desk.gains[axis], "the state before restored")
+        return sum(map(len, changed))
+
+    return job
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
+def record_velocity_step(desk: TuneDesk, axis: int, rpm: float, hold: float) -> Callable[[Drives], StepRecording]:
+    """Return the job that records a velocity step there and back in csv, with the present gains.
+
+    Args:
+        desk: Keeps the recording.
+        axis: The axis; axes that drive one part move together.
+        rpm: Height of the step.
+        hold: How long the speed is held each way [s].
+    """
+
+    def job(drives: Drives) -> StepRecording:
+        with desk.target(drives) as target:
+            where = target.together(only(drives, axis))
+            speed = 2.0 * np.pi / 60.0 * rpm
+            direction = _direction(target, where, abs(speed) * hold, f"{rpm:g} rpm for {hold:g} s")
+            counts = np.rint(target.speed_counts() * speed * direction).astype(np.int64)
+            rows = [np.zeros(_cycles(QUIET)), np.ones(_cycles(hold)), -np.ones(_cycles(hold)), np.zeros(_cycles(AFTER))]
+            course = np.concatenate(rows)[:, None] * np.where(where, counts, 0)
+            gains = tuple(map(int, read_gains(drives)[axis]))
+            names = (cia402.TARGET_VELOCITY, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+            with _moving(drives, where, "csv"):
+                trace = drives.record(names[1:], len(course) * CYCLE, play={names[0]: course.astype(np.int64)})
+            first = _cycles(QUIET)
+            actual, unit = _in_unit(desk, axis, names[1], trace[names[1]][:, axis])
+            demand, _ = _in_unit(desk, axis, names[0], course[:, axis])
+            window = slice(0, first + _cycles(hold))
+            t = np.asarray(trace.t, float) - first * CYCLE
+            figures = _figures(t[window], actual[window], float(demand[first]), unit)
+            current = _current(drives, axis, trace[names[2]])
+            return _keep(desk, StepRecording(axis, "velocity", gains, unit, t, demand, actual, current, figures))
+
+    return job
+
+
+def record_move(desk: TuneDesk, axis: int, turns: float) -> Callable[[Drives], StepRecording]:
+    """Return the job that records a move in pp with the drive's own profile, with the present gains, and moves back."""
+
+    def job(drives: Drives) -> StepRecording:
+        with desk.target(drives) as target:
+            where = target.together(only(drives, axis))
+            way = 2.0 * np.pi * turns
+            direction = _direction(target, where, abs(way), f"{turns:g} turns")
+            distance = np.rint(target.increments() * way * direction).astype(np.int64)
+            gains = tuple(map(int, read_gains(drives)[axis]))
+            names = (cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL)
+            parts = []
+            with _moving(drives, where, "pp"):
+                origin = drives.read(cia402.POSITION_ACTUAL)
+                motion.start_move(drives, origin + distance, where=where)
+                for _ in range(round(LONGEST / 0.05)):
+                    parts.append(drives.record(names, 0.05))
+                    if np.all(cia402.matches(drives.read(cia402.STATUSWORD), cia402.TARGET_REACHED)[where]):
+                        break
+                parts.append(drives.record(names, AFTER))
+                motion.move_to(drives, origin, where=where, timeout=LONGEST)
+            rows = [np.concatenate([np.asarray(part[name])[:, axis] for part in parts]) for name in names]
+            demand, unit = _in_unit(desk, axis, names[0], rows[0] - int(origin[axis]))
+            actual, _ = _in_unit(desk, axis, names[1], rows[1] - int(origin[axis]))
+            t = np.arange(len(rows[0]), dtype=float) * CYCLE
+            figures = _figures(t, actual, float(demand[-1]), unit)
+            current = _current(drives, axis, np.tile(rows[2][:, None], drives.num_axes))
+            return _keep(desk, StepRecording(axis, "position", gains, unit, t, demand, actual, current, figures))
+
+    return job
+
+
+def _cycles(duration: float) -> int:
+    return max(1, round(duration / CYCLE))
+
+
+def _direction(target: Target, where: Mask, way: float, what: str) -> Floats:
+    """Return the direction in which each axis has the longer way; ValueError where it is too short."""
+    forwards = target.high >= -target.low
+    room = np.where(forwards, target.high, -target.low)
+    short = np.flatnonzero(where & (room < way))
+    if short.size:
+        k = int(short[0])
+        raise ValueError(
+            f"axis {k}: {what} takes {way / (2 * np.pi):.3g} turns, and there are {room[k] / (2 * np.pi):.3g}; make "
+            "the step smaller, or move the axis away from its end first"
+        )
+    return np.where(forwards, 1.0, -1.0)
+
+
+@contextmanager
+def _moving(drives: Drives, where: Mask, mode: str) -> Iterator[None]:
+    """Enable axes in a mode, at rest; afterwards they are as they were, off or enabled in their mode."""
+    on = np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)) & where
+    names = {number: name for name, number in cia402.MODES.items()}
+    modes = [names.get(int(number)) for number in drives.read(cia402.MODE)]
+    if mode == "pp":
+        drives.write(cia402.TARGET_POSITION, drives.read(cia402.POSITION_ACTUAL), where=where)
+    else:
+        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
+    motion.enable(drives, mode=mode, where=where, timeout=3.0)
+    yield  # what raises leaves the axes to the session, which stops them
+    for axis in map(int, np.flatnonzero(where)):
+        before = modes[axis]
+        if not on[axis]:
+            disable(axis)(drives)
+        elif before is not None and before != mode:
+            select_mode(axis, before)(drives)
+
+
+def _in_unit(desk: TuneDesk, axis: int, name: ObjectName, raw: Any) -> tuple[Floats, str]:
+    entry = desk.session.description.dictionary.find(name)
+    channel = channel_of(entry, axis, desk.session.scales[axis], several=False)
+    return np.asarray(raw, float) * channel.factor, channel.unit
+
+
+def _current(drives: Drives, axis: int, raw: Any) -> Floats:
+    from drive_env.drives.currents import ampere_per_count
+
+    return np.asarray((np.asarray(raw, float) * ampere_per_count(drives))[:, axis])
+
+
+def _figures(t: Floats, actual: Floats, final: float, unit: str) -> str:
+    try:
+        found = step_metrics(t, actual, final, t_step=0.0, initial=float(actual[0]) if t[0] >= 0.0 else None)
+    except ValueError as error:
+        return f"no figures: {error}"
+
+    def text(value: Any, factor: float, what: str) -> str:
+        return f"{factor * float(value):.4g} {what}" if np.isfinite(value) else "none"
+
+    return (
+        f"step of {final:.4g} {unit}: rise {text(found.rise_time, 1e3, 'ms')}, overshoot "
+        f"{text(found.overshoot, 100.0, '%')}, settling (2 %) {text(found.settling_time, 1e3, 'ms')}"
+        f"{', oscillates' if bool(found.oscillating) else ''}"
+    )
+
+
+def _keep(desk: TuneDesk, step: StepRecording) -> StepRecording:
+    desk.steps.append(step)
+    desk.touch()
+    return step
+
+
+# --- response, identification, rules ----------------------------------------------------------------------------------
+def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives], MeasuredLoop]:
+    """Return the job that measures a loop's frequency response with the present gains."""
+
+    def job(drives: Drives) -> MeasuredLoop:
+        from tuning.response.frequency_response import measure
+
+        rest(drives)
+        with desk.target(drives) as target:
+            found = measure(target, loop, where=only(drives, axis), progress=_told(desk, "shaking"))
+        desk.responses[loop, axis] = found
+        desk.gains = read_gains(drives)
+        desk.touch()
+        return found
+
+    return job
+
+
+def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
+    """Return the job that identifies every axis, and has the rules propose gains for each."""
+
+    def job(drives: Drives) -> None:
+        from drive_env.safety.envelope import swinging_allowed
+        from tuning.identify.identification import identify
+        from tuning.response.linear_model import Plant
+        from tuning.rules.rules_by_name import RULES
+        from tuning.rules.side_by_side import AxisRules, proposals
+
+        rest(drives)
+        with desk.target(drives) as target, swinging_allowed(drives):
+            found = identify(target, progress=lambda what, share: _told(desk, what)(share))
+            rules = []
+            for axis, one in enumerate(found):
+                try:
+                    supply = float(target.supply[axis])
+                    plant = Plant.from_identification(target.device, target.motor, supply, one)
+                    rules.append(AxisRules(plant, proposals(target, plant, list(RULES))))
+                except ValueError as error:
+                    rules.append(AxisRules(str(error)))
+        desk.identified, desk.rules = found, rules
+        desk.touch()
+
+    return job
+
+
+def rest(drives: Drives) -> None:
+    """Bring every axis to rest and switch it off: experiments begin so."""
+    for axis in range(drives.num_axes):
+        if cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis])):
+            disable(axis)(drives)
+
+
+def _told(desk: TuneDesk, what: str) -> Callable[[float], None]:
+    """Return what is called with the share done: the page shows it, and a job that was stopped ends."""
+
+    def tell(share: float) -> None:
+        desk.session.tell(what, share)
+        if share < SAFE_TO_STOP:
+            desk.session.check()
+
+    return tell
+
+
+# --- tuners -----------------------------------------------------------------------------------------------------------
+def run_tuner(
+    desk: TuneDesk, run: TunerSession, work: Callable[[Target, TunerSession, Callable[[str, float], None]], Any]
+) -> Callable[[Drives], None]:
+    """Return the job of a tuner: from rest, to a verdict, or back to the state before.
+
+    Args:
+        desk: Keeps the gains.
+        run: What it says.
+        work: Tunes a target; given the run and what it tells its progress, it returns a result with `axes`.
+    """
+
+    def job(drives: Drives) -> None:
+        desk.run = run
+        desk.touch()
+        is_back = False
+        try:
+            desk.keep_before(drives)
+            rest(drives)
+            old = read_gains(drives)
+            try:
+                with desk.target(drives) as target:
+                    result = work(target, run, _progress(desk, run))
+                run.verdicts = verdicts(result)
+            finally:
+                desk.gains = read_gains(drives)
+                is_back = np.array_equal(old, desk.gains)
+                for axis in range(drives.num_axes):
+                    desk.note(axis, old[axis], desk.gains[axis], run.title)
+            run.share = 1.0
+        except BaseException as error:
+            job_now = desk.session.job
+            stopped = "" if job_now is None else job_now.stopped
+            told = f"stopped: {stopped}" if stopped else sentence(error)
+            run.failure = f"{told}; the gains from before are back" if is_back else told
+            raise
+        finally:
+            run.is_over = True
+            desk.touch()
+
+    return job
+
+
+def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]:
+    def tell(what: str, share: float) -> None:
+        run.share = max(run.share, share)
+        if not run.lines or run.lines[-1] != what:
+            run.lines.append(what)
+        desk.touch()
+        _told(desk, what)(share)
+
+    return tell
+
+
+def verdicts(result: Any) -> tuple[AxisVerdict, ...]:
+    """Return what a result says of its axes, that of auto or of a stepper's commissioning."""
+    return tuple(
+        AxisVerdict(
+            k, axis.verdict, axis.reason, tuple(axis.reservations), tuple(getattr(axis, "notes", ())),
+            _integers(axis.before), _integers(axis.after),
+        )
+        for k, axis in enumerate(result.axes)
+    )  # fmt: skip
+
+
+def _integers(gains: Any) -> tuple[int, ...]:
+    values = gains.values() if isinstance(gains, dict) else gains
+    return tuple(int(value) for value in values)
+
+
+def auto(store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
+    """Return auto's work: that of `drive-tune auto`, its files in the run's folder."""
+
+    def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
+        from tuning.auto.run_to_files import auto_to_files, commission_to_files
+
+        if target.device.gains.is_open_loop:
+            return commission_to_files(target, run.folder, progress, keep=store)
+        return auto_to_files(target, run.folder, progress, keep=store)
+
+    return work

@@ -1,0 +1,164 @@
+"""The page Tune of the studio."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+
+from drive_env.devices import find_device
+from drive_env.motors import MOTORS, find_motor
+from drive_env.studio.page import StudioPage
+from drive_env.studio.session import Session
+from drive_env.studio.visitor import Visitor
+from tuning.studio import tune_jobs
+from tuning.studio.gain_card import GainCard
+from tuning.studio.response_card import ResponseCard
+from tuning.studio.rules_card import RulesCard
+from tuning.studio.step_card import StepCard
+from tuning.studio.tune_desk import TuneDesk, desk_of
+from tuning.studio.tuner_card import TunerCard
+from tuning.target import AXES
+
+REFRESH = 0.2  # s
+REREAD = 2.0  # s between two readings of the gains, which another page or another master may write
+COUPLING = {
+    "apart": "separate machines", "coupled": "joints of one machine", "linked": "they drive one part, as a gantry",
+}  # fmt: skip
+assert tuple(COUPLING) == AXES
+
+
+def build(session: Session, visitor: Visitor) -> None:
+    """Make the page."""
+    TunePanel(session, visitor).build()
+
+
+class TunePanel:
+    """The controls of one page; parts of other packages get it.
+
+    Args:
+        session: The drives.
+        visitor: The page.
+    """
+
+    def __init__(self, session: Session, visitor: Visitor) -> None:
+        self.session = session
+        self.visitor = visitor
+        self.desk: TuneDesk = desk_of(session)
+        self.gains, self.step, self.response = GainCard(self), StepCard(self), ResponseCard(self)
+        self.rules, self.tuner = RulesCard(self), TunerCard(self)
+        self._seen = -1
+
+    @property
+    def axis(self) -> int:
+        """The axis of the page."""
+        return self.visitor.axis
+
+    @property
+    def device(self) -> str:
+        """Name of the device."""
+        return self.session.description.name
+
+    @property
+    def motor(self) -> Any:
+        """The motor that is turned, as far as it is known."""
+        made = self.session.glimpse(lambda machine: machine.drives.motor)
+        return made or find_motor(self.desk.entries.motor or find_device(self.device).default_motor)
+
+    @property
+    def supply(self) -> float:
+        """Supply voltage [V] that gains in SI are computed with."""
+        given = self.desk.entries.supply
+        return float(find_device(self.device).supply_of(self.motor)) if given is None else given
+
+    @property
+    def rated_rpm(self) -> float:
+        """Rated speed of the motor [rpm]."""
+        return float(self.motor.rated_speed) * 60.0 / (2.0 * np.pi)
+
+    def build(self) -> None:
+        """Make it."""
+        try:
+            find_device(self.device)
+        except ValueError:
+            with self.card("Tune", "unknown"):
+                ui.label(
+                    f"{self.device} is known by its EDS alone, which says neither which objects are gains nor in what "
+                    "units it counts: make it a device (the page on file formats, section Device)."
+                )
+            return
+        ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
+        with ui.element("div").classes("studio-tune"):
+            with ui.element("div").classes("studio-stack"):
+                self._machine_card()
+                self.gains.build()
+                self.tuner.build()
+            with ui.element("div").classes("studio-stack"):
+                self.step.build()
+                self.response.build()
+            with ui.element("div").classes("studio-stack"):
+                self.tuner.build_run()
+                self.rules.build()
+        self.visitor.hand_in(tune_jobs.look(self.desk), "Read the gains")
+        ui.timer(REFRESH, self._show)
+        ui.timer(REREAD, self._reread)
+
+    def card(self, title: str, name: str) -> ui.card:
+        """Return a card with a heading."""
+        made = ui.card().classes(f"studio-card card-{name}")
+        with made:
+            ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
+        return made
+
+    def gains_slide(self) -> None:
+        """Show what the sliders would make of the response."""
+        self.response.show(tuple(self.gains.wanted))
+
+    def _show(self) -> None:
+        if self.desk.version == self._seen:
+            return
+        self._seen = self.desk.version
+        self.gains.show()
+        self.step.show()
+        self.response.show(tuple(self.gains.wanted))
+        self.rules.show()
+        self.tuner.show()
+
+    async def _reread(self) -> None:
+        """Read the gains again, unless something is under way."""
+        if self.session.job is None and not self.session.waiting:
+            future = self.session.do(tune_jobs.look(self.desk), "Read the gains", page=self.visitor.id, quiet=True)
+            with contextlib.suppress(Exception):  # the next one may get through; what is wrong, other pages tell
+                await asyncio.wrap_future(future)
+
+    def _machine_card(self) -> None:
+        """Ask what no bus tells: motor, travel, supply, coupling."""
+        desk = self.desk
+        emulated = desk.is_emulated
+        with self.card("Machine", "machine"):
+            with ui.row().classes("studio-buttons"):
+                if not emulated:
+                    names, usual = sorted(MOTORS), find_device(self.device).default_motor
+                    motor = ui.select(names, value=desk.entries.motor or usual, label="Motor", with_input=True)
+                    motor.props("dense outlined").classes("grow")
+                    motor.on_value_change(lambda event: setattr(desk.entries, "motor", str(event.value or "")))
+                travel = ui.input(
+                    "Travel [turns]", value=desk.entries.travel, placeholder="the load's" if emulated else "-0.5:0.5"
+                ).props("dense outlined data-test=travel").classes("grow")  # fmt: skip
+                travel.on_value_change(lambda event: setattr(desk.entries, "travel", str(event.value or "")))
+                if not emulated and self.session.num_axes > 1:
+                    axes = ui.select(COUPLING, value=desk.entries.axes, label="Axes").props("dense outlined")
+                    axes.on_value_change(lambda event: setattr(desk.entries, "axes", str(event.value)))
+                if not emulated:
+                    supply = ui.number("Supply [V]", value=self.supply, min=1).props("dense outlined")
+                    supply.on_value_change(lambda event: setattr(desk.entries, "supply", event.value))
+            own = "; empty: as far as the load lets it" if emulated else ""
+            ui.label(f"How far the rotor may turn from where it stands: LOW:HIGH, as -0.5:0.5, or free{own}.").classes(
+                "studio-hint"
+            )
+
+
+page = StudioPage("/tune", "Tune", "tune", 40, build)
