@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import time
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from drive_env.master.description import Description
 
 OF_EMULATED = ("load", "motor", "seed", "factory")
+LOOK = 0.02  # s between two looks whether the bus is open
 
 
 def studio(
@@ -100,6 +102,10 @@ def studio(
         url = server.address(listen, sock.getsockname()[1], ticket)
 
         def ready() -> None:
+            while is_bus and session.state == "opening":  # an emulator may compile for a minute: its page says so
+                time.sleep(LOOK)
+            if session.state == "failed":
+                return
             print(f"drive-env: {title}: {url}", flush=True)
             print("drive-env: stop with Ctrl-C", flush=True)
             if browser:

@@ -118,10 +118,14 @@ class StudioServer(uvicorn.Server):
         super().__init__(config)
         self._stop = stop
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Stop the drives, then end."""
+    def handle_exit(self, sig: int, frame: FrameType | None = None) -> None:
+        """Stop the drives, then end; a second Ctrl-C waits for nobody.
+
+        Uvicorn would raise the signal once more at its end: the process would die before the drives are closed.
+        """
         self._stop("the studio ends")
-        super().handle_exit(sig, frame)
+        self.force_exit = self.should_exit and sig == signal.SIGINT
+        self.should_exit = True
 
 
 def web_app(studio: Studio, host: str, port: int, token: str | None) -> FastAPI:
@@ -212,7 +216,7 @@ def serve_studio(
     before = None if hang_up is None else signal.getsignal(hang_up)
     if hang_up is not None and before is not signal.SIG_IGN:
         signal.signal(hang_up, server.handle_exit)
-    session.when_not_opened = lambda: server.handle_exit(signal.SIGTERM, None)
+    session.when_not_opened = lambda: server.handle_exit(signal.SIGTERM)
     session.start()
     end = threading.Timer(terms.duration or 0.0, server.handle_exit, (signal.SIGTERM, None))
     end.daemon = True
