@@ -137,6 +137,31 @@ def test_gains_that_won_by_noise_are_not_kept(tmp_path, monkeypatch):
     assert "none of 24 others that were tried was better" in result.output
 
 
+def test_a_closed_loop_whose_every_trial_is_stopped_is_not_certified(tmp_path, monkeypatch):
+    """The axis is, with its loop open; a J of stopped trials is no figure."""
+
+    class Stopped(TrialBench):
+        def run(self, gains):
+            tried = super().run(gains)
+            return tried._replace(aborted=np.ones_like(tried.aborted))
+
+    def search(target, settings):
+        bench = TrialBench(target, gains=settings.gains)
+        bench.identify()
+        bench.leave(bench.rule)
+        return SimpleNamespace(gains=bench.rule, cost=np.array([0.0]))
+
+    monkeypatch.setattr("tuning.stepper.closed_loop.optimise", search)
+    monkeypatch.setattr("tuning.stepper.closed_loop.TrialBench", Stopped)
+    result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
+    assert axis["verdict"] == "accepted with reservations"
+    assert [axis["figures"][f"J of the closed loop, {how}"] for how in ("by commissioning", "tuned")] == [None, None]
+    assert "the closed loop is not certified: its trials were stopped" in " ".join(axis["reservations"])
+    assert "leave it open (2020h:00 = 0)" in " ".join(axis["reservations"])
+
+
 def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
     """With it closed the difference of demand and encoder is a following error, and no load angle."""
     with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:

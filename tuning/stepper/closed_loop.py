@@ -47,38 +47,48 @@ def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[
         for role in roles:
             drives.write(role, 0)
         found = optimise(target, Settings(trials=TRIALS, gains=names, safe=bool(target.bus)))
-        before, after, held = _compared(target, names, found.gains)
+        before, after, (stood, held) = _compared(target, names, found.gains)
     finally:
         write_gains(drives, detection.gains)
         for role, values in speeds.items():
             drives.write(role, values)
-    better = held & (after < before)
+    better = held & (~stood | (after < before))
     tuned = np.repeat(better, target.axes_per_machine)
     detection.gains[:, columns] = np.where(tuned[:, None], found.gains[:, columns], detection.gains[:, columns])
-    for k in np.flatnonzero(detection.found.going() & ~tuned):
+    useless = np.repeat(~stood & ~held, target.axes_per_machine)
+    for k in np.flatnonzero(detection.found.going() & useless):
+        detection.found.reservations[k].append(
+            "the closed loop is not certified: its trials were stopped, with the gains of commissioning and with "
+            f"the best of {TRIALS} others; leave it open ({_register(target)} = 0), or find out why it does not hold"
+        )
+    for k in np.flatnonzero(detection.found.going() & ~tuned & ~useless):
         detection.found.reservations[k].append(
             f"the gains of the closed loop are as they were: none of {TRIALS} others that were tried was better in "
             f"{REPEATS} more trials of each"
         )
-    figures = {BEFORE: np.exp(before), AFTER: np.where(better, np.exp(after), np.nan)}
+    figures = {BEFORE: np.where(stood, np.exp(before), np.nan), AFTER: np.where(better, np.exp(after), np.nan)}
     return {name: np.repeat(values, target.axes_per_machine) for name, values in figures.items()}
 
 
-def _compared(target: Target, names: tuple[str, ...], gains: Integers) -> tuple[Floats, Floats, Mask]:
-    """Try the commissioned gains and others again; return the mean ln J of both, and where the others were not stopped.
+def _register(target: Target) -> str:
+    index, sub = target.device.roles[Role.LOOP_MODE]
+    return f"{index:04X}h:{sub:02X}"
+
+
+def _compared(target: Target, names: tuple[str, ...], gains: Integers) -> tuple[Floats, Floats, tuple[Mask, Mask]]:
+    """Try the commissioned gains and others again; return the mean ln J of both, and where each was never stopped.
 
     What won a search won by its noise, too: its trial says too little. One of each goes each way.
     """
     bench = TrialBench(target, gains=names)
     bench.identify()
     costs: list[list[Floats]] = [[], []]
-    held = np.ones(bench.num_machines, bool)
+    held = np.ones((2, bench.num_machines), bool)
     for repeat in range(REPEATS):
         for which in (0, 1) if repeat % 2 == 0 else (1, 0):
             tried = bench.run(gains if which else bench.rule)
             costs[which].append(tried.cost)
-            if which:
-                held &= ~(tried.aborted | tried.fragile)
+            held[which] &= ~(tried.aborted | tried.fragile if which else tried.aborted)
     bench.leave(gains)
     before, after = (np.mean(one, axis=0) for one in costs)
-    return before, after, held
+    return before, after, (held[0], held[1])
