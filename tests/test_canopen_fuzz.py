@@ -139,6 +139,7 @@ def check_dictionary(wire):
 def converse(wire):
     """A clean conversation, whatever was before; the node ID may have been stored anew."""
     node = wire.node.node_id
+    number = [f"{ord(digit):02X}" for digit in wire.drives.device.name.removeprefix("tmcm")]  # of TMCM-1636
     rx, tx = f"rx {0x600 + node:03X}", f"tx {0x580 + node:03X}"
     wire.receive(0, f"80 {node:02X}")
     wire.receive(0x600 + node, "80 00 00 00 00 00 00 00")
@@ -147,9 +148,9 @@ def converse(wire):
         {rx}  40 08 10 00 00 00 00 00
         {tx}  41 08 10 00 09 00 00 00
         {rx}  60 00 00 00 00 00 00 00
-        {tx}  00 54 4D 43 4D 2D 31 36
+        {tx}  00 54 4D 43 4D 2D {number[0]} {number[1]}
         {rx}  70 00 00 00 00 00 00 00
-        {tx}  1B 33 36 00 00 00 00 00
+        {tx}  1B {number[2]} {number[3]} 00 00 00 00 00
         {rx}  2B 0C 10 00 64 00 00 00
         {tx}  60 0C 10 00 00 00 00 00
         {rx}  40 0C 10 00 00 00 00 00
@@ -159,8 +160,8 @@ def converse(wire):
     """)
 
 
-def fuzz(seed, count):
-    with EmulatedDrives(load="inertia", num_threads=1) as drives:
+def fuzz(seed, count, device="tmcm1636", axes=1):
+    with EmulatedDrives(device, load="inertia", num_machines=axes, num_threads=1) as drives:
         wire = Wire(drives, node_id=NODE)
         assert wire.download(HEARTBEAT_TIME, 0, PERIOD, 2) == 0
         generator = Generator(seed, wire.node.dictionary.entries)
@@ -192,6 +193,11 @@ def fuzz(seed, count):
 @pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
 def test_50000_frames():
     fuzz(1, 50_000)
+
+
+@pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
+def test_frames_for_a_node_of_six_axes():
+    fuzz(12, 10_000, "tmcm6212", 6)
 
 
 @pytest.mark.slow
