@@ -33,6 +33,8 @@ QUIRKS = {
         "mode_change_needs_halt": True,
         "absent_status_bits": [4, 9, 10],
         "set_point_buffer": 1,
+        "pv_slows_down_by_6084h": True,
+        "pv_starts_and_stops": True,
     },
 }
 
@@ -324,6 +326,7 @@ def test_a_move_that_does_not_arrive_is_no_move_that_has(tmp_path):
         ({"set_point_buffer": 2}, "set_point_buffer = 2 must be 0, or 1"),
         ({"mode_delay": 0.1}, "quirks.mode_delay is nothing that a device has"),
         ({"mode_change_needs_halt": 1}, "must be true or false"),
+        ({"pv_starts_and_stops": 0}, "pv_starts_and_stops = 0 must be true or false"),
     ],
 )
 def test_a_quirk_that_cannot_be_is_told(tmp_path, quirks, message):
@@ -331,6 +334,15 @@ def test_a_quirk_that_cannot_be_is_told(tmp_path, quirks, message):
         find_device(variant(tmp_path, quirks))
 
 
-def test_the_devices_that_ship_have_none():
-    for name in ("tmcm1636", "tmcm6212", "tmcm3313", "tmcm1636_fw109"):
-        assert find_device(name).quirks == DriveQuirks()
+@pytest.mark.parametrize(
+    ("device", "quirks"),
+    [
+        ("tmcm1636", {}),
+        ("tmcm1636_fw109", {}),
+        ("tgz_d", {}),
+        ("tmcm6212", {"pv_starts_and_stops": True}),  # its manual, section 1.5
+        ("tmcm3313", {"pv_slows_down_by_6084h": True}),  # its manual, section 7.1.14
+    ],
+)
+def test_the_devices_that_ship_have_those_of_their_manuals_alone(device, quirks):
+    assert find_device(device).quirks == DriveQuirks(**quirks)

@@ -392,9 +392,9 @@ class Transaction:
     def store(self, where: Mask | None = None) -> bool:
         """Have the drives keep their parameters over a power cycle; the file says so first.
 
-        Returns whether they do: emulated drives in this process have nothing that outlives it.
+        Returns whether they do, see `can_store`.
         """
-        if not self._target.bus:
+        if not can_store(self._target):
             return False
         self.before = replace(self.before, stored=True)
         self.before.save(self.path)
@@ -411,6 +411,15 @@ def _switch_off(drives: Drives, where: Mask) -> None:
             return
         drives.advance(motion.STEP)
     raise TimeoutError(f"an axis stays enabled for {SWITCH_OFF * motion.STEP:g} s after its voltage was switched off")
+
+
+def can_store(target: Target) -> bool:
+    """Return whether drives can keep their parameters over a power cycle.
+
+    Emulated drives in this process have nothing that outlives it, and some drives have no 1010h (TMCM-3313).
+    """
+    bus = target.drives.bus
+    return bool(target.bus) and (bus is None or bus.description.has(STORE))
 
 
 def store(drives: Drives, where: Mask | None = None) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
@@ -40,6 +41,8 @@ LONGEST_TRAVEL = 1e9  # rad: far beyond what counters of 32 bits hold
 # Of the travel, how far the envelope lets an axis overshoot it, and the least and the most of that [rad].
 SLACK, SLACK_ENDS = 0.05, (0.02 * 2.0 * np.pi, 0.5 * 2.0 * np.pi)
 SPEED_SLACK = 2.0  # of the rated speed: no excitation asks for more than that, and an overshoot may
+# The same of a stepper whose encoder commutates: a trial's ramp leaves it behind, and it is faster while it catches up.
+CATCHING_UP = 3.0
 
 
 @dataclass(frozen=True)
@@ -398,6 +401,7 @@ def hold_to_travel(target: Target) -> None:
     width = np.where(np.isfinite(target.high - target.low), target.high - target.low, 0.0)
     slack = np.clip(SLACK * width, *SLACK_ENDS)
     low, high = here + (target.low - slack) * scale, here + (target.high + slack) * scale
-    speed = np.ceil(SPEED_SLACK * target.motor.rated_speed * target.speed_counts())
+    slack_of_speed = SPEED_SLACK if target.device.gains.loop_of_kind(LOAD_ANGLE) is None else CATCHING_UP
+    speed = np.ceil(slack_of_speed * target.motor.rated_speed * target.speed_counts())
     assert drives.safety is not None, "drives of a bus are opened with an envelope"
     drives.safety.change(Limits(position=(low.tolist(), high.tolist()), velocity=speed.tolist()))

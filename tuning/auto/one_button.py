@@ -27,7 +27,7 @@ from tuning.auto.stages import Basis, RecordedGains, TriedGains
 from tuning.auto.trials import prove
 from tuning.identify.quick_identification import identify_briefly
 from tuning.outcome import Outcome
-from tuning.snapshot import Transaction
+from tuning.snapshot import Transaction, can_store
 from tuning.target import timed
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def prove_found(
         tell_of_lateness(bench)
         say("writing", 0.96)
         accepted = write(bench, fresh, recorded.gains, transaction)
-        kept = keep and bool(accepted.any()) and bool(target.bus)
+        kept = keep and bool(accepted.any()) and can_store(target)
         result = collect(bench, basis, recorded, verdict, transaction.path, kept)
         # What cannot be written down is not left in the drives, and nothing is written of what they did not keep.
         with files(result):

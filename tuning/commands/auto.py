@@ -113,12 +113,21 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
     lines.append(
         f"not measured: current and load step ({unmeasured(target.device)}), frequency response and margins (open loop)"
     )
-    kept = "; the settings are stored in the drive" if result.kept else ""
+    kept = "; the settings are stored in the drive" if result.kept else _not_kept(target)
     lines.append(f"{result.drive_seconds:.1f} s of drive time{kept}")
     lines.append(f"written to {folder}: before.toml, {CERTIFICATE}")
     if target.bus:
         lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)
+
+
+def _not_kept(target: Target) -> str:
+    """Return what to say of settings that a drive on a bus cannot store; "" where there is nothing to say."""
+    from tuning.snapshot import can_store
+
+    if not target.bus or can_store(target):
+        return ""
+    return "; the drive has no 1010h: it has the settings until it is switched off (`drive-env backup` keeps them)"
 
 
 def _left_behind(target: Target, file: Path) -> str:
@@ -184,7 +193,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
             lines.append(f"axis {k}: {axis.verdict}; the gains were verified {axis.verified}")
             lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
         lines += [f"axis {k}: {note}" for note in axis.notes]
-    kept = "; the gains are stored in the drive" if result.kept else ""
+    kept = "; the gains are stored in the drive" if result.kept else _not_kept(target)
     stopped = int(result.aborts.sum())
     trials = f"{stopped} trial{'s' * (stopped != 1)} stopped"
     lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {trials}{kept}")

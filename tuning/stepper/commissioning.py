@@ -23,7 +23,7 @@ from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.open_loop import encoder_age
 from tuning.search.trial_bench import TrialBench
-from tuning.snapshot import Transaction, restore
+from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
 from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
 from tuning.stepper.moves import WorkingMoves
@@ -115,7 +115,7 @@ def commission(
         say("writing", 0.95)
         accepted = found.going()
         _leave(bench, transaction, detection.gains, accepted, roles)
-        kept = keep and bool(accepted.any()) and bool(target.bus)
+        kept = keep and bool(accepted.any()) and can_store(target)
         result = StepperResult(
             tuple(_axis(k, target, bench, before, detection, proof_figures) for k in range(target.num_axes)),
             target.device.name, target.motor.name, target.machine, speed, clock.seconds, transaction.path, kept,
