@@ -217,8 +217,13 @@ def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
         header = tab.driver.execute_script("return studioScope.header")
         assert header["triggered"] and header["from"] == pytest.approx(-0.2, abs=0.01)
         assert {row["unit"] for row in header["channels"]} == {"rev", "rpm", "A"}
-    tab.press("measure")
-    until(lambda: "rise" in tab.one(".studio-figures").text, f"figures: {tab.one('.studio-figures').text}")
+
+
+    def measured():
+        tab.press("measure")
+        return "rise" in tab.one(".studio-figures").text
+
+    until(measured, "figures", step=0.5)
 
 
 def test_twenty_frames_a_second(tab):

@@ -42,8 +42,8 @@ ON_AND_ON = (
 )  # fmt: skip
 AREAS = {
     "communication": ("Communication (1000h to 1FFFh)", range(0x1000, 0x2000)),
-    "manufacturer": ("Manufacturer (2000h to 5FFFh)", range(0x2000, 0x6000)),
-    "profile": ("Drive profile (6000h to 9FFFh)", range(0x6000, 0xA000)),
+    "manufacturer": ("Manufacturer (2000h to 5FFFh)", range(0x2000, cia402.PROFILE_AREAS.start)),
+    "profile": ("Drive profile (6000h to 9FFFh)", cia402.PROFILE_AREAS),
 }
 
 

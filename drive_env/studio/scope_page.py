@@ -306,10 +306,15 @@ class ScopePanel:
             except ValueError as error:
                 told.set_text(str(error))
 
+        proposed: str | None = None
+
         def options() -> None:
+            nonlocal proposed
             labels = [one.label for one in self._view.channels]
             if labels != channel.options:
-                channel.set_options(labels, value=channel.value if channel.value in labels else _response(labels))
+                is_own = channel.value in labels and channel.value != proposed
+                proposed = _response(labels)
+                channel.set_options(labels, value=channel.value if is_own else proposed)
 
         ui.timer(0.5, options)
 

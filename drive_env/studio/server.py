@@ -111,6 +111,20 @@ class Studio:
             visitor.hand_in(motion_jobs.end_turn(visitor.axis), f"End of the jog of axis {visitor.axis}")
 
 
+class _SlowPages(logging.Filter):
+    """Has NiceGUI tell in one line of a browser that answers late: it is busy, or asleep."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Take the traceback from a record of a time-out."""
+        if record.exc_info and isinstance(record.exc_info[1], TimeoutError):
+            record.msg, record.args = f"a page answers late: {record.exc_info[1]}", ()
+            record.exc_info = record.exc_text = None
+        return True
+
+
+SLOW_PAGES = _SlowPages()
+
+
 class StudioServer(uvicorn.Server):
     """Serves until a signal ends it: then the drives are stopped first."""
 
@@ -150,6 +164,7 @@ def web_app(studio: Studio, host: str, port: int, token: str | None) -> FastAPI:
     )  # fmt: skip
     # NiceGUI looks for its server among all objects there are, and one of python-canopen's cannot be looked at.
     web.router.lifespan_context = _lifespan
+    logging.getLogger("nicegui").addFilter(SLOW_PAGES)
     web.add_middleware(StudioGate, host=host, port=port, token=token)  # type: ignore[arg-type]
     return web
 
