@@ -218,7 +218,6 @@ def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
         assert header["triggered"] and header["from"] == pytest.approx(-0.2, abs=0.01)
         assert {row["unit"] for row in header["channels"]} == {"rev", "rpm", "A"}
 
-
     def measured():
         tab.press("measure")
         return "rise" in tab.one(".studio-figures").text
