@@ -20,7 +20,7 @@ from drive_env.ethercat.slave import EtherCatSlave
 from drive_env.ethercat.ways import UdpSocket
 from drive_env.ethercat.world import EtherCatWorld
 from drive_env.master.ethercat_drives import EtherCatDrives
-from tuning.commands.optimise import leave_oscillations_to_trials
+from tuning.search.trial_bench import leave_oscillations_to_trials
 from tuning.stepper.commissioning import commission
 
 

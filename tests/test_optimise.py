@@ -459,7 +459,7 @@ def free_axis(drives):
 
 @pytest.mark.slow
 def test_a_search_runs_on_one_axis_of_a_bus_inside_the_envelope():
-    from tuning.commands.optimise import leave_oscillations_to_trials
+    from tuning.search.trial_bench import leave_oscillations_to_trials
 
     with served("calls", load="inertia") as drives:
         leave_oscillations_to_trials(drives)

@@ -21,9 +21,8 @@ from drive_env.motors import MOTORS
 from drive_env.phase_current import RESERVE, amplitude, holding_torque, run_and_standby
 from drive_env.trials.open_loop import encoder_age
 from tuning.commands.cli import app
-from tuning.commands.optimise import leave_oscillations_to_trials
 from tuning.search.optimise import Settings, optimise
-from tuning.search.trial_bench import TrialBench
+from tuning.search.trial_bench import TrialBench, leave_oscillations_to_trials
 from tuning.stepper import commissioning
 from tuning.stepper.commissioning import WORKING_SHARE, commission
 from tuning.stepper.load_detection import STALL_ANGLE, LoadDetection

@@ -16,8 +16,8 @@ from drive_env.dictionary.roles import Role
 from drive_env.gains import read_gains
 from drive_env.motors import MOTORS
 from drive_env.phase_current import holding_torque, run_and_standby
-from tuning.commands.optimise import leave_oscillations_to_trials
 from tuning.search.optimise import Settings, optimise
+from tuning.search.trial_bench import leave_oscillations_to_trials
 from tuning.snapshot import load_snapshot, restore
 from tuning.stepper.commissioning import commission
 from tuning.target import Target
