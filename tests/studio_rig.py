@@ -104,6 +104,8 @@ def chromium(width=1280, height=1000, *, dark=False):
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(DRIVER))
     driver.set_page_load_timeout(60)
+    # As a window that a person looks at: a select opens for nobody else.
+    driver.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": True})
     size_of(driver, width, height, dark=dark)
     try:
         yield driver

@@ -259,7 +259,7 @@ def test_what_one_button_leaves_is_better_than_what_was_there(folder, tmp_path):
                 (axis,) = auto(target, tmp_path / "before.toml").axes
                 assert axis.accepted, axis.reason
                 assert target.device.gains.read(target.drives)[0].tolist() == list(axis.after)
-    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 0.75 * errors[0]
 
 
 @pytest.mark.slow

@@ -218,11 +218,9 @@ def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
         assert header["triggered"] and header["from"] == pytest.approx(-0.2, abs=0.01)
         assert {row["unit"] for row in header["channels"]} == {"rev", "rpm", "A"}
 
-    def measured():
-        tab.press("measure")
-        return "rise" in tab.one(".studio-figures").text
-
-    until(measured, "figures", step=0.5)
+    tab.press("measure")
+    told = until(lambda: " ".join(one.text for one in tab.all(".studio-figures")).strip(), "figures")
+    assert "rise" in told, told
 
 
 def test_twenty_frames_a_second(tab):
@@ -235,12 +233,21 @@ def test_twenty_frames_a_second(tab):
 
 
 def choose(tab, name, text):
-    """Choose a row of a select by keyboard and mouse."""
-    field = tab.named(name)
-    tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", field)
-    tab.driver.execute_script("arguments[0].closest('.q-field').querySelector('.q-field__control').click()", field)
-    until(lambda: [o for o in tab.all(".q-menu .q-item") if o.text == text], f"the choice {text}")
-    next(o for o in tab.all(".q-menu .q-item") if o.text == text).click()
+    """Choose a row of a select by keyboard and mouse; a page that is still being built may lose a click."""
+
+    def row():
+        return next((one for one in tab.all(".q-menu .q-item") if one.text == text), None)
+
+    def opened():
+        field = tab.named(name)
+        tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", field)
+        tab.driver.execute_script("arguments[0].closest('.q-field').querySelector('.q-field__control').click()", field)
+        end = time.monotonic() + 1.0
+        while not (found := row()) and time.monotonic() < end:
+            time.sleep(0.05)
+        return found
+
+    until(opened, f"the choice {text}").click()
 
 
 # --- dictionary ---------------------------------------------------------------------------------------------------
