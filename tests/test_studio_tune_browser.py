@@ -197,13 +197,13 @@ def test_quick_stop_in_the_middle_of_auto_on_the_bus(driver, bench, emulated):
     gain(tab)
     tab.type("travel", "free")
     tab.press("run-auto")
-    until(lambda: "identifying" in text_of(tab, "run-lines"), "identification", 30.0)
+    until(lambda: "identifying" in text_of(tab, "run-lines"), "identification", 120.0)
     moves_or_ends = lambda: not world.truth.stands().all() or "stopped" in text_of(tab, "run-head")  # noqa: E731
     until(moves_or_ends, "a motion", 60.0)
     assert not world.truth.stands().all(), text_of(tab, "run-head")
     driver.execute_script("document.querySelector('.studio-stop').click()")
     until(lambda: world.truth.stands().all(), "rest", 2.0)
-    until(lambda: "stopped" in text_of(tab, "run-head"), "the end of the run", 30.0)
+    until(lambda: "stopped" in text_of(tab, "run-head"), "the end of the run", 120.0)
     assert "the gains from before are back" in text_of(tab, "run-head")
     assert world.truth.stands().all() and not world.truth.is_on().any()
     gains = emulated.device.gains.keys
