@@ -162,6 +162,7 @@ class Tab:
     def type(self, name, text):
         field = self.named(name)
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", field)
+        until(lambda: field.is_displayed() and field.is_enabled(), f"{name}, to be typed into")
         field.send_keys(Keys.CONTROL, "a")
         field.send_keys(text)
         time.sleep(0.2)  # the server has it
