@@ -65,8 +65,8 @@ def studio(
 ) -> None:
     """Show drives on a local web page: state, motion, scope, dictionary; and what tuning and agents add.
 
-    Emulated drives, unless --interface, --channel or --node names those of a bus. The safety envelope is on. Quick stop
-        is a button and the space bar of every page; a page that is closed, or asleep, stops what it moves.
+    Emulated drives, unless --interface, --channel or --node names those of a bus. On a bus the safety envelope is on.
+    Quick stop is a button and the space bar of every page; a page that is closed, or asleep, stops what it moves.
     """
     with errors_as_exit_codes():
         check_extra()

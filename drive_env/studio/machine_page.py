@@ -168,7 +168,7 @@ class MachinePanel:
                 "Supply voltage", "V", known.supply, (0.0, 1.5 * known.supply), "supply",
                 lambda value: self._do(jobs.set_supply(value), f"Supply {value:.4g} V"),
             )  # fmt: skip
-            ui.label("1.5 times what takes the motor's rated torque, either way.").classes("studio-hint")
+            ui.label("The load goes up to 1.5 times what needs the motor's rated torque.").classes("studio-hint")
 
     def _control(
         self, title: str, unit: str, value: float, ends: tuple[float, float], name: str,

@@ -186,6 +186,10 @@ def listen(host: str, port: int) -> socket.socket:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         return socket.create_server((host, port), family=family)
     except OSError as error:
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise ValueError(
+                f"cannot listen on {host}:{port}: this computer has no such address; give --listen one of its own"
+            ) from None
         why = "another program has it" if error.errno == errno.EADDRINUSE else os.strerror(error.errno or 0)
         raise ValueError(
             f"cannot listen on {host}:{port}: {why}; end that program, or choose another --port (0: a free one)"
