@@ -129,3 +129,15 @@ def test_a_master_reads_it_and_its_limits_stay_with_the_rotor(module):
         motion.disable(drives)
     bus.shutdown()
     world.close()
+
+
+def test_a_port_that_has_read_before_follows_a_scale_that_changes():
+    """A node reads an axis by its port, which keeps the factor of a unit as long as the scale is the same."""
+    with EmulatedDrives(load="inertia", num_threads=1) as drives:
+        wire = Wire(drives)
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, 65_536)
+        assert wire.value(0x6064) == pytest.approx(65_536, abs=200)
+        motion.disable(drives)
+        assert wire.download(0x2058, 0, 32_768, 4) == 0
+        assert wire.value(0x6064) == pytest.approx(32_768, abs=100)

@@ -7,6 +7,7 @@ import re
 import uuid
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -27,6 +28,7 @@ from tuning.commands.cli import app
 from tuning.snapshot import (
     SnapshotError,
     Transaction,
+    can_store,
     check_place,
     file_before,
     load_snapshot,
@@ -512,3 +514,12 @@ def test_a_file_does_not_say_how_else_drives_are_opened(tmp_path, bus, said):
     file.write_text(head + (bus + table if not bus.startswith("[") else table + bus))
     with pytest.raises(SnapshotError, match=said):
         load_snapshot(file, unchecked=True)
+
+
+@pytest.mark.parametrize(
+    ("bus", "has", "can"), [({}, True, False), ({"nodes": [1]}, True, True), ({"nodes": [1]}, False, False)]
+)
+def test_only_drives_of_a_bus_that_have_1010h_can_store(bus, has, can):
+    description = SimpleNamespace(has=lambda key: has and key == (0x1010, 1))
+    drives = SimpleNamespace(bus=SimpleNamespace(description=description))
+    assert can_store(SimpleNamespace(bus=bus, drives=drives)) is can
