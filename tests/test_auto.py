@@ -24,7 +24,8 @@ from tuning.auto import proving as proving_module
 from tuning.auto import search as auto_search
 from tuning.auto import trials as auto_trials
 from tuning.auto.certify import certificate
-from tuning.auto.checks import SENSITIVITY, sound_gains, unsafe_gains
+from tuning.auto.checks import sound_gains, unsafe_gains
+from tuning.auto.measured_margins import SENSITIVITY, SOUGHT, first_far_enough
 from tuning.auto.moves import OVERTIME
 from tuning.auto.one_button import BUDGET, auto
 from tuning.auto.proving import ProvingGround
@@ -159,7 +160,7 @@ def test_the_certificate_says_what_was_done(five):
     assert [shown.name for shown in tuned.frequency_responses] == ["velocity loop"] * 2 + ["position loop"] * 2
     for shown in (new, new_position):
         assert f"{shown.name} Ms {shown.margins['Ms']:.1f}" in tuned.reason
-        assert 1.0 < shown.margins["Ms"] <= auto_margins.SENSITIVITY
+        assert 1.0 < shown.margins["Ms"] <= SOUGHT
     assert np.isnan(old.coherence).all()
     assert "model" in old.source
     low = int(np.searchsorted(new.frequency, 20.0))
@@ -203,12 +204,33 @@ def test_gains_are_lowered_until_the_outer_loops_are_sound_by_the_model(position
     found = sound_gains(device, plant, gains)
     f = np.geomspace(1.0, 2400.0, 3000)
     now, then = (margins(f, position_open_loop(device, plant, one, f)) for one in (found, gains))
-    assert now.ms <= 1.02 * SENSITIVITY
+    assert now.ms <= 1.02 * SOUGHT
     assert found[:4] == gains[:4]
-    if then.ms <= SENSITIVITY:
+    if then.ms <= SOUGHT:
         assert found == gains
     else:
-        assert now.ms > 0.7 * SENSITIVITY and found[4] < position_p  # and no farther than that
+        assert now.ms > 0.7 * SOUGHT and found[4] < position_p  # and no farther than that
+
+
+@pytest.mark.parametrize(
+    ("peaks", "taken"),
+    [
+        ((1.5, 1.2), 0),  # as they are
+        ((3.0, SOUGHT, 1.2), 1),  # the first within what is sought
+        ((3.0, 3.5, 2.8), 0),  # none is: the first that is allowed, and a reservation
+        ((9.0, SENSITIVITY, 5.0), 1),
+        ((9.0, 4.01), None),
+        ((), None),
+    ],
+)
+def test_gains_are_lowered_to_what_is_sought_and_else_to_what_is_allowed(peaks, taken):
+    assert first_far_enough(iter(peaks)) == taken
+
+
+def test_what_is_sought_leaves_the_margins_without_which_nothing_is_moved():
+    """Ms bounds both margins from below: 2 asin(1/2Ms) and Ms/(Ms - 1)."""
+    assert np.degrees(2.0 * np.arcsin(0.5 / SOUGHT)) >= auto_margins.CLOSE["phase"] == 25.0
+    assert 20.0 * np.log10(SOUGHT / (SOUGHT - 1.0)) == pytest.approx(auto_margins.CLOSE["gain"], abs=0.1)
 
 
 # --- rolling back -----------------------------------------------------------------------------------------------------

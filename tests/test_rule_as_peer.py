@@ -48,6 +48,7 @@ def test_what_was_found_is_kept_where_it_is_better_on_the_drive_and_on_the_twins
     ((2.0, 2.0), (1.0, 1.2), (1.0, 1.9), (1.0, 1.0), 1),
     ((2.0, 1.0), (1.5, 1.4), (1.9, 1.0), (1.0, 1.0), 1),  # a machine is as good as its worst axis
     ((2.0, 1.0), (1.5, 1.4), (1.9, 1.0), (9.0, 1.0), 2),  # by the twins the axis 0 is not
+    ((2.0, 2.0), (1.0, 1.0), (2.0, 2.0), (np.inf, np.inf), 0),  # linked axes, of which no twin tells
 ])  # fmt: skip
 def test_a_machine_of_several_axes_is_judged_as_a_whole(rule, own, mixed, twin_own, chosen):
     costs = np.array([rule, own, mixed])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
 from tuning.auto.checks import sound_gains
-from tuning.auto.measured_margins import SENSITIVITY, sensitivity
+from tuning.auto.measured_margins import SENSITIVITY, SOUGHT, sensitivity
 from tuning.auto.trials import faster
 from tuning.auto.twin import SLIPPERY_WORLDS, WORLDS, Twins, search
 
@@ -29,7 +29,7 @@ INTEGRAL, POSITION = (0.0, 0.5, 1.0), (0.0, 0.5, 1.0, 1.5, 2.0, 4.0)
 WELL = 0.95
 # A search for calm gains: sets at once, generations, how wide it begins, and runs of each set with noises of their own.
 SETS, GENERATIONS, WIDTH, RUNS = 16, 12, 0.5, 2
-# By which power of the sensitivity peak over the allowed one, and of the swing at rest over the allowed one, gains cost
+# By which power of the sensitivity peak over the one sought, and of the swing at rest over the allowed one, gains cost
 # more that are too near to instability by the measured response, or that shake at rest.
 NEAR, SHAKING = 2.0, 4.0
 # How far the swing of twins at rest may be from that of their axis, either way, to be taken for its measure.
@@ -84,11 +84,12 @@ def far_enough(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) 
     with _twins_of(bench, basis, k, SETS, RUNS) as twins:
 
         def score(gains: Integers) -> Floats:
-            return np.asarray(twins.score(gains) * np.maximum(peaks(gains[0])[None] / SENSITIVITY, 1.0) ** NEAR)
+            return np.asarray(twins.score(gains) * np.maximum(peaks(gains[0])[None] / SOUGHT, 1.0) ** NEAR)
 
         starts = np.array([[recorded.gains[k], basis.reference[k]]])
         found = search(twins, starts, bench.rng, generations=GENERATIONS, width=WIDTH, score=score).gains[0]
-    found = found[peaks(found) <= SENSITIVITY]
+    far = peaks(found)
+    found = found[far <= (SOUGHT if (far <= SOUGHT).any() else SENSITIVITY)]
     if not len(found):
         return None
     return np.asarray(found[int(cost_on_twins(bench, basis, [k], found[None])[0].argmin())])
@@ -120,7 +121,7 @@ def standing(
         shaking = np.maximum(rest / limit, 1.0)
         if stands:  # of the rule's as they are the axis itself has shown it
             shaking[(gains == rule).all(axis=-1)] = 1.0
-        cost = cost * shaking**SHAKING * np.maximum(peaks(gains[0])[None] / SENSITIVITY, 1.0) ** NEAR
+        cost = cost * shaking**SHAKING * np.maximum(peaks(gains[0])[None] / SOUGHT, 1.0) ** NEAR
         return np.where((gains == own).all(axis=-1), np.inf, cost)
 
     with _twins_of(bench, basis, k, 1, REPEATS, slippery=True) as twins:
@@ -198,8 +199,10 @@ def calmer(
         return standing(bench, basis, recorded, k, swing, allowed, candidates)
     cost = cost_on_twins(bench, basis, [k], candidates[None])[0]
     if response is not None:  # it knows more than the model
-        near = _peaks(bench, basis, recorded, k)(candidates) > SENSITIVITY
-        cost = np.where(near & ~near.all(), np.inf, cost)
+        far = _peaks(bench, basis, recorded, k)(candidates)
+        for limit in (SENSITIVITY, SOUGHT):
+            near = (far > limit) | np.isinf(cost)
+            cost = np.where(near & ~near.all(), np.inf, cost)
     count = len(INTEGRAL) * len(POSITION)
     of_own, of_rule = cost[:count], cost[count:]
     if of_own.min() < WELL * of_rule.min():

@@ -8,6 +8,7 @@ import numpy as np
 
 from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
+from tuning.auto.measured_margins import SOUGHT
 from tuning.response.linear_model import OPEN_LOOPS
 from tuning.response.margins import margins
 
@@ -21,9 +22,7 @@ if TYPE_CHECKING:
 
 SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with
 LOOKED_AT = 400  # frequencies of the model
-# Greatest |1/(1+L)| that the position loop may have by the model, and by how much position P is lowered at a time, and
-# how often at most.
-SENSITIVITY, STEP, STEPS = 4.0, 0.85, 16
+STEP, STEPS = 0.85, 24  # by how much position P is lowered at a time, and how often at most
 
 
 def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
@@ -53,7 +52,7 @@ def sound_gains(device: Device, plant: Plant, gains: Sequence[int]) -> tuple[int
     *_, position_p = cascade_columns(device)
     for lowered in range(STEPS):
         less = tuple(max(round(STEP**lowered * gain), 1) if k == position_p else gain for k, gain in enumerate(gains))
-        if margins(f, OPEN_LOOPS["position"](device, plant, less, f)).ms <= SENSITIVITY:
+        if margins(f, OPEN_LOOPS["position"](device, plant, less, f)).ms <= SOUGHT:
             return less
     return tuple(gains)
 

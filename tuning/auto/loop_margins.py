@@ -17,7 +17,7 @@ from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.calmer_gains import far_enough, twins_tell
-from tuning.auto.measured_margins import CALMED, SENSITIVITY, judged_loops, margins_with, sensitivity
+from tuning.auto.measured_margins import CALMED, SENSITIVITY, SOUGHT, first_far_enough, judged_loops, margins_with, sensitivity
 from tuning.auto.moves import show
 from tuning.auto.stages import Verdict
 from tuning.auto.trials import BY_TRIAL, faster, watch_following
@@ -34,7 +34,7 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
-CLOSE = {"phase": 14.0, "gain": 2.5}  # margins that this leaves at least [degrees, dB]
+CLOSE = {"phase": 25.0, "gain": 5.0}  # margins that Ms as it is sought leaves at least [degrees, dB]
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
 OVERTIME = 0.5  # s beyond the budget for a response: so near to the end margins are worth more than the time
 LONGER = 2  # times as long it is shaken where too little was seen
@@ -112,14 +112,14 @@ def _rule_instead(
     bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, response: MeasuredLoop, why: str
 ) -> RecordedGains:
     """Take the baseline rule's gains, slowed as far as needed, for an axis whose own cannot be calmed; or reject it."""
-    for factor in SOFTER:
-        gains = faster(bench.target.device.gains, basis.reference[k], factor)
-        if sensitivity(bench.target, basis, response, gains, k) <= SENSITIVITY:
-            slowed = "" if factor == 1.0 else f", slowed to {100.0 * factor:.0f} %,"
-            bench.journals[k].note(f"the gains of the baseline rule{slowed} are kept: with those found by search {why}")
-            return recorded.with_gains(k, gains)
-    bench.journals[k].stop(f"{why}; {SENSITIVITY:g} is allowed")
-    return recorded
+    slower = [faster(bench.target.device.gains, basis.reference[k], factor) for factor in SOFTER]
+    chosen = first_far_enough(sensitivity(bench.target, basis, response, gains, k) for gains in slower)
+    if chosen is None:
+        bench.journals[k].stop(f"{why}; {SENSITIVITY:g} is allowed")
+        return recorded
+    slowed = "" if SOFTER[chosen] == 1.0 else f", slowed to {100.0 * SOFTER[chosen]:.0f} %,"
+    bench.journals[k].note(f"the gains of the baseline rule{slowed} are kept: with those found by search {why}")
+    return recorded.with_gains(k, slower[chosen])
 
 
 def _others_instead(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, why: str) -> RecordedGains:
@@ -145,21 +145,18 @@ def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, respon
     gains, known = recorded.gains[k], bench.target.device.gains
     for loop in judged_loops(bench.target):
         calmed = [column for column in known.columns_of(*CALMED[loop]) if known.rows[column].part == "P"]
-        for factor in SOFTER:
-            softer = known.scaled(gains, factor, calmed)
-            found = margins_with(basis, response, softer, k)[loop]
-            if found.ms <= SENSITIVITY:
-                break
-        else:
-            why = f"the measured {loop} loop has a sensitivity peak Ms of {found.ms:.1f}"
+        softer = [known.scaled(gains, factor, calmed) for factor in SOFTER]
+        peaks = [margins_with(basis, response, one, k)[loop].ms for one in softer]
+        if (chosen := first_far_enough(peaks)) is None:
+            why = f"the measured {loop} loop has a sensitivity peak Ms of {peaks[-1]:.1f}"
             return _others_instead(bench, basis, replace(recorded, response=response), k, why)
-        if factor != 1.0:
+        if chosen > 0:
             names = " and ".join(known.titles[column] for column in calmed)
             bench.journals[k].note(
-                f"{names} lowered to {100.0 * factor:.0f} %: the measured {loop} loop was too near to instability; "
-                "the margins with the lower gains are computed from that measurement"
+                f"{names} lowered to {100.0 * SOFTER[chosen]:.0f} %: the measured {loop} loop was too near to "
+                f"instability (Ms {peaks[0]:.1f}); the margins with the lower gains are computed from that measurement"
             )
-        gains = softer
+        gains = softer[chosen]
     # The second best would be as near.
     return recorded if np.array_equal(gains, recorded.gains[k]) else recorded.with_gains(k, gains)
 
@@ -248,6 +245,12 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
             )
         for note in [note for note in response.notes[k] if note not in journal.notes]:
             journal.note(note)
+        for loop in loops:
+            if margins[k][loop].ms > SOUGHT:
+                journal.reserve(
+                    f"the {loop} loop is near to instability: Ms {margins[k][loop].ms:.1f}, where {SOUGHT:g} or less "
+                    "was sought; lower its P, or move slower, if the load may change"
+                )
         if bench.target.linked:
             journal.reserve(ALONE)
         how = "by"
