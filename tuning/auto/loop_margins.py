@@ -17,7 +17,15 @@ from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.calmer_gains import far_enough, twins_tell
-from tuning.auto.measured_margins import CALMED, SENSITIVITY, SOUGHT, first_far_enough, judged_loops, margins_with, sensitivity
+from tuning.auto.measured_margins import (
+    CALMED,
+    SENSITIVITY,
+    SOUGHT,
+    first_far_enough,
+    judged_loops,
+    margins_with,
+    sensitivity,
+)
 from tuning.auto.moves import show
 from tuning.auto.stages import Verdict
 from tuning.auto.trials import BY_TRIAL, faster, watch_following

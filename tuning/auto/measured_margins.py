@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 Integers = NDArray[np.int64]
 
-# Greatest |1/(1+L)| that a loop may have, and what gains are lowered to where that can be: it leaves 25 degrees and 5 dB,
-# without which gains found in a drive are not moved with (checks.py). What is between is accepted with a reservation.
+# Greatest |1/(1+L)| that a loop may have, and what gains are lowered to where that can be: it leaves 25 degrees and
+# 5 dB, without which gains found in a drive are not moved with (checks.py). Between is accepted with a reservation.
 SENSITIVITY, SOUGHT = 4.0, 2.3
 CALMED = {"velocity": ("velocity", "position"), "position": ("position",)}  # whose P is lowered for a loop
 
