@@ -61,6 +61,15 @@ class Entry(NamedTuple):
         return self.index << 16 | self.sub << 8 | (self.bits or 0)
 
     @property
+    def is_written(self) -> bool:
+        """Whether it can be written and read back (CiA 306: rwr and rww are that, too)."""
+        return self.access in ("rw", "rwr", "rww")
+
+    def travels(self, is_sent: bool) -> bool:
+        """Return whether a PDO of a direction carries it (CiA 306: rww is process data that is written, rwr read)."""
+        return self.mappable and self.access not in (("wo", "rww") if is_sent else ("ro", "const", "rwr"))
+
+    @property
     def label(self) -> str:
         return f"{self.index:04X}h:{self.sub:02X}"
 

@@ -94,7 +94,7 @@ def test_what_can_only_be_read_refuses_every_write(wire, facts):
 @EACH_DEVICE
 def test_a_write_of_another_length_is_refused(wire, facts):
     for entry in facts.entries.values():
-        if entry.access == "rw" and entry.bits is not None:
+        if entry.is_written and entry.bits is not None:
             for size in {1, 4, entry.size % 4 + 1} - {entry.size}:
                 code = TOO_LONG if size > entry.size else TOO_SHORT
                 assert wire.download(entry.index, entry.sub, 0, size) == code, entry.label
@@ -104,7 +104,7 @@ def test_a_write_of_another_length_is_refused(wire, facts):
 def test_a_value_beyond_the_limits_of_the_eds_is_refused(wire, facts):
     found = 0
     for entry in facts.entries.values():
-        if entry.access != "rw" or entry.bits is None or entry.index in facts.manual.refuses:
+        if not entry.is_written or entry.bits is None or entry.index in facts.manual.refuses:
             continue
         lowest, highest = (-(1 << entry.bits - 1), (1 << entry.bits - 1) - 1) if entry.signed else (0, (1 << entry.bits) - 1)
         for limit, step, code in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):
@@ -119,7 +119,7 @@ def test_a_value_beyond_the_limits_of_the_eds_is_refused(wire, facts):
 @EACH_DEVICE
 def test_what_the_documents_say_is_refused_is_refused_whatever_is_written(wire, facts):
     for entry in facts.entries.values():
-        if entry.index in facts.manual.refuses and entry.access == "rw" and entry.bits is not None:
+        if entry.index in facts.manual.refuses and entry.is_written and entry.bits is not None:
             assert write(wire, facts, entry.index, facts.default(*entry.key), entry.sub) == 0x0800_0020, entry.label
 
 
@@ -144,7 +144,7 @@ def test_every_parameter_of_an_axis_is_its_own(wire, facts):
     """Of axis 0 each is changed; those of the others stay, but for what the manual says they share."""
     for first, last, step in facts.manual.areas:
         for entry in [e for e in facts.entries.values() if first <= e.index <= last and facts.axis_of(e.index) == 0]:
-            if entry.access != "rw" or entry.bits is None or entry.index in facts.manual.shared:
+            if not entry.is_written or entry.bits is None or entry.index in facts.manual.shared:
                 continue
             places = [(entry.index + step * axis, entry.sub) for axis in facts.axes]
             assert all(facts.has(*place) for place in places), entry.label

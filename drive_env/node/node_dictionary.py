@@ -11,6 +11,9 @@ from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.node.axis import Axis, ObjectPort
 
 
+WRITTEN = ("rw", "rwr", "rww")  # CiA 306: objects that are written and read back
+
+
 class OwnObjects(Protocol):
     """Objects that a node has once, whatever its axes: those of communication.
 
@@ -69,7 +72,7 @@ class NodeDictionary:
         stores_mapped = self._device.canopen.quirks.stores_mapped
         if entry.pdo_mappable and not (stores_mapped and not self._commands(entry.index)):
             return None
-        if entry.access != "rw" or entry.bits is None or is_command:
+        if entry.access not in WRITTEN or entry.bits is None or is_command:
             return None
         if 0x1000 <= entry.index <= 0x1FFF:
             return "communication"
