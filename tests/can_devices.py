@@ -87,6 +87,7 @@ class Manual(NamedTuple):
         hot_told: The emergencies of it: code, error register, additional bytes ("axis": the motor's number).
         further_axis: Bit of 1001h of axes other than the first.
         lost: Emergencies of a lost heartbeat: code, and additional bytes; one of each axis where they name it.
+        stopped: The same of a node that is stopped (NMT) while an axis is enabled.
         before_mode: What must be written for a mode: index, step to the next axis, raw value by mode, bytes.
         groups: What each sub-index of 1010h stores, by the areas' names below.
         shared: Objects of the profile that all axes have in common.
@@ -105,6 +106,7 @@ class Manual(NamedTuple):
     hot_told: tuple[tuple[int, int, tuple[object, ...]], ...]
     further_axis: int
     lost: tuple[int, tuple[object, ...]]
+    stopped: tuple[int, tuple[object, ...]]
     speed: int
     before_mode: tuple[int, int, dict[int, int], int] | None = None
     groups: dict[int, tuple[str, ...]] = {}
@@ -115,6 +117,7 @@ class Manual(NamedTuple):
 STOPS = {0: "STOPPED", 1: "OPERATIONAL", 2: "STOPPED"}  # manual of the TMCM-1636, table 41
 TRINAMIC_HOT = ((0x4310, 0x09, (2, "axis", 0, 0, 0)), (0x4310, 0x09, (1, "axis", 0, 0, 0)))  # tables 303 and 380
 TRINAMIC_LOST = (0x8130, (0, 255, 0, 0, 0))  # table 303
+TRINAMIC_STOPPED = (0x8100, (0, 255, 0, 0, 0))
 PROFILE_AREA = (0x6000, 0x67FF, 0x800)
 AREAS = {"communication": (0x1000, 0x1FFF), "profile": (0x6000, 0x9FFF)}
 
@@ -129,6 +132,7 @@ MANUALS = (
         hot_told=TRINAMIC_HOT,
         further_axis=0,
         lost=TRINAMIC_LOST,
+        stopped=TRINAMIC_STOPPED,
         speed=200_000,
         groups={1: ("communication", "profile", "motor 0"), 2: ("communication",), 3: ("profile",), 4: ("motor 0",)},
     ),
@@ -142,6 +146,7 @@ MANUALS = (
         hot_told=TRINAMIC_HOT,
         further_axis=0,
         lost=TRINAMIC_LOST,
+        stopped=TRINAMIC_STOPPED,
         speed=51_200,
         # The maker's EDS names them.
         groups={1: ("communication", "profile", *(f"motor {k}" for k in range(6)), "module"), 2: ("communication",),
@@ -158,6 +163,7 @@ MANUALS = (
         hot_told=((0x4210, 0x09, (11, "axis", 0, 0, 0)),),  # predefined error field, HEAT_SINK_TEMPERATURE
         further_axis=0x80,  # error register
         lost=(0x8100, (17, "axis", 0, 0, 0)),  # HOST_COMMUNICATION
+        stopped=(0x8100, (17, "axis", 0, 0, 0)),
         speed=300_000,
         before_mode=(0x2303, 0x100, {1: 7, 3: 6, 4: 1, 6: 7, 7: 3, 8: 3, 9: 2, 10: 1}, 4),  # D-Mode
         groups={1: ("communication", "profile", "motor 0", "motor 1", "module")},
@@ -174,6 +180,7 @@ MANUALS = (
         hot_told=TRINAMIC_HOT,
         further_axis=0,
         lost=TRINAMIC_LOST,
+        stopped=TRINAMIC_STOPPED,
         speed=51_200,
         refuses=frozenset((0x1600, 0x1A00, 0x1C00, 0x1C12, 0x1C13)),  # CoE
     ),
@@ -279,9 +286,9 @@ class Facts:
         return next((e for e in self.entries.values() if e.bits is None and e.access != "wo" and len(e.default) > 7),
                     None)  # fmt: skip
 
-    def lost(self) -> list[str]:
-        """Return the emergencies of a lost heartbeat, the register of 1001h open."""
-        code, extra = self.manual.lost
+    def told_of(self, event: str) -> list[str]:
+        """Return the emergencies of a lost network ("lost", "stopped"), the register of 1001h open."""
+        code, extra = getattr(self.manual, event)
         axes = self.axes if "axis" in extra else [0]
         return [frame_of(code, "..", extra, axis) for axis in axes]
 

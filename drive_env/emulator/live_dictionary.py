@@ -80,6 +80,8 @@ class LiveDictionary:
         self._scale_changes = 0
         self._snapshot: RecordSnapshot | None = None  # of what a restart restores
         self._values: dict[tuple[int, int], Integers | str] = {}
+        # What the node of an axis told as its network took it into fault, 0: nothing; for 603Fh.
+        self.network_codes: Integers = np.zeros(self.num_axes, np.int64)
         self._stored = self._commission(preset)
 
     def read(self, name: ObjectName) -> Integers:
@@ -374,6 +376,8 @@ class LiveDictionary:
         for row in np.unique(faults[faults > 0]):
             emergency = self.device.emergencies[self.device.firmware.causes[int(row) - 1].name]
             of_axis = [emergency.of_axis(axis % self.device.num_axes).code for axis in range(self.num_axes)]
+            if row == self.device.firmware.communication_lost + 1:
+                of_axis = np.where(self.network_codes > 0, self.network_codes, of_axis)
             codes = np.where(faults == row, of_axis, codes)
         return codes
 
