@@ -24,6 +24,8 @@ PROFILE = 0x800  # from an axis' objects of CiA 402 to the next one's
 CONTROLWORD, STATUSWORD, MODE, MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
 TARGET_VELOCITY, PROFILE_VELOCITY, VELOCITY = 0x60FF, 0x6081, 0x606C
 PV = 3
+# CiA 402: what moves a drive, and what a master sends in each cycle.
+SET_POINTS = {CONTROLWORD, MODE, 0x6042, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FE, TARGET_VELOCITY}
 SAVE, LOAD = 0x6576_6173, 0x6461_6F6C
 SWITCH_ON_DISABLED, READY, ENABLED, FAULT = 0x40, 0x21, 0x27, 0x08  # CiA 402-2: bits 0 to 3, 5 and 6 of 6041h
 
@@ -90,10 +92,12 @@ class Manual(NamedTuple):
         stopped: The same of a node that is stopped (NMT) while an axis is enabled.
         before_mode: What must be written for a mode: index, step to the next axis, raw value by mode, bytes.
         groups: What each sub-index of 1010h stores, by the areas' names below.
+        address: Objects of the node-ID, of the one in force, and of the command that stores the first.
+        bus: Parameters outside 1000h to 1FFFh that 1010h:02 stores.
         shared: Objects of the profile that all axes have in common.
-        keeps: Objects that a set of parameters leaves alone: those that a write of others moves.
         refuses: Objects that are writable by the EDS and refuse every value with 08000020h, as the documents say.
-        commands: Parameters by access that command something instead, or a state alone takes.
+        stores_mapped: A parameter that a PDO can carry is stored, too.
+        commands: Objects by index that are no parameters: services, a latch that is armed (200Fh), a counter (210Bh).
         speed: Target velocity of a motor that turns.
     """
 
@@ -110,8 +114,12 @@ class Manual(NamedTuple):
     speed: int
     before_mode: tuple[int, int, dict[int, int], int] | None = None
     groups: dict[int, tuple[str, ...]] = {}
+    address: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None = None
+    bus: frozenset[int] = frozenset()
     shared: frozenset[int] = frozenset()
     refuses: frozenset[int] = frozenset()
+    commands: frozenset[int] = frozenset()
+    stores_mapped: bool = False
 
 
 STOPS = {0: "STOPPED", 1: "OPERATIONAL", 2: "STOPPED"}  # manual of the TMCM-1636, table 41
@@ -135,6 +143,9 @@ MANUALS = (
         stopped=TRINAMIC_STOPPED,
         speed=200_000,
         groups={1: ("communication", "profile", "motor 0"), 2: ("communication",), 3: ("profile",), 4: ("motor 0",)},
+        address=((0x2705, 0), (0x2708, 0), (0x2706, 0)),
+        bus=frozenset((0x2704, 0x2705)),
+        commands=frozenset((0x2703, 0x2706, 0x5FFF)),
     ),
     Manual(
         "tmcm6212",
@@ -151,6 +162,9 @@ MANUALS = (
         # The maker's EDS names them.
         groups={1: ("communication", "profile", *(f"motor {k}" for k in range(6)), "module"), 2: ("communication",),
                 3: ("profile",), **{4 + k: (f"motor {k}",) for k in range(6)}, 10: ("module",)},  # fmt: skip
+        address=((0x3005, 0), (0x3008, 0), (0x3006, 1)),  # sections 4.2.57 to 4.2.61
+        bus=frozenset((0x3004, 0x3005)),
+        commands=frozenset((0x3000, 0x3006, *(index + 0x200 * axis for index in (0x200F, 0x210B) for axis in range(6)))),
         refuses=frozenset((0x1023, 0x3000, 0x3001)),  # about.md of the device: [unsupported.reasons]
     ),
     Manual(
@@ -169,6 +183,8 @@ MANUALS = (
         groups={1: ("communication", "profile", "motor 0", "motor 1", "module")},
         shared=frozenset((0x60FE, 0x68FE, 0x60FD, 0x68FD)),
         refuses=frozenset((0x1C12, 0x1C13, 0x1C32, 0x1C33)),  # CoE
+        commands=frozenset((0x4001, 0x23C6, 0x23C7, 0x24C6, 0x24C7)),
+        stores_mapped=True,  # every parameter is mappable by the table of objects
     ),
     Manual(
         "tmcm3313",
@@ -275,11 +291,25 @@ class Facts:
 
     def area_of(self, index: int) -> str:
         """Return the area of the store that a parameter belongs to."""
+        if index in self.manual.bus:
+            return "communication"
         for name, (first, last) in AREAS.items():
             if first <= index <= last:
                 return name
         axis = self.axis_of(index)
         return "module" if axis is None else f"motor {axis}"
+
+    def parameters(self) -> list[Entry]:
+        """Return what 1010h:01 stores: what can be written, is no command, and is no set-point that a PDO brings."""
+        out = {*self.manual.refuses, *self.manual.bus, *self.manual.commands, 0x1003, 0x1010, 0x1011}
+        return [entry for entry in self.entries.values() if entry.is_written and entry.bits is not None
+                and entry.index not in out and not (entry.mappable and self.commanded(entry.index))]  # fmt: skip
+
+    def commanded(self, index: int) -> bool:
+        """Return whether an object that a PDO can carry is a command or a set-point, and no parameter."""
+        if not self.manual.stores_mapped:
+            return True
+        return index in self.manual.commands or (index >= 0x6000 and index % PROFILE + 0x6000 - 0x6000 % PROFILE in SET_POINTS)
 
     def text(self) -> Entry | None:
         """Return a readable text that takes segments, of more than seven letters; None if it has none."""

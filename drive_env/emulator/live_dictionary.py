@@ -310,6 +310,7 @@ class LiveDictionary:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
 
         What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
+        An object that only shows what another sets has no say.
         """
         length = max(map(len, self._stored.values()))
         context = self.context()
@@ -321,11 +322,17 @@ class LiveDictionary:
         peak = self.device.roles.get(Role.PEAK_CURRENT)
         if peak is not None:
             context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
+        known = [key for key in self._stored if key in self.codes]
+        set_by = {key for key in known if self.entries.find(key).access not in ("ro", "const")}
+        places = {(self.codes[key].field, self.codes[key].part) for key in set_by}
         bound = [
             key
-            for key in self._stored
-            if key in self.codes
-            and (self.entries.find(key).access not in ("ro", "const") or self.codes[key].field in self._parameters)
+            for key in known
+            if key in set_by
+            or (
+                self.codes[key].field in self._parameters
+                and (self.codes[key].field, self.codes[key].part) not in places
+            )
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
