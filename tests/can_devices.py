@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import configparser
 import re
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +58,12 @@ class Entry(NamedTuple):
     def size(self) -> int:
         """Bytes on the wire."""
         return (self.bits or 0) // 8
+
+    @property
+    def room(self) -> range:
+        """What its bits hold."""
+        half = 1 << (self.bits or 1) - 1
+        return range(-half, half) if self.signed else range(2 * half)
 
     @property
     def mapping(self) -> int:
@@ -113,7 +121,7 @@ class Manual(NamedTuple):
     stopped: tuple[int, tuple[object, ...]]
     speed: int
     before_mode: tuple[int, int, dict[int, int], int] | None = None
-    groups: dict[int, tuple[str, ...]] = {}
+    groups: Mapping[int, tuple[str, ...]] = MappingProxyType({})
     address: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None = None
     bus: frozenset[int] = frozenset()
     shared: frozenset[int] = frozenset()
@@ -159,12 +167,18 @@ MANUALS = (
         lost=TRINAMIC_LOST,
         stopped=TRINAMIC_STOPPED,
         speed=51_200,
-        # The maker's EDS names them.
-        groups={1: ("communication", "profile", *(f"motor {k}" for k in range(6)), "module"), 2: ("communication",),
-                3: ("profile",), **{4 + k: (f"motor {k}",) for k in range(6)}, 10: ("module",)},  # fmt: skip
+        groups={  # as the maker's EDS names them
+            1: ("communication", "profile", *(f"motor {k}" for k in range(6)), "module"),
+            2: ("communication",),
+            3: ("profile",),
+            **{4 + k: (f"motor {k}",) for k in range(6)},
+            10: ("module",),
+        },
         address=((0x3005, 0), (0x3008, 0), (0x3006, 1)),  # sections 4.2.57 to 4.2.61
         bus=frozenset((0x3004, 0x3005)),
-        commands=frozenset((0x3000, 0x3006, *(index + 0x200 * axis for index in (0x200F, 0x210B) for axis in range(6)))),
+        commands=frozenset(
+            (0x3000, 0x3006, *(index + 0x200 * axis for index in (0x200F, 0x210B) for axis in range(6)))
+        ),
         refuses=frozenset((0x1023, 0x3000, 0x3001)),  # about.md of the device: [unsupported.reasons]
     ),
     Manual(
@@ -309,7 +323,8 @@ class Facts:
         """Return whether an object that a PDO can carry is a command or a set-point, and no parameter."""
         if not self.manual.stores_mapped:
             return True
-        return index in self.manual.commands or (index >= 0x6000 and index % PROFILE + 0x6000 - 0x6000 % PROFILE in SET_POINTS)
+        of_axis = index >= 0x6000 and 0x6000 + index % PROFILE in SET_POINTS
+        return of_axis or index in self.manual.commands
 
     def text(self) -> Entry | None:
         """Return a readable text that takes segments, of more than seven letters; None if it has none."""
@@ -401,10 +416,8 @@ def write(wire: Wire, facts: Facts, index: int, raw: int, sub: int = 0) -> int:
 
 def another(wire: Wire, facts: Facts, entry: Entry, before: int) -> int | None:
     """Write another value that an object takes; return it, None where there is none within reach."""
-    width = entry.bits or 0
-    room = range(-(1 << width - 1), 1 << width - 1) if entry.signed else range(1 << width)
     for raw in (before + 1, before - 1, 1, 0, 3):
-        if raw != before and raw in room and write(wire, facts, entry.index, raw, entry.sub) == 0:
+        if raw != before and raw in entry.room and write(wire, facts, entry.index, raw, entry.sub) == 0:
             return raw
     return None
 

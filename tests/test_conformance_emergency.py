@@ -1,4 +1,4 @@
-"""Emergencies of every CAN device of ours (CiA 301, 7.2.7 and 1003h; the manuals' tables); can_devices.py has the facts."""
+"""Emergencies of every CAN device of ours (CiA 301, 7.2.7, 1003h; the manuals); can_devices.py has the facts."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_the_first_four_have_the_predefined_identifiers_and_the_others_none(fact
 
 @EACH_DEVICE
 def test_the_pdos_of_an_axis_map_its_own_objects(facts):
-    """TMCM-6212, section 1.1: four of an axis, numbers 1 to 4, 65 to 68 and so on; TGZ: its page of default mappings."""
+    """TMCM-6212, section 1.1: four of an axis, numbers 1 to 4, 65 to 68 and so on; TGZ: its default mappings."""
     step = facts.manual.pdo_set
     for indices in (facts.rpdos, facts.tpdos):
         if step:

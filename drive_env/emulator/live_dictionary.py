@@ -382,7 +382,7 @@ class LiveDictionary:
         codes = np.zeros(faults.shape, np.int64)
         for row in np.unique(faults[faults > 0]):
             emergency = self.device.emergencies[self.device.firmware.causes[int(row) - 1].name]
-            of_axis = [emergency.of_axis(axis % self.device.num_axes).code for axis in range(self.num_axes)]
+            of_axis = np.full(self.num_axes, emergency.code)
             if row == self.device.firmware.communication_lost + 1:
                 of_axis = np.where(self.network_codes > 0, self.network_codes, of_axis)
             codes = np.where(faults == row, of_axis, codes)

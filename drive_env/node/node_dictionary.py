@@ -10,7 +10,6 @@ from drive_env.devices import Device
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.node.axis import Axis, ObjectPort
 
-
 WRITTEN = ("rw", "rwr", "rww")  # CiA 306: objects that are written and read back
 
 
