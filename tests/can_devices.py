@@ -349,11 +349,16 @@ EACH_DEVICE = pytest.mark.parametrize("facts", DEVICES, ids=repr)
 EACH_AXIS = pytest.mark.parametrize(
     ("facts", "axis"), [pytest.param(facts, axis, id=f"{facts}-{axis}") for facts in DEVICES for axis in facts.axes]
 )
-EACH_RPDO = pytest.mark.parametrize(
-    ("facts", "pdo"), [pytest.param(facts, pdo, id=f"{facts}-{pdo:04X}") for facts in DEVICES for pdo in facts.rpdos]
-)
-EACH_TPDO = pytest.mark.parametrize(
-    ("facts", "pdo"), [pytest.param(facts, pdo, id=f"{facts}-{pdo:04X}") for facts in DEVICES for pdo in facts.tpdos]
+EACH_RPDO, EACH_TPDO = (
+    pytest.mark.parametrize(
+        ("facts", "pdo"),
+        [  # each third is in each run: of every device, and of every place in an axis' set
+            pytest.param(facts, pdo, id=f"{facts}-{pdo:04X}", marks=pytest.mark.every(3))
+            for facts in DEVICES
+            for pdo in getattr(facts, direction)
+        ],
+    )
+    for direction in ("rpdos", "tpdos")
 )
 
 

@@ -74,7 +74,7 @@ def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
             if variable is not None and (found is None or found[0] != bits):
                 said = "of no integer type" if found is None else f"an integer of {found[0]} bits"
                 raise ValueError(
-                    f"{path}{_line_of(path, variable.index)}: {variable.index:04X}h {variable.name} is {said} ({variable.data_type or 0:04X}h), and "
-                    f"CiA 402 has it with {bits} bits; correct its DataType"
+                    f"{path}{_line_of(path, variable.index)}: {variable.index:04X}h {variable.name} is {said} "
+                    f"({variable.data_type or 0:04X}h), and CiA 402 has it with {bits} bits; correct its DataType"
                 )
     return axes
