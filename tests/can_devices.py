@@ -153,7 +153,7 @@ MANUALS = (
         groups={1: ("communication", "profile", "motor 0"), 2: ("communication",), 3: ("profile",), 4: ("motor 0",)},
         address=((0x2705, 0), (0x2708, 0), (0x2706, 0)),
         bus=frozenset((0x2704, 0x2705)),
-        commands=frozenset((0x2703, 0x2706, 0x5FFF)),
+        commands=frozenset((0x2703, 0x2706, 0x5FFF)),  # sections 4.1.26 to 4.1.30
     ),
     Manual(
         "tmcm6212",

@@ -232,6 +232,22 @@ def test_every_transmission_type(wire, facts, pdo):
         configure(wire, pdo, 1, FREE_ID | OFF | NO_REMOTE, 4)
 
 
+@EACH_DEVICE
+@pytest.mark.parametrize("kind", [3, 240])
+def test_every_nth_sync_is_counted_by_each_pdo(wire, facts, kind):
+    first, last = facts.tpdos[0], facts.tpdos[-1]
+    silence(wire, facts)
+    give(wire, first, FREE_ID, kind)
+    wire.start()
+    wire.receive(0x080)
+    give(wire, last, FREE_ID + 1, kind)  # counts from here on
+    seen = {FREE_ID: [], FREE_ID + 1: []}
+    for k in range(2, 2 * kind + 2):
+        for frame in wire.receive(0x080):
+            seen[frame.can_id].append(k)
+    assert seen == {FREE_ID: [kind, 2 * kind], FREE_ID + 1: [kind + 1, 2 * kind + 1]}
+
+
 @EACH_TPDO
 def test_inhibit_time_and_event_timer_in_their_units(wire, facts, pdo):
     """The event timer in ms; the inhibit time in 100 us by CiA 301, in ms by some manuals."""

@@ -125,6 +125,22 @@ def test_every_parameter_is_stored_and_every_one_restored(wire, facts):
 
 
 @EACH_STORE
+def test_what_commands_or_counts_is_not_stored(wire, facts):
+    """Outputs, set-points of images, an armed latch, a counter."""
+    written = []
+    for entry in facts.entries.values():
+        if entry.index in facts.manual.commands and entry.is_written and entry.bits is not None:
+            raw = another(wire, facts, entry, read(wire, facts, *entry.key))
+            if raw is not None and read(wire, facts, *entry.key) == raw != facts.default(*entry.key):
+                written.append(entry)
+    assert wire.download(STORE, 1, SAVE, 4) == 0
+    power_cycled(wire)
+    assert written, "each device that stores has such a one"
+    for entry in written:
+        assert read(wire, facts, *entry.key) == facts.default(*entry.key), entry.label
+
+
+@EACH_STORE
 def test_mapping_and_identifiers_of_every_axis_come_back(wire, facts):
     """The last of the PDOs that are sent, and of those that are received."""
     sent, received = facts.tpdos[-1], facts.rpdos[-1]
