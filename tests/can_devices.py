@@ -183,7 +183,8 @@ MANUALS = (
     ),
     Manual(
         "tgz_d",
-        areas=((0x2300, 0x23FF, 0x100), (0x3300, 0x33FF, 0x100), PROFILE_AREA),
+        # Its registers lie 100h apart as 3325h and 3425h do; 333Eh is once in the module.
+        areas=((0x2300, 0x23FF, 0x100), (0x3300, 0x333D, 0x100), (0x333F, 0x33FF, 0x100), PROFILE_AREA),
         pdo_set=0,
         error_behaviour={0: "PRE_OPERATIONAL", 1: "OPERATIONAL", 2: "STOPPED"},  # CiA 301
         inhibit_unit=1e-4,  # CiA 301
@@ -299,8 +300,9 @@ class Facts:
         if len(self.axes) == 1:
             return 0 if index >= 0x2000 else None
         for first, last, step in self.manual.areas:
-            if first <= index <= last + step * self.axes[-1] and (index - first) // step <= self.axes[-1]:
-                return (index - first) // step
+            axis, place = divmod(index - first, step)
+            if axis in self.axes and place <= last - first:
+                return axis
         return None
 
     def area_of(self, index: int) -> str:

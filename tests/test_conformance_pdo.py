@@ -306,6 +306,23 @@ def test_identifiers_follow_cia_301(wire, facts):
 
 
 @EACH_DEVICE
+def test_the_identifier_of_sync(wire, facts):
+    """CiA 301, 1005h: of 11 bits, none that is reserved; none of them produces SYNC (bit 30), which has no 1006h."""
+    assert facts.default(0x1005) & 0x7FF == 0x80 and not facts.has(0x1006)
+    silence(wire, facts)
+    give(wire, facts.tpdos[-1], FREE_ID, 1)
+    wire.start()
+    for bad in (0x4000_0080, 0x2000_0080, 0x880, *(one for one in RESTRICTED)):
+        assert wire.download(0x1005, 0, bad, 4) == RANGE, f"{bad:08X}h"
+    configure(wire, 0x1005, 0, 0x81, 4)
+    assert wire.receive(0x080) == []
+    assert [frame.can_id for frame in wire.receive(0x081)] == [FREE_ID]
+    assert [frame.can_id for frame in wire.receive(0x081, "07")] == [FREE_ID], "with a counter, too"
+    for data in ("01 02", "00 00 00 00 00 00 00 00"):
+        assert wire.receive(0x081, data) == [], "no SYNC"
+
+
+@EACH_DEVICE
 def test_no_remote_frame_is_answered(wire, facts):
     wire.start()
     for pdo in facts.tpdos:

@@ -11,7 +11,10 @@ from can_devices import (
     PROFILE,
     PROFILE_VELOCITY,
     STATUSWORD,
+    TARGET_VELOCITY,
+    VELOCITY,
     another,
+    enable,
     fresh,
     read,
     request,
@@ -154,6 +157,29 @@ def test_every_parameter_of_an_axis_is_its_own(wire, facts):
                 continue  # a command, or it takes the value alone that it has
             after = [read(wire, facts, *place) for place in places]
             assert after[1:] == before[1:], entry.label
+
+
+@EACH_DEVICE
+def test_every_object_of_an_axis_reads_as_the_drives_have_it_while_they_move(wire, facts):
+    enable(wire, facts)
+    for axis in facts.axes:
+        speed = facts.manual.speed * (axis + 1) // len(facts.axes)
+        assert write(wire, facts, TARGET_VELOCITY + PROFILE * axis, speed) == 0
+    wire.wait(100)
+    wire.take()
+    seen = set()
+    of_node = {*facts.manual.bus, *(index for index, _ in facts.manual.address or ())}
+    for first, last, step in facts.manual.areas or ((0x2000, 0x67FF, 0x4800),):
+        for entry in facts.entries.values():
+            if not first <= entry.index <= last or entry.bits is None or entry.index in of_node:
+                continue
+            known = wire.drives.read(entry.key)
+            for axis in facts.axes:
+                value = wire.value(entry.index + step * axis, entry.sub)
+                assert value == known[axis], f"{entry.label} of axis {axis}"
+                seen.add((entry.index, axis, value))
+    speeds = [value for index, _, value in sorted(seen) if index == VELOCITY]
+    assert speeds == sorted(set(speeds)) and speeds[0] > 0, "each moves, and at its own speed"
 
 
 # --- segments ---------------------------------------------------------------------------------------------------------
