@@ -134,6 +134,8 @@ def test_what_commands_or_counts_is_not_stored(wire, facts):
             if raw is not None and read(wire, facts, *entry.key) == raw != facts.default(*entry.key):
                 written.append(entry)
     assert wire.download(STORE, 1, SAVE, 4) == 0
+    stored = {key for section in wire.node._store.sections.values() for key in section}
+    assert stored.isdisjoint(entry.key for entry in written)
     power_cycled(wire)
     assert written, "each device that stores has such a one"
     for entry in written:
