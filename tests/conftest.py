@@ -8,6 +8,7 @@ import typer.testing
 from thinning import STRIDE
 
 from drive_env import EmulatedDrives, motion
+from drive_env.devices import find_device
 from drive_env.master.description import Description
 
 ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
@@ -43,6 +44,21 @@ def pytest_collection_modifyitems(config, items):
         config.hook.pytest_deselected(items=left_out)
         gone = set(left_out)
         items[:] = [item for item in items if item not in gone]
+
+
+@pytest.fixture(scope="session")
+def emulated():
+    """Drives of a device by its name, as many as it has axes, made once: what the conformance tests share."""
+    made = {}
+
+    def of(name):
+        if name not in made:
+            made[name] = EmulatedDrives(name, "inertia", num_machines=find_device(name).num_axes, num_threads=1)
+        return made[name]
+
+    yield of
+    for drives in made.values():
+        drives.close()
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion
 from drive_env.bus.world import World
+from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.devices.new_device import new_device
@@ -29,6 +30,7 @@ from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import check_linear_model
+from drive_env.master.description import describe
 from drive_env.motors import find_motor
 
 FILES = sorted(path.stem for path in FOLDER.glob("*.eds"))
@@ -528,6 +530,89 @@ def test_603fh_shows_what_holds_the_axis_in_fault(folders):
         drives.advance(0.5)
         motion.reset_fault(drives)
         assert drives.read(0x603F)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("told", "lose"),
+    [
+        (0x8100, lambda wire: wire.receive(0, f"02 {NODE:02X}")),
+        (0x8140, lambda wire: (wire.node.bus_off(wire.now), wire.wait(1), wire.node.bus_on(wire.now))),
+        (0x8130, lambda wire: (wire.receive(0x707, "05"), wire.wait(60))),
+    ],
+    ids=["stopped", "bus-off", "heartbeat"],
+)
+def test_603fh_has_the_code_of_the_emergency_that_a_lost_network_had(tmp_path, told, lose):
+    """CiA 402: the code of the last error, as the emergency and 1003h have it."""
+    more = entry("1016sub1", "Consumer") + entry("1029sub1", "Communication error", data_type="0x0005")
+    path = tmp_path / "watching.eds"
+    path.write_text((FOLDER / "deltron_dl750.eds").read_text(encoding="cp1252") + "\n" + more, encoding="cp1252")
+    made = new_device(path, tmp_path / "out", find_motor(MOTOR))
+    with emulated(str(made.folder)) as drives:
+        wire = Wire(drives, NODE)
+        assert wire.download(0x1016, 1, 0x0007_0032, 4) == 0  # node 7, 50 ms
+        assert wire.download(0x1029, 1, 2, 1) == 0  # to stopped
+        motion.enable(drives, mode="pp")
+        wire.start()
+        lose(wire)
+        wire.wait(2)
+        wire.node.receive(Frame(0, bytes((0x80, NODE))), wire.now)
+        codes = [int.from_bytes(frame.data[:2], "little") for frame in wire.take() if frame.can_id == 0x80 + NODE]
+        assert codes in ([told], []), "a heartbeat's was told before"
+        assert wire.value(0x603F, 0) == drives.read(0x603F)[0] == told
+
+
+# --- objects of the standard with sub-objects -------------------------------------------------------------------------
+WORDS = {"6040": ("0x0006", "rw"), "6041": ("0x0006", "ro"), "6060": ("0x0002", "rw")}
+
+
+def with_sub_objects(tmp_path, index, sections):
+    """Return an EDS in which an object is described otherwise, and the line at which it begins."""
+    text = (FOLDER / "alpina_ax40.eds").read_text(encoding="cp1252")
+    before = re.search(rf"\[{index}\].*?(?=\n\[)", text, re.DOTALL)[0]
+    path = tmp_path / "subs.eds"
+    path.write_text(text.replace(before, sections), encoding="cp1252")
+    return path, text[: text.index(before)].count("\n") + 1
+
+
+@pytest.mark.parametrize("index", WORDS)
+@pytest.mark.parametrize(("kind", "of_its_own"), [("0x7", True), ("0x9", True), ("0x7", False)])
+def test_sub_objects_of_a_word_do_not_matter_where_sub_index_0_is_the_word(tmp_path, index, kind, of_its_own):
+    """Bits that were described one by one, for instance: sub-index 0 is what CiA 402 has."""
+    data_type, access = WORDS[index]
+    bit = entry(f"{index}sub1", "Bit 0", data_type="0x0001", access="ro")
+    if of_its_own:
+        sections = entry(index, "Word", kind, data_type=None, access=None)
+        sections += entry(f"{index}sub0", "Word", data_type=data_type, access=access) + bit
+    else:
+        sections = entry(index, "Word", kind, data_type=data_type, access=access) + bit
+    path, _ = with_sub_objects(tmp_path, index, sections)
+    made = new_device(path, tmp_path / "out", find_motor(MOTOR))
+    told = [note.why for note in made.repairs if note.what == f"[{index}]"]
+    assert any("that of sub-index 0, which was added" in why for why in told) is not of_its_own
+    with emulated(str(made.folder)) as drives:
+        motion.enable(drives, mode="pp")
+        assert int(drives.read(0x6041)[0]) & 0x6F == 0x27
+
+
+@pytest.mark.parametrize("index", WORDS)
+@pytest.mark.parametrize(
+    ("sub_0", "says"),
+    [("Number of entries", "counts them at sub-index 0 (Number of entries, UNSIGNED8)"), (None, "has no sub-index 0")],
+)
+def test_a_word_at_another_sub_index_is_refused_with_its_line_and_a_remedy(tmp_path, index, sub_0, says):
+    data_type, access = WORDS[index]
+    sections = entry(index, "Word", "0x9", data_type=None, access=None)
+    if sub_0 is not None:
+        sections += entry(f"{index}sub0", sub_0, data_type="0x0005", access="ro", DefaultValue="1")
+    sections += entry(f"{index}sub1", "Word", data_type=data_type, access=access)
+    path, line = with_sub_objects(tmp_path, index, sections)
+    with pytest.raises(ValueError, match=rf"subs\.eds, line {line}: {index}h has sub-indices 01 and ") as refused:
+        new_device(path, tmp_path / "out", find_motor(MOTOR))
+    assert says in str(refused.value)
+    assert f"make [{index}] one object with ObjectType=0x7" in str(refused.value)
+    with pytest.raises(ValueError, match=rf"line {line}: {index}h has sub-indices 01"):
+        describe(None, path)  # a master's
+    assert not (tmp_path / "out").exists()
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from drive_env.canopen.sync import SyncProducer, SyncWindow
 from drive_env.canopen.time_of_day import Clock, TimeProducer
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, VALUE_RANGE, ObjectAccessError
 from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.firmware.common.protection import COMMUNICATION
 from drive_env.node.node_axes import NodeAxes
 from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.node_errors import NodeErrors
@@ -339,7 +340,7 @@ class Node:
         self._is_online = False
         self._received.clear()
         self._clear_answers()
-        self._axes.trip()
+        self._axes.trip("bus_off_recovered")
         self._react(COMMUNICATION_ERROR)
 
     def bus_on(self, now: float) -> None:
@@ -542,7 +543,8 @@ class Node:
         self._clear_answers()
         self._boots_at, self._boot = now + self._boot_time, boot
 
-    def _enter(self, state: NmtState, *, is_commanded: bool = False) -> None:
+    def _enter(self, state: NmtState, *, is_commanded: bool = False, told: str = COMMUNICATION) -> None:
+        """Enter a state; `told` is the condition that leads there."""
         if state is self.state:
             return
         if self.state is NmtState.STOPPED:
@@ -557,8 +559,8 @@ class Node:
         elif state is NmtState.STOPPED:
             self._close_sdo()
             # The one link between the two automata (manual, section 2.2). A stop after an error has been told already.
-            if self._axes.trip() and is_commanded:
-                self._errors.condition("communication_error", self._now)
+            if self._axes.trip(told) and is_commanded:
+                self._errors.condition(told, self._now)
 
     def _on_sdo(self, data: bytes, now: float) -> None:
         if not nmt.SERVICES[self.state].sdo:
@@ -661,16 +663,16 @@ class Node:
 
     def _lose(self, service: str, node_id: int, now: float) -> None:
         self._errors.condition("heartbeat_lost", now, "guarding" if service == "guarding" else (service, node_id))
-        self._react(COMMUNICATION_ERROR)
+        self._react(COMMUNICATION_ERROR, "heartbeat_lost")
 
-    def _react(self, error_class: int) -> None:
+    def _react(self, error_class: int, told: str = COMMUNICATION) -> None:
         """Do what 1029h says of an error that is detected in operational."""
         if self.state is not NmtState.OPERATIONAL:
             return
         raw = self._module.value(communication.ERROR_BEHAVIOUR, error_class)
         target = self._device.canopen.error_behaviour.get(raw, "stay")
         if target != "stay":
-            self._enter(NmtState[target])
+            self._enter(NmtState[target], told=told)
 
     def _flush(self, now: float) -> None:
         if self._is_online and nmt.SERVICES[self.state].emergency:

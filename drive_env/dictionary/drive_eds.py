@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary.datatypes import UNSIGNED8
 
 from drive_env import cia402
-from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, read_eds
+from drive_env.dictionary.eds_file import place_of_line
+from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_text, read_eds
 
 Key = tuple[int, int]
 
@@ -31,6 +33,29 @@ def read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
     return types
 
 
+def _check_values(path: Path, types: Mapping[Key, ODVariable]) -> None:
+    """Raise ValueError for an object of which sub-index 0 is no value, but counts other sub-indices or is missing."""
+    for index in sorted({index for index, sub in types if sub > 0}):
+        axis, first = divmod(index - cia402.PROFILE_AREAS.start, cia402.AXIS_OFFSET)
+        bits = KINDS.get((cia402.PROFILE_AREAS.start + first, 0)) if 0 <= axis < MOST_AXES else None
+        head = types.get((index, 0))
+        if bits is None or (head is not None and head.data_type != UNSIGNED8):
+            continue
+        subs = ", ".join(f"{sub:02X}" for one, sub in types if one == index and sub > 0)
+        found = "has no sub-index 0" if head is None else f"counts them at sub-index 0 ({head.name}, UNSIGNED8)"
+        raise ValueError(
+            f"{path}{_line_of(path, index)}: {index:04X}h has sub-indices {subs} and {found}, where CiA 402 has the "
+            f"value itself, {bits} bits; make [{index:04X}] one object with ObjectType=0x7 and that DataType, without "
+            "sub-objects. A drive that has the value at another sub-index is no CiA 402 drive, and cannot be driven"
+        )
+
+
+def _line_of(path: Path, index: int) -> str:
+    """Return ", line n" of an object's first section in an EDS; nothing where it has none."""
+    found = (place and place[0] == index for place in map(place_of_line, eds_text(path).splitlines()))
+    return next((f", line {number}" for number, is_it in enumerate(found, 1) if is_it), "")
+
+
 def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
     """Return how many axes an EDS describes.
 
@@ -38,6 +63,7 @@ def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
         ValueError: If it is that of no CiA 402 drive, or has an object that decides what a drive does with another
             type than the standard's.
     """
+    _check_values(path, types)
     axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(MOST_AXES))
     if axes == 0:
         raise ValueError(f"{path} describes no CiA 402 drive: it has no statusword 6041h")
@@ -48,7 +74,7 @@ def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
             if variable is not None and (found is None or found[0] != bits):
                 said = "of no integer type" if found is None else f"an integer of {found[0]} bits"
                 raise ValueError(
-                    f"{path}: {variable.index:04X}h {variable.name} is {said} ({variable.data_type or 0:04X}h), and "
-                    f"CiA 402 has it with {bits} bits; correct its DataType"
+                    f"{path}{_line_of(path, variable.index)}: {variable.index:04X}h {variable.name} is {said} "
+                    f"({variable.data_type or 0:04X}h), and CiA 402 has it with {bits} bits; correct its DataType"
                 )
     return axes

@@ -60,6 +60,8 @@ _MEMBER = re.compile(
 )
 _COMPACT = re.compile(r"([0-9A-Fa-f]{4})(Name|Value)$", re.IGNORECASE)
 
+VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
+
 Section = dict[str, str]
 
 
@@ -96,6 +98,12 @@ def place_of(name: str) -> tuple[int, int] | None:
     if found := _MEMBER.match(name):
         return int(found[1], 16), int(found[2], 16)
     return None
+
+
+def place_of_line(line: str) -> tuple[int, int] | None:
+    """Return the same of a line of a file, None of one that begins no section of an object."""
+    found = _SECTION.match(line)
+    return None if found is None else place_of(found[1])
 
 
 @lru_cache(maxsize=16)
@@ -203,7 +211,7 @@ class _Repairer:
                 if value := texts["Value"].get(str(sub)):
                     named["DefaultValue"] = value
                 self._sections.setdefault(object_section(place[0], sub), member | named)
-            for key in ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping"):
+            for key in VALUE_KEYS:
                 row.pop(key, None)
             row["ObjectType"] = row.get("ObjectType", str(GROUPS[0]))
 
@@ -228,7 +236,16 @@ class _Repairer:
             counted = number_of(row.get("SubNumber", "")) if "SubNumber" in row else len(subs)
             if counted != len(subs):
                 self._tell(f"[{name}]", f"SubNumber={row['SubNumber']}, and there are {len(subs)} sub-objects")
+            if kind not in GROUPS and 0 not in subs and "DataType" in row:
+                self._move_value_to_sub_0(name, row)
+                subs.append(0)
             row["SubNumber"] = str(len(subs))
+
+    def _move_value_to_sub_0(self, name: str, row: Section) -> None:
+        """Let what an object with sub-objects says of itself be its sub-index 0, at which CiA 301 has a value."""
+        own = {key: row.pop(key) for key in VALUE_KEYS if key in row}
+        self._sections[f"{name}sub0"] = {"ParameterName": row.get("ParameterName", "")} | own
+        self._tell(f"[{name}]", "has a DataType beside its sub-objects: that of sub-index 0, which was added")
 
     def _object_type(self, name: str, row: Section) -> int:
         text = row.get("ObjectType")

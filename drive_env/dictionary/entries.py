@@ -89,6 +89,11 @@ def eds_file(path: Path | EdsText, node_id: int = 1) -> EdsFile:
     return parse_eds(_source(path)[0], node_id)
 
 
+def eds_text(path: Path | EdsText) -> str:
+    """Return an EDS as it is written."""
+    return _source(path)[0]
+
+
 def _source(path: Path | EdsText) -> tuple[str, str]:
     """Return an EDS's text and where it is from."""
     return (path.text, path.name) if isinstance(path, EdsText) else (_read_text(path), str(path))

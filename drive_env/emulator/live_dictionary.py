@@ -80,6 +80,8 @@ class LiveDictionary:
         self._scale_changes = 0
         self._snapshot: RecordSnapshot | None = None  # of what a restart restores
         self._values: dict[tuple[int, int], Integers | str] = {}
+        # What the node of an axis told as its network took it into fault, 0: nothing; for 603Fh.
+        self.network_codes: Integers = np.zeros(self.num_axes, np.int64)
         self._stored = self._commission(preset)
 
     def read(self, name: ObjectName) -> Integers:
@@ -308,6 +310,7 @@ class LiveDictionary:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
 
         What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
+        An object that only shows what another sets has no say.
         """
         length = max(map(len, self._stored.values()))
         context = self.context()
@@ -319,11 +322,17 @@ class LiveDictionary:
         peak = self.device.roles.get(Role.PEAK_CURRENT)
         if peak is not None:
             context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
+        known = [key for key in self._stored if key in self.codes]
+        set_by = {key for key in known if self.entries.find(key).access not in ("ro", "const")}
+        places = {(self.codes[key].field, self.codes[key].part) for key in set_by}
         bound = [
             key
-            for key in self._stored
-            if key in self.codes
-            and (self.entries.find(key).access not in ("ro", "const") or self.codes[key].field in self._parameters)
+            for key in known
+            if key in set_by
+            or (
+                self.codes[key].field in self._parameters
+                and (self.codes[key].field, self.codes[key].part) not in places
+            )
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
@@ -373,7 +382,9 @@ class LiveDictionary:
         codes = np.zeros(faults.shape, np.int64)
         for row in np.unique(faults[faults > 0]):
             emergency = self.device.emergencies[self.device.firmware.causes[int(row) - 1].name]
-            of_axis = [emergency.of_axis(axis % self.device.num_axes).code for axis in range(self.num_axes)]
+            of_axis = np.full(self.num_axes, emergency.code)
+            if row == self.device.firmware.communication_lost + 1:
+                of_axis = np.where(self.network_codes > 0, self.network_codes, of_axis)
             codes = np.where(faults == row, of_axis, codes)
         return codes
 

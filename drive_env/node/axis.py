@@ -26,6 +26,7 @@ from drive_env.emulator.live_dictionary import (
 )
 from drive_env.emulator.prepared_record import PEAK_FIELD, RATIO_FIELD, SCALE_FIELD
 from drive_env.firmware import cycle
+from drive_env.firmware.common.protection import COMMUNICATION
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
 
@@ -117,10 +118,18 @@ class Axis:
         """Bring texts back to the dictionary's, as a restart does."""
         self._texts.clear()
 
-    def trip(self) -> bool:
-        """Take the axis from operation enabled into fault because its network is lost; return whether it was there."""
+    def trip(self, told: str = COMMUNICATION) -> bool:
+        """Take the axis from operation enabled into fault because its network is lost; return whether it was there.
+
+        Args:
+            told: The condition that its node tells of, whose code 603Fh then shows.
+        """
         firmware = self._device.firmware
-        return bool(firmware.trip(self._records, self._lane, 1, firmware.communication_lost))
+        tripped = bool(firmware.trip(self._records, self._lane, 1, firmware.communication_lost))
+        if tripped:
+            row = self._device.emergencies.get(told)
+            self._objects.network_codes[self.number] = 0 if row is None else row.code
+        return tripped
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _place(self, field: str, part: int = 0) -> tuple[Any, int]:

@@ -8,6 +8,7 @@ from typing import overload
 import numpy as np
 
 from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.firmware.common.protection import COMMUNICATION
 from drive_env.node.axis import Axis
 
 
@@ -60,9 +61,13 @@ class NodeAxes(Sequence[Axis]):
         for axis in self._axes:
             axis.forget_texts()
 
-    def trip(self) -> bool:
-        """Take each axis from operation enabled into fault, as its network is lost; return whether one was there."""
-        tripped = [axis.trip() for axis in self._axes]  # all of them, not those up to the first that was
+    def trip(self, told: str = COMMUNICATION) -> bool:
+        """Take each axis from operation enabled into fault, as its network is lost; return whether one was there.
+
+        Args:
+            told: The condition that the node tells of.
+        """
+        tripped = [axis.trip(told) for axis in self._axes]  # all of them, not those up to the first that was
         return any(tripped)
 
     def engrave(self, key: tuple[int, int], raw: int) -> None:

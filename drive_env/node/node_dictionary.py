@@ -10,6 +10,8 @@ from drive_env.devices import Device
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.node.axis import Axis, ObjectPort
 
+WRITTEN = ("rw", "rwr", "rww")  # CiA 306: objects that are written and read back
+
 
 class OwnObjects(Protocol):
     """Objects that a node has once, whatever its axes: those of communication.
@@ -43,6 +45,8 @@ class NodeDictionary:
         self._module = module
         self._axes = axes
         self._ports: dict[tuple[int, int], ObjectPort] = {}
+        parameters = {field.name for field in device.firmware.layout.parameters}
+        self._states = {key for key, binding in device.bindings.items() if binding.field not in parameters}
 
     def port(self, index: int, sub: int) -> ObjectPort:
         """Return the way to an object.
@@ -59,7 +63,7 @@ class NodeDictionary:
         """Return the section of the store that a parameter belongs to; None of what is no parameter.
 
         What a receive PDO can carry is a command or a set-point: a drive that found an old one after power-on would
-        act on it.
+        act on it. Nor is it one what the firmware itself sets: a counter, or a latch that is armed.
         """
         roles = self._device.canopen.objects
         if (entry.index, entry.sub) in (roles.get("bit_rate"), roles.get("node_id")):
@@ -69,13 +73,15 @@ class NodeDictionary:
         stores_mapped = self._device.canopen.quirks.stores_mapped
         if entry.pdo_mappable and not (stores_mapped and not self._commands(entry.index)):
             return None
-        if entry.access != "rw" or entry.bits is None or is_command:
+        if entry.access not in WRITTEN or entry.bits is None or is_command:
             return None
         if 0x1000 <= entry.index <= 0x1FFF:
             return "communication"
         if self._device.is_shared(entry.index):
             return "module"
         axis, base = self._device.locate(entry.index)
+        if (base, entry.sub) in self._states:
+            return None
         return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
 
     def _commands(self, index: int) -> bool:

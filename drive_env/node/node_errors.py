@@ -17,7 +17,7 @@ from drive_env.node.error_history import CONDITIONS, OPTIONAL_CONDITIONS, ErrorC
 from drive_env.node.node_objects import ERROR_HISTORY, ERROR_REGISTER, NodeObjects
 
 FAULT_RESET = 0  # row of the firmware's causes
-NETWORK_LOST = ("communication_error", "heartbeat_lost")  # conditions that take axes into fault
+NETWORK_LOST = ("communication_error", "heartbeat_lost")  # conditions that may take axes into fault
 
 
 class EmergencySink(Protocol):
@@ -93,7 +93,8 @@ class NodeErrors:
             if axis is not without:
                 register |= self._of_axis(number, axis.error_register)
         for condition in self.conditions.values():
-            register |= condition.error_register
+            last = len(self._axes) - 1 if self._is_of_axes(condition.name) else 0
+            register |= self._of_axis(last, condition.error_register)
         return register
 
     def _of_axis(self, number: int, register: int) -> int:
@@ -102,20 +103,25 @@ class NodeErrors:
         return register | bit if number and register else register
 
     def condition(self, name: str, now: float, key: Hashable = None) -> None:
-        """Tell of a condition of the bus at `now` [s], unless it is known already; `key` says whose it is."""
+        """Tell of a condition of the bus at `now` [s], unless it is known already; `key` says whose it is.
+
+        CiA 301: 1003h notes what the emergencies tell.
+        """
         condition = CONDITIONS.get(name) or OPTIONAL_CONDITIONS[name]
         key = name if key is None else key
         if self.conditions.get(key) is condition:
             return
         if condition.lasts:
             self.conditions[key] = condition
-        emergency = self._device.emergencies[name].of_axis(0)
-        self._told_last = 0
-        self._sink.push(emergency, self.register() | condition.error_register)
-        if name in NETWORK_LOST and self._device.canopen.quirks.history_tells_number:
-            self._note_lost_network()
-        else:
-            self.history.add(emergency.code, 0, self._number_of(emergency))
+        told, axes = name, 1
+        if self._is_of_axes(name):
+            firmware = self._device.firmware
+            told, axes = firmware.causes[firmware.communication_lost].name, len(self._axes)
+        for axis in range(axes):
+            emergency = self._device.emergencies[told].of_axis(axis)
+            self._told_last = axis
+            self._sink.push(emergency, self.register() | condition.error_register)
+            self.history.add(emergency.code, axis, self._number_of(emergency))
         self._flush(now)
 
     def condition_if_known(self, name: str, now: float) -> None:
@@ -148,13 +154,9 @@ class NodeErrors:
             self._flush(now)
             self._react()
 
-    def _note_lost_network(self) -> None:
-        """Note the error that each axis has of it, where the history has the device's own number of errors."""
-        firmware = self._device.firmware
-        cause = firmware.causes[firmware.communication_lost].name
-        for axis in range(len(self._axes)):
-            emergency = self._device.emergencies[cause].of_axis(axis)
-            self.history.add(emergency.code, axis, self._number_of(emergency))
+    def _is_of_axes(self, name: str) -> bool:
+        """Return whether a lost network is an error of each axis: the device's table has none of the node for it."""
+        return name in NETWORK_LOST and name not in self._device.emergencies
 
     def _number_of(self, emergency: EmergencyCode) -> int:
         """Return the device's own number of an error, as 1003h has it."""

@@ -1,0 +1,288 @@
+"""SDO of every CAN device of ours, each object of its EDS (CiA 301, 7.2.4); can_devices.py has the facts."""
+
+from __future__ import annotations
+
+import pytest
+from can_devices import (
+    DEVICES,
+    EACH_AXIS,
+    EACH_DEVICE,
+    NODE,
+    PROFILE,
+    PROFILE_VELOCITY,
+    STATUSWORD,
+    TARGET_VELOCITY,
+    VELOCITY,
+    another,
+    enable,
+    fresh,
+    read,
+    request,
+    upload,
+    write,
+)
+
+READ_ONLY, WRITE_ONLY, NO_OBJECT, NO_SUB_INDEX = 0x0601_0002, 0x0601_0001, 0x0602_0000, 0x0609_0011
+TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x0607_0012, 0x0607_0013, 0x0609_0031, 0x0609_0032
+NO_DATA = 0x0800_0024
+HISTORY = 0x1003
+TEXT = pytest.mark.parametrize(
+    "facts",
+    [pytest.param(facts, id=repr(facts), marks=[] if facts.text() else pytest.mark.skip(
+        reason=f"{facts} has no text of more than four letters, and nothing else takes segments to be read"))
+     for facts in DEVICES],
+)  # fmt: skip
+
+
+@pytest.fixture
+def wire(emulated, facts):
+    """Node 5, pre-operational."""
+    return fresh(emulated(facts.name))
+
+
+def pairs(code):
+    """Return an abort code as a transcript has it."""
+    return code.to_bytes(4, "little").hex(" ").upper()
+
+
+# --- what there is ----------------------------------------------------------------------------------------------------
+@EACH_DEVICE
+def test_every_object_is_read_with_the_length_of_its_type(wire, facts):
+    for entry in facts.entries.values():
+        data = upload(wire, entry.index, entry.sub)
+        if entry.access == "wo":
+            assert data == WRITE_ONLY, entry.label
+        elif entry.index == HISTORY and entry.sub > 0:
+            assert data == NO_DATA, "no error yet"
+        elif entry.bits is None:
+            assert isinstance(data, bytes), entry.label
+        else:
+            assert isinstance(data, bytes) and len(data) == entry.size, entry.label
+
+
+@EACH_DEVICE
+def test_what_communication_has_is_the_factory_s(wire, facts):
+    for entry in facts.entries.values():
+        if 0x1000 <= entry.index < 0x2000 and (entry.index != HISTORY or entry.sub == 0):
+            known = entry.default.encode() if entry.bits is None else facts.default(entry.index, entry.sub)
+            if (entry.index, entry.sub) == (0x1018, 4):
+                continue  # the serial number, which each node has of its own
+            found = upload(wire, entry.index, entry.sub)
+            assert found == known or read(wire, facts, entry.index, entry.sub) == known, entry.label
+
+
+@EACH_DEVICE
+def test_an_object_that_does_not_exist_and_a_sub_index_that_does_not(wire, facts):
+    indices = {index for index, _ in facts.entries}
+    for index in sorted(indices):
+        subs = facts.subs(index)
+        for sub in {max(subs) + 1, 0xFF, *range(max(subs))} - set(subs):
+            answers = upload(wire, index, sub), wire.download(index, sub, 0, 4)
+            assert answers == (NO_SUB_INDEX, NO_SUB_INDEX), f"{index:04X}h:{sub:02X}"
+    beside = {index + step for index in indices for step in (-1, 1)}
+    for index in {0, 0x1FFF, 0x5FFE, 0xFFFF, *beside} - indices:
+        assert upload(wire, index) == wire.download(index, 0, 0, 4) == NO_OBJECT, f"{index:04X}h"
+    beyond = PROFILE * len(facts.axes)
+    assert upload(wire, STATUSWORD + beyond) == NO_OBJECT, "an axis more than it has"
+
+
+@EACH_DEVICE
+def test_what_can_only_be_read_refuses_every_write(wire, facts):
+    for entry in facts.entries.values():
+        if entry.access in ("ro", "const"):
+            before = upload(wire, entry.index, entry.sub)
+            for size in (1, 4):
+                assert wire.download(entry.index, entry.sub, 0, size) == READ_ONLY, entry.label
+            assert entry.mappable or upload(wire, entry.index, entry.sub) == before
+
+
+@EACH_DEVICE
+def test_a_write_of_another_length_is_refused(wire, facts):
+    for entry in facts.entries.values():
+        if entry.is_written and entry.bits is not None:
+            for size in {1, 4, entry.size % 4 + 1} - {entry.size}:
+                code = TOO_LONG if size > entry.size else TOO_SHORT
+                assert wire.download(entry.index, entry.sub, 0, size) == code, entry.label
+
+
+@EACH_DEVICE
+def test_a_value_beyond_the_limits_of_the_eds_is_refused(wire, facts):
+    found = 0
+    for entry in facts.entries.values():
+        if not entry.is_written or entry.bits is None or entry.index in facts.manual.refuses:
+            continue
+        for limit, step, code in ((entry.high, 1, TOO_HIGH), (entry.low, -1, TOO_LOW)):
+            if limit is not None and limit + step in entry.room:
+                before = read(wire, facts, entry.index, entry.sub)
+                assert write(wire, facts, entry.index, limit + step, entry.sub) == code, entry.label
+                assert read(wire, facts, entry.index, entry.sub) == before
+                found += 1
+    assert found > 5
+
+
+@EACH_DEVICE
+def test_what_the_documents_say_is_refused_is_refused_whatever_is_written(wire, facts):
+    for entry in facts.entries.values():
+        if entry.index in facts.manual.refuses and entry.is_written and entry.bits is not None:
+            assert write(wire, facts, entry.index, facts.default(*entry.key), entry.sub) == 0x0800_0020, entry.label
+
+
+# --- axes -------------------------------------------------------------------------------------------------------------
+@EACH_AXIS
+def test_a_write_reaches_its_axis_alone(wire, facts, axis):
+    """Each parameter of the profile that an axis has: all the axes are read before and after."""
+    index = PROFILE_VELOCITY + PROFILE * axis
+    before = [read(wire, facts, PROFILE_VELOCITY + PROFILE * one) for one in facts.axes]
+    wire.play(f"""
+        rx 605  23 {request(index, 0)} 39 30 00 00
+        tx 585  60 {request(index, 0)} 00 00 00 00
+        rx 605  40 {request(index, 0)} 00 00 00 00
+        tx 585  43 {request(index, 0)} 39 30 00 00
+    """)
+    after = [read(wire, facts, PROFILE_VELOCITY + PROFILE * one) for one in facts.axes]
+    assert after == [12345 if one == axis else before[one] for one in facts.axes]
+
+
+@pytest.mark.parametrize("facts", [facts for facts in DEVICES if len(facts.axes) > 1], ids=repr)
+def test_every_parameter_of_an_axis_is_its_own(wire, facts):
+    """Of axis 0 each is changed; those of the others stay, but for what the manual says they share."""
+    for first, last, step in facts.manual.areas:
+        for entry in [e for e in facts.entries.values() if first <= e.index <= last and facts.axis_of(e.index) == 0]:
+            if not entry.is_written or entry.bits is None or entry.index in facts.manual.shared:
+                continue
+            places = [(entry.index + step * axis, entry.sub) for axis in facts.axes]
+            assert all(facts.has(*place) for place in places), entry.label
+            before = [read(wire, facts, *place) for place in places]
+            if another(wire, facts, entry, before[0]) is None:
+                continue  # a command, or it takes the value alone that it has
+            after = [read(wire, facts, *place) for place in places]
+            assert after[1:] == before[1:], entry.label
+
+
+@EACH_DEVICE
+def test_every_object_of_an_axis_reads_as_the_drives_have_it_while_they_move(wire, facts):
+    enable(wire, facts)
+    for axis in facts.axes:
+        speed = facts.manual.speed * (axis + 1) // len(facts.axes)
+        assert write(wire, facts, TARGET_VELOCITY + PROFILE * axis, speed) == 0
+    wire.wait(100)
+    wire.take()
+    seen = set()
+    of_node = {*facts.manual.bus, *(index for index, _ in facts.manual.address or ())}
+    for first, last, step in facts.manual.areas or ((0x2000, 0x67FF, 0x4800),):
+        for entry in facts.entries.values():
+            if not first <= entry.index <= last or entry.bits is None or entry.index in of_node:
+                continue
+            known = wire.drives.read(entry.key)
+            for axis in facts.axes:
+                value = wire.value(entry.index + step * axis, entry.sub)
+                assert value == known[axis], f"{entry.label} of axis {axis}"
+                seen.add((entry.index, axis, value))
+    speeds = [value for index, _, value in sorted(seen) if index == VELOCITY]
+    assert speeds == sorted(set(speeds)) and speeds[0] > 0, "each moves, and at its own speed"
+
+
+# --- segments ---------------------------------------------------------------------------------------------------------
+@EACH_AXIS
+@pytest.mark.parametrize("size", ["04 00 00 00", "00 00 00 00"], ids=["size", "no size"])
+def test_a_number_comes_in_segments(wire, facts, axis, size):
+    where = request(PROFILE_VELOCITY + PROFILE * axis, 0)
+    wire.play(f"""
+        rx 605  2{int(size[:2] != "00")} {where} {size}
+        tx 585  60 {where} 00 00 00 00
+        rx 605  0C 39 00 00 00 00 00 00   # one byte
+        tx 585  20 00 00 00 00 00 00 00
+        rx 605  19 30 00 00 00 00 00 00   # three: the last
+        tx 585  30 00 00 00 00 00 00 00
+        rx 605  40 {where} 00 00 00 00
+        tx 585  43 {where} 39 30 00 00
+    """)
+
+
+@EACH_AXIS
+@pytest.mark.parametrize(
+    ("segment", "code"),
+    [
+        ("00 01 02 03 04 05 06 07", TOO_LONG),  # more than the object has, and more to come
+        ("0B 01 02 00 00 00 00 00", TOO_SHORT),  # the last, with two bytes
+        ("17 01 02 03 04 00 00 00", 0x0503_0000),  # toggle
+        ("60 00 00 00 00 00 00 00", 0x0504_0001),  # of an upload
+    ],
+)
+def test_a_wrong_segment_ends_the_download(wire, facts, axis, segment, code):
+    index = PROFILE_VELOCITY + PROFILE * axis
+    before, where = read(wire, facts, index), request(index, 0)
+    wire.play(f"""
+        rx 605  21 {where} 04 00 00 00
+        tx 585  60 {where} 00 00 00 00
+        rx 605  {segment}
+        tx 585  80 {where} {pairs(code)}
+        rx 605  07 78 56 34 12 00 00 00   # it is over
+        tx 585  80 00 00 00 01 00 04 05
+    """)
+    assert read(wire, facts, index) == before
+
+
+@TEXT
+def test_a_text_is_read_in_segments(wire, facts):
+    text = facts.text()
+    where, letters = request(*text.key), text.default.encode()
+    first, rest = letters[:7].hex(" ").upper(), letters[7:]
+    wire.play(f"""
+        rx 605  40 {where} 00 00 00 00
+        tx 585  41 {where} {len(letters):02X} 00 00 00
+        rx 605  60 00 00 00 00 00 00 00
+        tx 585  00 {first}
+        rx 605  60 00 00 00 00 00 00 00   # the same toggle again
+        tx 585  80 {where} 00 00 03 05
+        rx 605  40 {where} 00 00 00 00
+        tx 585  41 {where} {len(letters):02X} 00 00 00
+        rx 605  60 00 00 00 00 00 00 00
+        tx 585  00 {first}
+        rx 605  70 00 00 00 00 00 00 00
+        tx 585  {0x11 | (7 - len(rest)) << 1:02X} {rest.ljust(7, bytes(1)).hex(" ").upper()}
+        rx 605  40 {where} 00 00 00 00
+        tx 585  41 {where} {len(letters):02X} 00 00 00
+        rx 605  80 {where} 00 00 00 08   # the client aborts
+        rx 605  60 00 00 00 00 00 00 00
+        tx 585  80 00 00 00 01 00 04 05
+    """)
+
+
+@EACH_DEVICE
+@pytest.mark.parametrize("specifier", ["A0", "A4", "C2", "C6", "E0"])
+def test_a_block_transfer_is_refused(wire, facts, specifier):
+    """None of the manuals has it."""
+    where = request(PROFILE_VELOCITY, 0)
+    wire.play(f"rx 605  {specifier} {where} 04 00 00 00\ntx 585  80 {where} 01 00 04 05")
+
+
+@EACH_DEVICE
+def test_a_transfer_is_replaced_given_up_and_ended_by_stopped(wire, facts):
+    where, status = request(PROFILE_VELOCITY, 0), request(STATUSWORD, 0)
+    before = read(wire, facts, PROFILE_VELOCITY)
+    wire.play(f"""
+        rx 605  21 {where} 04 00 00 00
+        tx 585  60 {where} 00 00 00 00
+        rx 605  40 {status} 00 00 00 00   # something else in between
+        tx 585  4B {status} .. .. 00 00
+        rx 605  07 01 00 00 00 00 00 00   # the download is no more
+        tx 585  80 00 00 00 01 00 04 05
+        rx 605  21 {where} 04 00 00 00
+        tx 585  60 {where} 00 00 00 00
+        rx 000  02 05                     # stopped
+        rx 605  40 {status} 00 00 00 00
+        rx 000  80 05
+        rx 605  07 01 00 00 00 00 00 00
+        tx 585  80 00 00 00 01 00 04 05
+        rx 605  21 {where} 04 00 00 00
+        tx 585  60 {where} 00 00 00 00
+        wait 999 ms
+        wait 1 ms
+        tx 585  80 {where} 00 00 04 05    # the client was silent for a second
+        rx 606  40 {status} 00 00 00 00   # another node's
+        rx 605  40 {status[:8]}           # no request: it is too short
+        rx 605  RTR
+    """)
+    assert read(wire, facts, PROFILE_VELOCITY) == before
+    assert wire.node.node_id == NODE
