@@ -2,8 +2,8 @@
 
 The rule is a peer: its gains make the same trial and the same move as those found, and it is looked whether the axes
 stand with them. What was found is kept only where it is better on the drives and on the twins, or where the rule's
-gains fail what is asked of any. Axes of one machine are judged as a whole; of linked ones, whose coupling no twin has, what
-was found is never better.
+gains fail what is asked of any. Axes of one machine are judged as a whole; of linked ones, whose coupling no twin has,
+what was found is never better.
 """
 
 from __future__ import annotations
@@ -195,8 +195,8 @@ def _figures(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mas
     assert recorded.rule is not None, "it was tried"
     twin = np.full((2, bench.target.num_axes), np.nan)
     if bench.target.linked:
-        # A trial alone misleads: on a gantry it had 2.4 and 2.7 for what was found and 3.0 and 3.2 for the rule's, where
-        # the robust cost was 1.30 and 1.03.
+        # A trial alone misleads: on a gantry it had 2.4 and 2.7 for what was found and 3.0 and 3.2 for the rule's,
+        # where the robust cost was 1.30 and 1.03.
         twin[1] = np.inf
     known = where & np.isfinite(recorded.cost) & ~np.array(basis.identified.doubtful) & (not bench.target.linked)
     # Twins take longer than an enabled axis may be left alone where time does not wait.
