@@ -450,7 +450,7 @@ def test_what_a_ready_made_image_has_can_be_recorded_whatever_the_eds_says(tgz):
     assert not tgz.dictionary.find(0x3325).pdo_mappable
     data.check_sampled([tgz.dictionary.find(0x3325)])
     with pytest.raises(ObjectAccessError, match="cannot be recorded: it is no process data"):
-        data.check_sampled([tgz.dictionary.find(0x6098)])
+        data.check_sampled([tgz.dictionary.find((0x1018, 1))])
 
 
 def test_what_is_welcome_comes_where_the_image_has_it(data, one):
