@@ -10,19 +10,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from small_eds import I8, I16, I32, U8, U16, U32, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.dictionary.drive_eds import read_types
-from drive_env.dictionary.entries import EdsText, ObjectDictionary
-from drive_env.master.description import CIA_402, Description, describe
+from drive_env.master.description import describe
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.ethercat import image_data
 from drive_env.master.ethercat.ethercat_master import ImageSizes
 from drive_env.master.ethercat.image_data import EtherCatProcessData
-from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImageLayout, ImagePlanner, changed
+from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImagePlanner, changed
 from drive_env.master.ethercat.slave_images import SlaveImages
 
-U8, U16, U32, I8, I16, I32, I64 = 0x05, 0x06, 0x07, 0x02, 0x03, 0x04, 0x15
 ROWS = [
     (0x6040, "Controlword", U16, "rww", 1), (0x6041, "Statusword", U16, "ro", 1), (0x6060, "Mode", I8, "rww", 1),
     (0x6061, "Mode display", I8, "ro", 0), (0x6064, "Position", I32, "ro", 1), (0x606C, "Velocity", I32, "ro", 1),
@@ -31,31 +29,13 @@ ROWS = [
     (0x6081, "Limit", U32, "const", 1),
 ]  # fmt: skip
 NODE_ROWS = [(0x2001, "Temperature", I16, "ro", 1), (0x2002, "Lamp", U8, "rww", 1)]
-PDOS = {0x1600: ("rw", 5), 0x1602: ("const", 2), 0x1A00: ("rw", 5), 0x1A02: ("ro", 2)}
-
-
-def eds_text():
-    """An EDS of these rows."""
-    items = [(index, name, kind, access, pdo) for index, name, kind, access, pdo in ROWS]
-    items += [(index + 0x800, f"{name} 2", kind, access, pdo) for index, name, kind, access, pdo in ROWS]
-    items += NODE_ROWS
-    lines = ["[DeviceInfo]", "VendorName=Test", "[OptionalObjects]", f"SupportedObjects={len(items) + len(PDOS)}"]
-    lines += [f"{k}=0x{index:04X}" for k, index in enumerate([*(one[0] for one in items), *PDOS], 1)]
-    for index, name, kind, access, pdo in items:
-        lines += [f"[{index:04X}]", f"ParameterName={name}", "ObjectType=7", f"DataType=0x{kind:04X}",
-                  f"AccessType={access}", f"PDOMapping={pdo}"]  # fmt: skip
-    for index, (access, count) in PDOS.items():
-        lines += [f"[{index:04X}]", f"ParameterName=PDO {index:X}", "ObjectType=9", f"SubNumber={count + 1}"]
-        for sub in range(count + 1):
-            lines += [f"[{index:04X}sub{sub}]", f"ParameterName=Entry {sub} of {index:X}", "ObjectType=7",
-                      f"DataType=0x{U32 if sub else U8:04X}", f"AccessType={access}", "PDOMapping=0"]  # fmt: skip
-    return EdsText("two.eds", "\n".join(lines) + "\n")
+PDOS = [(0x1600, "rw", 5, None), (0x1602, "const", 2, None), (0x1A00, "rw", 5, None), (0x1A02, "ro", 2, None)]
 
 
 @pytest.fixture(scope="module")
 def drive():
-    eds = eds_text()
-    return Description("two", ObjectDictionary(eds), 2, None, CIA_402, timeout=0.5, _types=read_types(eds))
+    further = [(index + 0x800, f"{name} 2", *rest) for index, name, *rest in ROWS]
+    return described(small_eds([*ROWS, *further, *NODE_ROWS], PDOS), 2)
 
 
 @pytest.fixture(scope="module")
@@ -371,6 +351,7 @@ def lockstep(drive):
 
 
 def test_images_begin_with_what_the_slaves_have(bench, data):
+    assert (data.mapping, data.owed, data.exchanged_at, data.is_silent) == (0, 0, 0.0, False)
     assert data.missing == [0, 1] and data.num_axes == 4 and not data.has((0x6040, 0))
     assert data.sampled_entries() == () and data.samples() is None
     assert data.put(0, (0x6040, 0), b"\x0f\0") is None, "there are no images yet"
@@ -540,7 +521,8 @@ def test_an_exchange_is_a_row_where_all_images_come_back(bench, data, monkeypatc
     assert data.exchange(is_cycle=False, timeout=0.5) and data.exchanged_at == 13.5
     assert samples.complete() == 1 and samples.rows == [ROW]
     assert bench.master.sent == [([b"\6\0\7\0"] * 2, 0.02)] * 2 + [([b"\6\0\7\0"] * 2, 0.5)]
-    other = data.samples()
+    other, empty = data.samples(), data.samples()
+    empty.close()
     samples.close()
     assert data.exchange(is_cycle=True) and (samples.complete(), other.complete()) == (1, 1)
     data.is_silent = True
