@@ -394,8 +394,10 @@ def test_a_map_goes_by_pre_op_and_back_to_op(bench, data, one):
                                    ("operate", NODES, 5.0)]  # fmt: skip
     assert data.mapping == 2 and data.missing == [] and data.sampled_entries() == one(0x6077, 0x6041)
     assert data.exchanged_at > 0.0
+    samples, bench.master.rows = data.samples(), [[bytes(8)] * 2]
     bench.master.meanwhile()
     assert len(bench.master.sent) == 1, "images are exchanged while Op is waited for"
+    assert samples.complete() == 0, "and are nobody's sample"
 
 
 def test_images_are_not_changed_while_an_axis_is_enabled(bench, data, one):

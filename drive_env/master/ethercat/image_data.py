@@ -281,11 +281,11 @@ class EtherCatProcessData:
             found = self._master.exchange([bytes(image) for image in self.images], timeout)
             if self.phase is not None and self._master.system_time is not None:
                 self.phase.take(self._master.system_time)
-            row = [image + more for image, more in zip(found, beside, strict=True) if image is not None]
-            if len(row) < len(self._nodes):
+            if None in found:
                 return False
             self.exchanged_at = time.monotonic()
             if is_cycle:
+                row = [(image or b"") + more for image, more in zip(found, beside, strict=True)]
                 for taker in self.takers:
                     taker.append(row)
             return True
