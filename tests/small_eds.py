@@ -14,7 +14,8 @@ def small_eds(objects, arrays):
 
     Args:
         objects: Index, name, type, access, whether a PDO can carry it.
-        arrays: Index, access and number of entries (UNSIGNED32) of records; and the most that sub-index 0 takes, or None.
+        arrays: Index, access and number of entries (UNSIGNED32) of records, and the most that sub-index 0 takes, or None.
+            An access "rw/ro" is that of sub-index 0 and of the entries.
     """
     lines = ["[DeviceInfo]", "VendorName=Test", "[OptionalObjects]", f"SupportedObjects={len(objects) + len(arrays)}"]
     lines += [f"{k}=0x{one[0]:04X}" for k, one in enumerate((*objects, *arrays), 1)]
@@ -24,7 +25,7 @@ def small_eds(objects, arrays):
         lines += [f"[{index:04X}]", f"ParameterName=Record {index:X}", "ObjectType=9", f"SubNumber={count + 1}"]
         for sub in range(count + 1):
             lines += [f"[{index:04X}sub{sub:X}]", f"ParameterName=Entry {sub} of {index:X}"]
-            lines += _variable(U32 if sub else U8, access, 0)
+            lines += _variable(U32 if sub else U8, access.split("/")[-1 if sub else 0], 0)
             lines += [f"HighLimit={most}"] if most and not sub else []
     return EdsText("small.eds", "\n".join(lines) + "\n")
 

@@ -29,7 +29,7 @@ ROWS = [
     (0x6081, "Limit", U32, "const", 1),
 ]  # fmt: skip
 NODE_ROWS = [(0x2001, "Temperature", I16, "ro", 1), (0x2002, "Lamp", U8, "rww", 1)]
-PDOS = [(0x1600, "rw", 5, None), (0x1602, "const", 2, None), (0x1A00, "rw", 5, None), (0x1A02, "ro", 2, None)]
+PDOS = [(0x1600, "rw", 5, None), (0x1602, "const", 2, None), (0x1A00, "rw", 5, None), (0x1A02, "rw/ro", 2, None)]
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +175,7 @@ def test_where_the_eds_does_not_list_entries_there_are_eight(planner, one):
 
 
 def test_directions_that_differ(planner, one):
+    assert (OUTPUTS, INPUTS) == (0x1C12, 0x1C13)
     first, second = planner.free(0x1600, one(0x6040)), planner.free(0x1A00, one(0x6041))
     assert changed({}, {OUTPUTS: first}) == [OUTPUTS]
     assert changed({OUTPUTS: first, INPUTS: first}, {OUTPUTS: first, INPUTS: second}) == [INPUTS]
