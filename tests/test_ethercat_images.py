@@ -168,6 +168,8 @@ def test_what_is_too_much_for_one_image_is_told(planner, one):
 
 def test_where_the_eds_does_not_list_entries_there_are_eight(planner, one):
     assert planner._room(0x1601) == 8 and planner._room(0x1A00) == 5
+    everything = ImagePlanner(described(small_eds(ROWS, [(0x1A00, "rw", 255, None)]), 1))
+    assert everything._room(0x1A00) == 254, "255 is none"
     empty = planner.free(0x1A03, ())
     assert planner.completed(INPUTS, empty).entries == one(0x6041, 0x6064, 0x606C)
     with pytest.raises(ObjectAccessError, match="more than the 8"):
@@ -199,6 +201,8 @@ def test_ready_made_images_are_those_of_the_device_s_data(tgz, tgz_planner):
     find = tgz.dictionary.find
     places = layout.places(tgz)
     assert places[0x607A, 0] == (0, 4) and places[0x6040, 0] == (12, 2) and places[0x6840, 0] == (32, 2)
+    start, size = places[0x6840, 0]
+    assert bytes(range(40))[start : start + size] == bytes((32, 33))
     assert tgz_planner.completed(OUTPUTS, layout) is layout
     assert find(0x607A) in tgz_planner.carried(OUTPUTS) and find(0x607A) not in tgz_planner.carried(INPUTS)
     assert find(0x6064) in tgz_planner.carried(INPUTS)
