@@ -178,6 +178,33 @@ def test_lengths_of_segments_are_held_against_the_object_and_what_was_announced(
     """)
 
 
+def test_a_text_of_three_segments_is_written():
+    objects = Objects(0, ROOM)
+    objects.play("""
+        21 03 20 00 10 00 00 00 -> 60 03 20 00 00 00 00 00
+        00 41 42 43 44 45 46 47 -> 20 00 00 00 00 00 00 00
+        10 48 49 4A 4B 4C 4D 4E -> 30 00 00 00 00 00 00 00
+        0B 4F 50 00 00 00 00 00 -> 20 00 00 00 00 00 00 00
+    """)
+    assert objects.values[0x2003] == "ABCDEFGHIJKLMNOP"
+
+
+def test_more_than_an_object_has_room_for_is_refused_before_the_last_segment(objects):
+    objects.play("""
+        20 02 20 00 00 00 00 00 -> 60 02 20 00 00 00 00 00
+        00 01 02 03 04 05 06 07 -> 20 00 00 00 00 00 00 00
+        10 01 02 03 04 05 06 07 -> 80 02 20 00 12 00 07 06
+    """)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_segment_that_comes_first_of_all_is_none_of_a_transfer(closed):
+    for made in (Objects(), Objects(BLOCK, ROOM)):
+        if closed:
+            made.server.close()
+        made.play("00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05")
+
+
 def test_segments_of_the_other_direction_are_none_of_the_open_transfer(objects):
     objects.play("""
         40 03 20 00 00 00 00 00 -> 41 03 20 00 0F 00 00 00
