@@ -400,6 +400,34 @@ def test_segments_on_their_way_when_a_block_was_aborted_are_no_requests(blocks):
     assert blocks.values[0x2000] == 0x2A
 
 
+ABORTED_BLOCK = """
+    C0 00 20 00 00 00 00 00 -> A4 00 20 00 04 00 00 00
+    01 41 42 43 44 45 46 47 -> --
+    02 41 42 43 44 45 46 47 -> 80 00 20 00 05 00 04 05
+"""
+
+
+@pytest.mark.parametrize("after", [
+    "2F 00 20 00 2A 00 00 00 -> 60 00 20 00 00 00 00 00",  # no segment in turn
+    "83 00 20 00 2A 00 00 00 -> --",  # the last segment
+    "80 00 00 00 00 00 00 08 -> --",  # an abort
+    "04 00 20 00 2A 00 00 00 -> 80 00 00 00 01 00 04 05",  # one was lost: the fourth is none in turn
+])  # fmt: skip
+def test_what_follows_an_aborted_block_out_of_turn_ends_its_segments(blocks, after):
+    blocks.play(ABORTED_BLOCK)
+    blocks.play(after)
+    blocks.play("""
+        04 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05
+        00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05
+        40 00 20 00 00 00 00 00 -> 4F 00 20 00 %s 00 00 00
+    """ % ("2A" if after[:2] == "2F" else "07"))
+
+
+def test_a_threshold_of_0_is_none(blocks):
+    blocks.values[0x2003] = ""
+    blocks.play("A4 03 20 00 04 00 00 00 -> C6 03 20 00 00 00 00 00")
+
+
 def test_another_request_ends_a_block(blocks):
     blocks.play("""
         A4 03 20 00 02 00 00 00 -> C6 03 20 00 0F 00 00 00

@@ -250,7 +250,7 @@ class SdoServer:
         Its first byte might be that of a write, and its data name an object.
         """
         number = data[0] & 0x7F
-        if number != self._leftover + 1 or data[0] == ABORTED:
+        if number != self._leftover + 1:
             self._leftover = 0
             return False
         self._leftover = 0 if data[0] & 0x80 or number >= self._block_size else number
