@@ -192,3 +192,12 @@ def test_a_register_of_the_device_says_with_which_ready_made_image_it_begins(tgz
     tgz.values[0x25C0, 0], tgz.values[0x25C1, 0] = 0x1702, 0x1B21
     tgz.objects.restart()
     assert tgz.objects.mapped(OUTPUTS) == [(0x1702, [])] and tgz.objects.mapped(INPUTS) == [(0x1B21, [])]
+
+
+def test_an_image_that_the_register_names_and_that_is_none_cannot_be_used(tgz):
+    tgz.values[0x25C0, 0] = 0x1FFF
+    tgz.objects.restart()
+    assert tgz.objects.output_size == 0 and tgz.objects.mapped(OUTPUTS) == [(0x1FFF, [])]
+    tgz.write(0x1C12, 0, 0)
+    with refused("06090030", "1C12h:00 .* cannot be 1FFFh; there is 1701h"):
+        tgz.write(0x1C12, 0, 1)

@@ -141,6 +141,12 @@ def test_when_nothing_is_left_the_end_is_told_of_the_axis_that_was_told_last(nod
     assert node.sink.take() == [], "once"
 
 
+def test_who_was_told_by_a_message_before_is_told_the_end_of_the_first_axis(node):
+    node.sink.told = 0x11
+    node.errors.collect(1.0)
+    assert node.sink.take() == [(0, (0, 0), 0)]
+
+
 def test_what_the_whole_module_has_is_told_once_in_a_cycle(node):
     for axis in (1, 2, 5):
         node.queue(axis, "shutdown_switch", 0x21)
