@@ -423,6 +423,25 @@ def test_what_follows_an_aborted_block_out_of_turn_ends_its_segments(blocks, aft
     """ % ("2A" if after[:2] == "2F" else "07"))
 
 
+@pytest.mark.parametrize("transcript", [
+    """
+    C4 03 20 00 00 00 00 00 -> A4 03 20 00 04 00 00 00
+    05 41 42 43 44 45 46 47 -> 80 03 20 00 03 00 04 05
+    """, """
+    C4 03 20 00 00 00 00 00 -> A4 03 20 00 04 00 00 00
+    01 41 42 43 44 45 46 47 -> --
+    04 41 42 43 44 45 46 47 -> A2 01 04 00 00 00 00 00
+    05 41 42 43 44 45 46 47 -> 80 03 20 00 03 00 04 05
+    """, """
+    A4 03 20 00 04 00 00 00 -> C6 03 20 00 0F 00 00 00
+    A2 01 04 00 00 00 00 00 -> 80 03 20 00 01 00 04 05
+    """,
+], ids=["at once", "after a sub-block", "an upload"])  # fmt: skip
+def test_nothing_follows_a_block_of_which_no_segment_is_on_its_way(blocks, transcript):
+    blocks.play(transcript)
+    blocks.play("00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05")
+
+
 def test_a_threshold_of_0_is_none(blocks):
     blocks.values[0x2003] = ""
     blocks.play("A4 03 20 00 04 00 00 00 -> C6 03 20 00 00 00 00 00")
