@@ -306,3 +306,12 @@ def test_a_look_takes_all_that_waits(clock):
     mailbox = Mailbox([emergency(0x11, 0x86, 0x20), answer(IS_1234, 1), emergency(0, 0, 0, 9)])
     mailbox.client.look(0.0)
     assert list(mailbox.client.emergencies) == [(0x8611, 0x20, ()), (0, 0, (9,))] and mailbox.reads == []
+
+
+def test_a_read_of_three_segments():
+    slave = Slave(
+        f"41 {KEY.hex()} 3f 00 00 00 {numbers(0, 16)}",  # 63 bytes
+        f"00 {numbers(16, 23)}", f"10 {numbers(39, 23)}", f"0d {numbers(62, 1)} 00 00 00 00 00 00",
+    )  # fmt: skip
+    assert slave.client.upload(0x2005, 1, 1.0) == bytes(range(63))
+    assert slave.asked[1:] == ["60" + " 00" * 7, "70" + " 00" * 7, "60" + " 00" * 7]
