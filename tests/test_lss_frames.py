@@ -40,6 +40,7 @@ class Bus:
     def wait(self, done, timeout):
         self.waits.append(timeout)
         if done():
+            assert timeout != 0.005, "what comes late is waited for, whatever came"
             return True
         found = self.answer(self.last)
         if found is not None:
