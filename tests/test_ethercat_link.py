@@ -436,13 +436,17 @@ class Registers:
         self.late, self.now, self.writes, self.found = late, now, [], {}
 
     def register(self, position, address, size):
+        found = self._register(position, address)
+        return None if found is None else found[:size]
+
+    def _register(self, position, address):
         if (position, address) in self.found:
             return self.found[position, address]
         if address == 0x0910:
-            return (self.now % (1 << 64)).to_bytes(8, "little")
+            return (self.now % (1 << 64)).to_bytes(8, "little") + b"\xff"
         if address == 0x0984:
             self.late -= position == 5
-            return b"\xfb" if self.late < 0 or position != 5 else b"\x04"
+            return b"\xfb\xff" if self.late < 0 or position != 5 else b"\x04\xff"
         return None
 
     def write_register(self, position, address, data):
@@ -500,13 +504,18 @@ def test_clocks_of_slaves_that_do_not_answer_are_told():
 def test_offsets_by_the_times_at_which_a_frame_came():
     """The first slave's local time is 100 when the frame is there, the second's 1000; it is 25 ns from one to the other."""
     found = Registers()
-    row = lambda forth, back, unit: b"".join(v.to_bytes(4, "little") for v in (forth, back, 9, 9, 9, 9)) + unit.to_bytes(8, "little")
-    found.found = {(0, 0x0900): row(100, 160, 100), (1, 0x0900): row(1000, 1010, 1000), (2, 0x0900): row(7, 99, 7)}
+    far = 1 << 56  # the eighth byte of a time of 64 bits
+
+    def times(forth, back, unit):
+        return b"".join(one.to_bytes(4, "little") for one in (forth, back, 9, 9, 9, 9)) + unit.to_bytes(8, "little")
+
+    found.found = {(0, 0x0900): times(100, 160, 100), (1, 0x0900): times(1000, 1010, 1000),
+                   (2, 0x0900): times(7, 99, far + 7)}  # fmt: skip
     set_offsets(found, 3)
     assert found.writes == [
         (0, 0x0920, 0, 8), (0, 0x0928, 0, 4),
         (1, 0x0920, (1 << 64) - 900 + 25, 8), (1, 0x0928, 25, 4),
-        (2, 0x0920, 93 + 30, 8), (2, 0x0928, 30, 4),
+        (2, 0x0920, (1 << 64) - far + 93 + 30, 8), (2, 0x0928, 30, 4),
     ]  # fmt: skip
 
 
