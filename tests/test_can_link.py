@@ -181,6 +181,7 @@ def test_frames_of_a_cycle_with_all_stuff_bits_leave_a_fifth():
     needed = 47 + 2 * (47 + 48 + (34 + 48 - 1) // 4)
     for share, has in ((0.7999, True), (0.8, True), (0.8001, False)):
         assert BusTime(1e6, needed * 1e-6 / share).has_room_besides([pdo(16, 32)], 2) is has
+    assert BusTime() == (1_000_000, math.inf), "the highest rate of classical CAN"
     assert BusTime().has_room_besides([pdo(64)] * 100, 100), "where frames take no time"
     assert BusTime(1e6, 47e-6 / 0.79).has_room_besides([], 2)
 
