@@ -250,6 +250,13 @@ def test_a_bus_that_is_gone_is_told(piped):
         port.receive(5.0)
 
 
+def test_a_look_without_waiting_is_one_system_call(joined, monkeypatch):
+    """It is done some thousand times a second."""
+    bus, _ = joined
+    monkeypatch.setattr(slcan_socket, "select", SimpleNamespace())
+    assert bus.recv(0.0) is None
+
+
 # --- without a hub ------------------------------------------------------------------------------------------------
 class Connection:
     """A connection whose answer to a token is told: bytes, or an error."""
