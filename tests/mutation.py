@@ -140,12 +140,13 @@ def _is_python(mutant: Mutant) -> bool:
     """Return whether a change leaves a file that can be read, without a warning.
 
     Where it cannot be read every test would notice; `is` for `==` beside a literal is the same, and Python warns of it.
+    Cosmic Ray stumbles over exceptions that are named with a dot.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", SyntaxWarning)
         try:
             compile(_changed((REPOSITORY / mutant.file).read_text(encoding="utf-8"), mutant), mutant.file, "exec")
-        except (SyntaxError, SyntaxWarning):
+        except (SyntaxError, SyntaxWarning, AttributeError):
             return False
     return True
 

@@ -370,3 +370,36 @@ def test_a_guarded_node_is_asked_by_a_remote_frame():
     controls.begin(0.3)
     assert port.sent == [(0x705, b"", True, 1)] * 3
     assert objects[0].values[LIFE] == b"\3"
+
+
+@pytest.mark.parametrize(("found", "has"), [(b"\0", b"\2"), (b"\1", b"\2"), (b"\2", b"\2"), (b"\3", b"\3"), (b"\4", b"\4")])
+def test_of_a_known_drive_what_leads_elsewhere_than_stopped_is_made_to_lead_there(found, has):
+    control, objects, _, _ = control_of({CONSUMER: bytes(4), BEHAVIOUR: found})
+    behaviour = {0: "PRE_OPERATIONAL", 1: "OPERATIONAL", 2: "STOPPED", 4: "STOPPED"}
+    control._description.device = SimpleNamespace(canopen=SimpleNamespace(error_behaviour=behaviour))
+    control.configure(0.5)
+    assert objects.values[BEHAVIOUR] == has
+
+
+@pytest.mark.parametrize("listed", [[GUARD], [LIFE]])
+def test_life_guarding_takes_both_its_objects(listed):
+    control, objects, _, _ = control_of({GUARD: bytes(2), LIFE: bytes(1)}, listed=listed)
+    with pytest.raises(NoWatchdogError, match="it has neither a heartbeat consumer .1016h. nor life guarding .100Ch.;"):
+        control.configure(0.5)
+    assert not objects.log
+
+
+def test_node_ids_of_masters_are_the_last_32():
+    assert (MASTERS[0], MASTERS[-1], len(MASTERS)) == (96, 127, 32)
+
+
+def test_a_consumer_s_sub_index_0_is_none():
+    control, objects, _, _ = control_of({(0x1016, 0): b"\1", CONSUMER: bytes(4)})
+    control.configure(0.5)
+    assert objects.values[0x1016, 0] == b"\1" and objects.values[CONSUMER] == consumer(OURS, 500)
+
+
+def test_a_time_out_is_in_whole_milliseconds():
+    control, objects, _, _ = control_of({CONSUMER: consumer(7 | 0x80, 1)})
+    control.configure(0.0126)
+    assert objects.values[CONSUMER] == consumer(OURS, 13) and control.time == pytest.approx(0.013)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drive_env.devices.image_rows import ImageField
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, UNSUPPORTED_ACCESS, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.master.can.mapping import Slots, pack
@@ -13,6 +14,9 @@ from drive_env.master.can.samples import PdoSamples
 from drive_env.master.errors import BusError
 from drive_env.master.packing import Member, integers, pack_rows, unpack_rows
 from drive_env.node import mapping
+from drive_env.node.axis import ObjectPort
+from drive_env.node.fixed_images import PackedFields
+from drive_env.node.process_data import MappedObjects
 
 
 def entry(index=0x6064, bits=32, signed=True, access="rw", mappable=True, sub=0):
@@ -183,3 +187,126 @@ def test_the_kth_frame_of_each_pdo_belongs_to_the_kth_sync():
     samples.close()
     assert not port.takers
     assert PdoSamples(port, [[], []], 1).complete() == 0
+
+
+# --- the node's process data ------------------------------------------------------------------------------------------
+class Objects:
+    """Objects of a node, by index: values, and what is written, in its order; some values are refused."""
+
+    def __init__(self, **rows):
+        self.values, self.written, self.refused, self.ports = {}, [], set(), {}
+        for name, (bits, signed, event, value) in rows.items():
+            index = int(name.removeprefix("i"), 16)
+            self.values[index] = value
+            self.ports[index] = self._port(entry(index, bits, signed), event)
+
+    def _port(self, found, event):
+        def check(raw):
+            if raw in self.refused:
+                raise ObjectAccessError(CANNOT_BE_MAPPED, "refused")
+
+        def write(raw):
+            self.values[found.index] = raw
+            self.written.append((found.index, raw))
+
+        return ObjectPort(found, lambda: self.values[found.index], check, write, event)
+
+    def find(self, index, sub=0):
+        if index not in self.ports or sub:
+            raise ObjectAccessError(CANNOT_BE_MAPPED, "none")
+        return self.ports[index]
+
+    def take(self):
+        taken, self.written = self.written, []
+        return taken
+
+
+@pytest.fixture
+def drive():
+    return Objects(
+        i6040=(16, False, "controlword", 0x0F), i6060=(8, True, "mode", 8), i607A=(32, True, "set_point", -2),
+        i2000=(8, False, "", 0xFF), i2001=(64, True, "", -3),
+    )  # fmt: skip
+
+
+def test_a_node_s_objects_travel_one_behind_the_other(drive):
+    mapped = MappedObjects([drive.ports[index] for index in (0x6040, 0x6060, 0x607A, 0x2000, 0x2001)])
+    assert mapped.size == 16 and len(mapped) == 5
+    assert mapped.pack().hex(" ") == "0f 00 08 fe ff ff ff ff fd ff ff ff ff ff ff ff"
+    assert len(MappedObjects([])) == 0 and MappedObjects([]).pack() == b"" and MappedObjects([]).write(b"")
+
+
+def test_set_points_take_effect_before_the_mode_and_that_before_the_controlword(drive):
+    mapped = MappedObjects([drive.ports[index] for index in (0x6040, 0x6060, 0x607A, 0x2000)])
+    assert mapped.write(bytes.fromhex("07 00 FF 00 01 00 00 80"))
+    assert drive.take() == [(0x607A, 256), (0x2000, 128), (0x6060, -1), (0x6040, 7)]
+    assert mapped.write(bytes.fromhex("06 00 FF 00 01 00 00 80"))
+    assert drive.take() == [(0x607A, 256), (0x2000, 128), (0x6040, 6)], "a mode that is repeated is no write"
+    drive.refused = {-1}
+    assert mapped.write(bytes.fromhex("06 00 FF 00 01 00 00 80")), "nor would it be refused"
+
+
+def test_of_data_that_one_object_refuses_nothing_is_written(drive):
+    drive.refused = {7}
+    mapped = MappedObjects([drive.ports[index] for index in (0x6040, 0x607A)])
+    assert not mapped.write(bytes.fromhex("07 00 00 01 00 00"))
+    assert drive.take() == []
+
+
+def fields(*rows):
+    return [ImageField(kind, key, is_name) for kind, key, is_name in rows]
+
+
+READY_MADE = fields(
+    ("i32", (0x607A, 0), False), ("u16", None, False), ("u32", (0x6060, 0), False), ("i16", (0x6040, 0), False),
+    ("u32", (0x2002, 0), True), ("i64", (0x2001, 0), False),
+)  # fmt: skip
+
+
+def test_a_ready_made_image_has_fields_of_its_own_width(drive):
+    """What is reserved is 0; what names another object carries that one: here 2000h, as an entry 20000008h."""
+    drive.values[0x2002] = 0x20000008
+    drive.ports[0x2002] = drive._port(entry(0x2002, 32, False), "")
+    image = PackedFields(READY_MADE, drive.find)
+    assert image.size == 24
+    assert image.pack().hex(" ") == (
+        "fe ff ff ff 00 00 08 00 00 00 0f 00 ff 00 00 00 fd ff ff ff ff ff ff ff"
+    )  # fmt: skip
+    drive.values[0x6060] = -1
+    assert image.pack()[6:10].hex(" ") == "ff ff ff ff"
+    for named in (0x12340010, 0x20000108, 0):
+        drive.values[0x2002] = named
+        assert image.pack()[12:16] == bytes(4), "it names none"
+    drive.ports[0x2003] = ObjectPort(entry(0x2003, None), lambda: "a text", lambda raw: None, lambda raw: None)
+    drive.values[0x2002] = 0x20030000
+    assert image.pack()[12:16] == bytes(4)
+
+
+def test_of_a_field_an_object_takes_its_own_bits(drive):
+    image = PackedFields(fields(("u16", None, False), ("u32", (0x6040, 0), False), ("u32", (0x6060, 0), False),
+                                ("i32", (0x607A, 0), False), ("u16", (0x2000, 0), False)), drive.find)  # fmt: skip
+    assert image.write(bytes.fromhex("FF FF 07 00 FF FF 80 12 34 56 00 00 00 80 7F 01"))
+    assert drive.take() == [(0x607A, -(1 << 31)), (0x2000, 0x7F), (0x6060, -128), (0x6040, 7)]
+    assert image.write(bytes.fromhex("00 00 FF 80 00 00 7F 00 00 00 FF FF FF FF FF FF"))
+    assert drive.take() == [(0x607A, -1), (0x2000, 0xFF), (0x6060, 127), (0x6040, 0x80FF)]
+    drive.refused = {7}
+    assert not image.write(bytes.fromhex("FF FF 07 00 FF FF 80 12 34 56 00 00 00 80 7F 01"))
+    assert drive.take() == []
+
+
+@pytest.mark.parametrize(("raw", "transmit", "taken"), [
+    (0x00050008, False, True), (0x00070020, False, True), (0x00020008, False, True),
+    (0x00050008, True, False),  # nothing is passed over that goes out
+    (0x00050010, False, False), (0x00080008, False, False), (0x00010008, False, False),
+])  # fmt: skip
+def test_a_dummy_passes_over_what_comes_in(raw, transmit, taken):
+    dummies = {2: 8, 3: 16, 4: 32, 5: 8, 6: 16, 7: 32, 8: 8, 1: 8}
+    find = lambda index, sub: entry(index, dummies[index], mappable=False)
+    if taken:
+        assert mapping.check_mappable(entry(0x1600, sub=1), raw, transmit, find).index == raw >> 16
+    else:
+        with pytest.raises(ObjectAccessError):
+            mapping.check_mappable(entry(0x1600, sub=1), raw, transmit, find)
+    with pytest.raises(ObjectAccessError, match="^1600h:01 an object cannot map 0005h:03: none ") as error:
+        mapping.check_mappable(entry(0x1600, sub=1), 0x00050308, False, Objects().find)
+    assert error.value.abort_code == CANNOT_BE_MAPPED

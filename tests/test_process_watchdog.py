@@ -14,7 +14,7 @@ from drive_env.master.link import NoWatchdogError
 
 
 class Slaves:
-    """The registers of slaves, by position; a register that is none reads as None."""
+    """The registers of slaves, by position; a register that is none reads as None, one of another length as a mistake."""
 
     def __init__(self, dividers, control=0x64, takes=True):
         self.registers = {
@@ -28,7 +28,9 @@ class Slaves:
         self.takes, self.is_op = takes, True
 
     def register(self, position, address, size):
-        return self.registers[position].get(address)
+        found = self.registers[position].get(address)
+        assert found is None or len(found) == size
+        return None if found is None else bytes(bytearray(found))  # as it comes over a cable
 
     def write_register(self, position, address, data):
         if self.takes:
@@ -106,7 +108,12 @@ def test_all_have_noticed_when_the_last_one_has():
     assert watchdog.detection_time == pytest.approx(1e-3)
 
 
+def test_the_control_of_the_outputs_is_at_0814h():
+    assert OUTPUTS_CONTROL == 0x0814
+
+
 @pytest.mark.parametrize(("slaves", "said"), [
+    (Slaves({4: 2498}, control=0xBF), "position 4 does not watch its outputs"),
     (Slaves({4: 2498}, control=0x24), "position 4 does not watch its outputs"),
     (Slaves({4: 2498}, takes=False), "position 4 took b80b for 0420h and has e803"),
 ])  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.can import sdo as module
-from drive_env.master.can.sdo import BUSY_TIME, PATIENT, SdoClient
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.errors import BusError, NoAnswerError
 
 READ_6041 = bytes.fromhex("40 41 60 00 00 00 00 00")
@@ -107,7 +107,7 @@ def test_an_abort_that_names_no_object_is_of_this_transfer(made):
         "4B 41 60 01 00 00 00 00",  # another sub-index
         "60 64 60 00 00 00 00 00",  # the end of an earlier write
         "80 64 60 00 10 00 09 06",  # an abort of another
-        "4B 41 60 00 37 02 00",  # too short
+        "4B 41 60 00 55 55 00",  # too short
     ],
 )
 def test_answers_of_another_transfer_are_passed_over(made, foreign):
@@ -203,7 +203,7 @@ def test_putting_back_wakes_the_node_and_waits_four_times_as_long(made):
     line, client = made()
     with pytest.raises(NoAnswerError):
         client.put_back(0x6040, 0, b"\x0f\x00", "Controlword", 0.2)
-    assert line.now == pytest.approx(50.0 + 0.2 + PATIENT * 0.2)
+    assert line.now == pytest.approx(50.0 + 0.2 + 4 * 0.2)
 
 
 def test_putting_back_what_the_drive_refuses_is_not_tried_again(made):
@@ -211,6 +211,17 @@ def test_putting_back_what_the_drive_refuses_is_not_tried_again(made):
     with pytest.raises(ObjectAccessError):
         client.put_back(0x6040, 0, b"\x0f\x00", "Controlword", 0.2)
     assert line.sent == [(0x605, WRITE_6040)]
+
+
+def test_who_waits_is_done_when_an_answer_has_come_or_the_node_has_booted(made):
+    line, client = made([IS_0237])
+    client.read(0x6041, 0, "Statusword", 0.5)
+    assert not client._answered()
+    line.handler(IS_0237)
+    assert client._answered()
+    client._answers.clear()
+    client.forget()
+    assert client._answered()
 
 
 # --- looks and commands -----------------------------------------------------------------------------------------------
@@ -268,7 +279,7 @@ def test_a_frame_that_a_full_buffer_does_not_take_is_tried_again_for_a_while(mad
     line.refusals = 10**6
     with pytest.raises(BusError):
         client.send_patiently(READ_6041)
-    assert line.now == pytest.approx(50.003 + BUSY_TIME, abs=0.003)
+    assert line.now == pytest.approx(50.003 + 0.5, abs=0.003)
 
 
 def test_without_a_code_an_abort_is_a_general_error(made):

@@ -178,6 +178,33 @@ def test_lengths_of_segments_are_held_against_the_object_and_what_was_announced(
     """)
 
 
+def test_a_text_of_three_segments_is_written():
+    objects = Objects(0, ROOM)
+    objects.play("""
+        21 03 20 00 10 00 00 00 -> 60 03 20 00 00 00 00 00
+        00 41 42 43 44 45 46 47 -> 20 00 00 00 00 00 00 00
+        10 48 49 4A 4B 4C 4D 4E -> 30 00 00 00 00 00 00 00
+        0B 4F 50 00 00 00 00 00 -> 20 00 00 00 00 00 00 00
+    """)
+    assert objects.values[0x2003] == "ABCDEFGHIJKLMNOP"
+
+
+def test_more_than_an_object_has_room_for_is_refused_before_the_last_segment(objects):
+    objects.play("""
+        20 02 20 00 00 00 00 00 -> 60 02 20 00 00 00 00 00
+        00 01 02 03 04 05 06 07 -> 20 00 00 00 00 00 00 00
+        10 01 02 03 04 05 06 07 -> 80 02 20 00 12 00 07 06
+    """)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_segment_that_comes_first_of_all_is_none_of_a_transfer(closed):
+    for made in (Objects(), Objects(BLOCK, ROOM)):
+        if closed:
+            made.server.close()
+        made.play("00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05")
+
+
 def test_segments_of_the_other_direction_are_none_of_the_open_transfer(objects):
     objects.play("""
         40 03 20 00 00 00 00 00 -> 41 03 20 00 0F 00 00 00
@@ -371,6 +398,53 @@ def test_segments_on_their_way_when_a_block_was_aborted_are_no_requests(blocks):
         2F 00 20 00 2A 00 00 00 -> 60 00 20 00 00 00 00 00
     """)
     assert blocks.values[0x2000] == 0x2A
+
+
+ABORTED_BLOCK = """
+    C0 00 20 00 00 00 00 00 -> A4 00 20 00 04 00 00 00
+    01 41 42 43 44 45 46 47 -> --
+    02 41 42 43 44 45 46 47 -> 80 00 20 00 05 00 04 05
+"""
+
+
+@pytest.mark.parametrize("after", [
+    "2F 00 20 00 2A 00 00 00 -> 60 00 20 00 00 00 00 00",  # no segment in turn
+    "83 00 20 00 2A 00 00 00 -> --",  # the last segment
+    "80 00 00 00 00 00 00 08 -> --",  # an abort
+    "04 00 20 00 2A 00 00 00 -> 80 00 00 00 01 00 04 05",  # one was lost: the fourth is none in turn
+])  # fmt: skip
+def test_what_follows_an_aborted_block_out_of_turn_ends_its_segments(blocks, after):
+    blocks.play(ABORTED_BLOCK)
+    blocks.play(after)
+    blocks.play("""
+        04 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05
+        00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05
+        40 00 20 00 00 00 00 00 -> 4F 00 20 00 %s 00 00 00
+    """ % ("2A" if after[:2] == "2F" else "07"))
+
+
+@pytest.mark.parametrize("transcript", [
+    """
+    C4 03 20 00 00 00 00 00 -> A4 03 20 00 04 00 00 00
+    05 41 42 43 44 45 46 47 -> 80 03 20 00 03 00 04 05
+    """, """
+    C4 03 20 00 00 00 00 00 -> A4 03 20 00 04 00 00 00
+    01 41 42 43 44 45 46 47 -> --
+    04 41 42 43 44 45 46 47 -> A2 01 04 00 00 00 00 00
+    05 41 42 43 44 45 46 47 -> 80 03 20 00 03 00 04 05
+    """, """
+    A4 03 20 00 04 00 00 00 -> C6 03 20 00 0F 00 00 00
+    A2 01 04 00 00 00 00 00 -> 80 03 20 00 01 00 04 05
+    """,
+], ids=["at once", "after a sub-block", "an upload"])  # fmt: skip
+def test_nothing_follows_a_block_of_which_no_segment_is_on_its_way(blocks, transcript):
+    blocks.play(transcript)
+    blocks.play("00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05")
+
+
+def test_a_threshold_of_0_is_none(blocks):
+    blocks.values[0x2003] = ""
+    blocks.play("A4 03 20 00 04 00 00 00 -> C6 03 20 00 00 00 00 00")
 
 
 def test_another_request_ends_a_block(blocks):

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import can
 import pytest
 
+from drive_env.master.can import slcan_socket
 from drive_env.master.can.port import Port
 from drive_env.master.can.slcan_socket import SlcanSocket
 from drive_env.master.errors import BusError, OpenError
@@ -247,3 +248,69 @@ def test_a_bus_that_is_gone_is_told(piped):
     os.write(writing, b"x")
     with pytest.raises(BusError, match="the bus is gone: unplugged"):
         port.receive(5.0)
+
+
+def test_a_look_without_waiting_is_one_system_call(joined, monkeypatch):
+    """It is done some thousand times a second."""
+    bus, _ = joined
+    monkeypatch.setattr(slcan_socket, "select", SimpleNamespace())
+    assert bus.recv(0.0) is None
+
+
+# --- without a hub ------------------------------------------------------------------------------------------------
+class Connection:
+    """A connection whose answer to a token is told: bytes, or an error."""
+
+    def __init__(self, *answers):
+        self.answers, self.sent, self.is_open = list(answers), b"", True
+
+    def sendall(self, data):
+        self.sent += data
+
+    def recv(self, size):
+        assert size >= 4096
+        found = self.answers.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def close(self):
+        self.is_open = False
+
+
+@pytest.mark.parametrize(("answers", "said"), [
+    ((TimeoutError(),), "chan does not answer to the token within 3 s; if it is not the hub of `drive-env serve`, unset"),
+    ((b"K", TimeoutError()), "chan does not answer to the token within 3 s"),
+    ((OSError("reset"),), "chan refuses the token; take the one that `drive-env serve` printed, and wait a second"),
+    ((b"K\r", b""), "chan refuses the token"),
+])  # fmt: skip
+def test_who_does_not_take_the_token_is_let_go(answers, said):
+    connection = Connection(*answers)
+    with pytest.raises(OpenError, match=f"^{said}"):
+        slcan_socket._present(TOKEN, connection, "chan")
+    assert connection.sent == b"K" + TOKEN.encode() + b"\r" and not connection.is_open
+
+
+def test_what_is_no_token_is_not_sent():
+    connection = Connection()
+    with pytest.raises(OpenError, match="; take the one that `drive-env serve` printed$"):
+        slcan_socket._present("short", connection, "chan")
+    assert connection.sent == b"" and not connection.is_open
+    connection = Connection(b"\r")
+    slcan_socket._present(TOKEN, connection, "chan")
+    assert connection.is_open
+
+
+def test_a_connection_is_tried_for_3_s(monkeypatch):
+    asked = []
+    monkeypatch.setattr(slcan_socket.socket, "create_connection", lambda *what: asked.append(what) or "connection")
+    assert slcan_socket._connect("socket://host.example:29536") == "connection"
+    assert slcan_socket._connect("::1:5") == "connection"
+    assert asked == [(("host.example", 29536), 3.0), (("::1", 5), 3.0)]
+
+
+def test_a_question_for_the_token_is_told(joined):
+    bus, adapter = joined
+    adapter.sendall(b"K\r")
+    with pytest.raises(OpenError, match="asks for a token; set DRIVE_ENV_TOKEN to the one that `drive-env serve` print"):
+        bus.recv(20.0)

@@ -229,7 +229,7 @@ class Axis:
             return lambda: fixed
         reals, places = self._reals, (self._scaler, *self._other_scales.values())
         known: Sequence[float] = ()
-        factor = 0.0
+        factor = self._factor(code)
 
         def now() -> float:
             nonlocal known, factor

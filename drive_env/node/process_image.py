@@ -172,9 +172,9 @@ class ImageObjects:
         self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
 
     def _image(self, direction: int) -> MappedObjects | PackedFields:
-        assigned = self._assigned(direction)
-        if assigned and assigned[0] in self._fixed:
-            return PackedFields(self._fixed[assigned[0]].fields, self._port_of)
+        ready_made = next((self._fixed[index] for index in self._assigned(direction) if index in self._fixed), None)
+        if ready_made is not None:
+            return PackedFields(ready_made.fields, self._port_of)
         mapped = [mapping.parse(raw) for _, raws in self.mapped(direction) for raw in raws]
         return MappedObjects([self._port_of(index, sub) for index, sub, _ in mapped])
 

@@ -74,8 +74,14 @@ class SdoServer:
         self.block: BlockDownload | BlockUpload | None = None
         self._block_port: ObjectPort | None = None  # of a block download
         self._block_size_said: int | None = None
-        self._last = 0.0  # of a block transfer [s]
+        self._last: float  # of a block transfer [s], from its beginning on
         self._leftover = 0  # segment of a sub-block that was aborted: what follows it in turn is no request
+        self._services = {
+            INITIATE_UPLOAD: self._initiate_upload,
+            INITIATE_DOWNLOAD: self._initiate_download,
+            UPLOAD_SEGMENT: self._upload_segment,
+            DOWNLOAD_SEGMENT: self._download_segment,
+        }
 
     def request(self, data: bytes, now: float) -> bytes | None:
         """Return the response to a request that came at `now` [s]; a frame of other than 8 bytes is no request."""
@@ -92,14 +98,8 @@ class SdoServer:
             self._open = None
             return None
         try:
-            if specifier == INITIATE_UPLOAD:
-                return self._initiate_upload(data, now)
-            if specifier == INITIATE_DOWNLOAD:
-                return self._initiate_download(data, now)
-            if specifier == UPLOAD_SEGMENT:
-                return self._upload_segment(data, now)
-            if specifier == DOWNLOAD_SEGMENT:
-                return self._download_segment(data, now)
+            if specifier in self._services:
+                return self._services[specifier](data, now)
             if self._block_size and specifier in (BLOCK_UPLOAD, BLOCK_DOWNLOAD) and is_initiate(data):
                 self._open = None
                 return self._initiate_block(data, now)
@@ -250,7 +250,7 @@ class SdoServer:
         Its first byte might be that of a write, and its data name an object.
         """
         number = data[0] & 0x7F
-        if number != self._leftover + 1 or data[0] == ABORTED:
+        if number != self._leftover + 1:
             self._leftover = 0
             return False
         self._leftover = 0 if data[0] & 0x80 or number >= self._block_size else number

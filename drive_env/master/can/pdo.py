@@ -95,7 +95,7 @@ def slots(description: Description, direction: Direction, axis: int) -> Slots:
         return Slots((), 0)
     mapping = [entry for entry in known if entry.index == direction.mapping + mine[0]]
     limit = next((entry.high for entry in mapping if entry.sub == 0), None)
-    entries = max((entry.sub for entry in mapping), default=0)
+    entries = max(entry.sub for entry in mapping)
     return Slots(mine, min(entries, PDO_BITS // 8, limit if limit else PDO_BITS))
 
 

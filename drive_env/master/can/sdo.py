@@ -49,11 +49,11 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._node = node
         self._alive = alive
         self._answers: list[bytes] = []
-        self._has_booted = False  # since the transfer under way began
+        self._has_booted: bool  # since the transfer under way began
         self._has_blocks = True  # as far as is known
         self._in_block = False  # every frame is of the block transfer under way
-        self._object = (0, 0)
-        self._timeout = 0.5
+        self._object: tuple[int, int]  # of the transfer under way
+        self._timeout: float  # and its time for an answer [s]
         self._turn = threading.RLock()  # one transfer at a time: the supervisor's thread looks at the drive, too
         port.subscribe(SDO_RESPONSE + node, self._answers.append)
 

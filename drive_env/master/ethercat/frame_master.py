@@ -77,7 +77,7 @@ class FrameMaster:
         self._turn = threading.RLock()  # a frame and its answer
         self._places: list[SlavePlaces] = []
         self._mailboxes: list[MailboxClient] = []
-        self._repeats: list[bool] = []
+        self._repeats: dict[int, bool] = {}  # position -> whether its last message was asked for again, by turns
         self._mapped: dict[int, tuple[int, ImageSizes]] = {}  # position -> logical address, sizes
 
     # --- frames -----------------------------------------------------------------------------------------------------
@@ -150,13 +150,12 @@ class FrameMaster:
         """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends."""
         count = self._count()
         self._mapped.clear()
-        self._places, self._mailboxes, self._repeats = [], [], []
+        self._places, self._mailboxes = [], []
         for position in range(count):
             self._address(position)
             self._to(position, AlState.INIT)
             places = self._read_places(position)
             self._places.append(places)
-            self._repeats.append(False)
             self._mailboxes.append(self._mailbox(position, places))
             self._open_mailbox(position)
         return count

@@ -164,8 +164,7 @@ class EtherCatProcessData:
 
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
         """Return whether the images that are exchanged carry these already."""
-        has = len(self._ready) == len(self._nodes)
-        if not has or not self._carries(OUTPUTS, played):
+        if self.missing or not self._carries(OUTPUTS, played):
             return False
         # What nobody needs any more is not read before each frame.
         return set(sampled) - set(self._layouts[INPUTS].entries) == set(self._beside)
@@ -186,7 +185,7 @@ class EtherCatProcessData:
         }
         self._beside = tuple(entry for entry in sampled if entry not in fitting)
         self.mapping += 1
-        if wanted == self._layouts and len(self._ready) == len(self._nodes):
+        if wanted == self._layouts and not self.missing:
             return
         self._check_none_is_enabled((*played, *sampled))
         with self.turn:
@@ -276,17 +275,17 @@ class EtherCatProcessData:
             Whether the images of all of them came back.
         """
         with self.turn:
-            if self.is_silent or len(self._ready) < len(self._nodes):
+            if self.is_silent or self.missing:
                 return False
             beside = self._read_beside() if is_cycle and self._beside else [b""] * len(self._nodes)
             found = self._master.exchange([bytes(image) for image in self.images], timeout)
             if self.phase is not None and self._master.system_time is not None:
                 self.phase.take(self._master.system_time)
-            row = [image + more for image, more in zip(found, beside, strict=True) if image is not None]
-            if len(row) < len(self._nodes):
+            if None in found:
                 return False
             self.exchanged_at = time.monotonic()
             if is_cycle:
+                row = [(image or b"") + more for image, more in zip(found, beside, strict=True)]
                 for taker in self.takers:
                     taker.append(row)
             return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import struct
 import threading
 import time
@@ -80,7 +81,7 @@ class SoemMaster:
         self._turns: list[threading.RLock] = []
         self._emergencies: deque[ReceivedEmergency] = deque()
         self._mapped: dict[int, ImageSizes] = {}
-        self._looked, self._states = 0.0, dict[int, SlaveStatus]()
+        self._looked, self._states = -math.inf, dict[int, SlaveStatus]()
 
     # --- slaves -----------------------------------------------------------------------------------------------------
     def begin(self) -> int:
@@ -209,7 +210,7 @@ class SoemMaster:
                 exchange()
             self.alive()
             time.sleep(0.001)
-        self._states = {}
+        self._looked = -math.inf
 
     def leave_op(self, position: int) -> None:
         """Take a slave to Pre-Op."""
@@ -227,7 +228,7 @@ class SoemMaster:
             if self.clock is not None:
                 self.system_time = int(self._master.dc_time)
             now = time.monotonic()
-            if now - self._looked > STATE_LOOK or not self._states:
+            if now - self._looked > STATE_LOOK:
                 # A slave that has left Op still answers process data; only its state tells.
                 self._looked, self._states = now, {position: self.status(position) for position in self._mapped}
             return [bytes(self._slave(k).input) if self._states[k].is_op else None for k in self._mapped]
