@@ -115,10 +115,12 @@ def test_a_sub_block_whose_last_segment_is_lost_is_acknowledged_as_far_as_it_cam
 
 
 def test_three_sub_blocks_in_a_row_may_be_lost_and_the_fourth_ends_it():
-    channel = Channel(*[NOTHING] * 3, SEGMENTS[0], *[NOTHING] * 4, f"01 {hexed(TEXT[7:14])}", f"82 {hexed(TEXT[14:])}", END)
+    channel = Channel(
+        *[NOTHING] * 3, SEGMENTS[0], *[NOTHING] * 4, f"01 {hexed(TEXT[7:14])}", f"82 {hexed(TEXT[14:])}", END
+    )
     assert block_transfer.read(channel, BEGUN_UPLOAD) == TEXT
     channel = Channel(SEGMENTS[0], *[NOTHING] * 5, SEGMENTS[0])
-    with pytest.raises(SdoCommunicationError, match="^No SDO response received$"):
+    with pytest.raises(SdoCommunicationError, match=r"^No SDO response received$"):
         block_transfer.read(channel, BEGUN_UPLOAD)
     assert channel.sent == ["A3", "A2 01 7F", *["A2 00 7F"] * 3] and len(channel.answers) == 1
 
@@ -131,7 +133,7 @@ def test_segments_that_were_sent_twice_are_no_end():
 
 def test_a_wrong_checksum_is_told():
     channel = Channel(*SEGMENTS, "D1 34 12")
-    with pytest.raises(SdoCommunicationError, match="^the checksum of 17 bytes is wrong$"):
+    with pytest.raises(SdoCommunicationError, match=r"^the checksum of 17 bytes is wrong$"):
         block_transfer.read(channel, BEGUN_UPLOAD)
     assert channel.aborted == [0x05040004] and channel.sent[-1] == "A2 03 7F"
     channel = Channel(*SEGMENTS, "D1 34 12")
@@ -171,7 +173,7 @@ def test_what_the_server_has_not_got_is_sent_again():
 
 def test_a_server_that_loses_four_sub_blocks_in_a_row_is_given_up():
     channel = Channel(*["A2 00 7F"] * 3, "A2 01 7F", *["A2 00 7F"] * 4)
-    with pytest.raises(SdoCommunicationError, match="^the server takes no blocks of 127 segments, or loses all$"):
+    with pytest.raises(SdoCommunicationError, match=r"^the server takes no blocks of 127 segments, or loses all$"):
         block_transfer.write(channel, BEGUN_DOWNLOAD, TEXT)
     assert channel.aborted == [0x05040001] and len(channel.segments) == 4 * 3 + 4 * 2
     channel = Channel(*["A2 00 7F"] * 3, "A2 03 7F", "A1")

@@ -372,7 +372,9 @@ def test_a_guarded_node_is_asked_by_a_remote_frame():
     assert objects[0].values[LIFE] == b"\3"
 
 
-@pytest.mark.parametrize(("found", "has"), [(b"\0", b"\2"), (b"\1", b"\2"), (b"\2", b"\2"), (b"\3", b"\3"), (b"\4", b"\4")])
+@pytest.mark.parametrize(
+    ("found", "has"), [(b"\0", b"\2"), (b"\1", b"\2"), (b"\2", b"\2"), (b"\3", b"\3"), (b"\4", b"\4")]
+)
 def test_of_a_known_drive_what_leads_elsewhere_than_stopped_is_made_to_lead_there(found, has):
     control, objects, _, _ = control_of({CONSUMER: bytes(4), BEHAVIOUR: found})
     behaviour = {0: "PRE_OPERATIONAL", 1: "OPERATIONAL", 2: "STOPPED", 4: "STOPPED"}
@@ -384,7 +386,9 @@ def test_of_a_known_drive_what_leads_elsewhere_than_stopped_is_made_to_lead_ther
 @pytest.mark.parametrize("listed", [[GUARD], [LIFE]])
 def test_life_guarding_takes_both_its_objects(listed):
     control, objects, _, _ = control_of({GUARD: bytes(2), LIFE: bytes(1)}, listed=listed)
-    with pytest.raises(NoWatchdogError, match="it has neither a heartbeat consumer .1016h. nor life guarding .100Ch.;"):
+    with pytest.raises(
+        NoWatchdogError, match=r"it has neither a heartbeat consumer .1016h. nor life guarding .100Ch.;"
+    ):
         control.configure(0.5)
     assert not objects.log
 

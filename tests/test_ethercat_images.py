@@ -160,7 +160,7 @@ def test_what_is_wanted_comes_with_what_a_drive_is_commanded_and_watched_by(plan
 def test_what_is_too_much_for_one_image_is_told(planner, one):
     empty = planner.free(0x1600, ())
     assert planner.plan(OUTPUTS, one(0x607A, 0x6071, 0x2002), empty).entries == one(0x607A, 0x6071, 0x2002)
-    with pytest.raises(ObjectAccessError, match="^3 objects of 2 axes are more than the 5 that the process image 1600h ta"
+    with pytest.raises(ObjectAccessError, match=r"^3 objects of 2 axes are more than the 5 that the process image 1600h ta"
     ) as error:  # fmt: skip
         planner.plan(OUTPUTS, one(0x607A, 0x6071, 0x6040), empty)
     assert error.value.abort_code == 0x06040042
@@ -286,7 +286,7 @@ def test_what_cannot_be_put_back_keeps_nothing_else_from_it(drive, planner, one,
     images.change(INPUTS, planner.free(0x1A00, one(0x6077)))
     slave.take()
     slave.refuses = {(0x1A00, 0)}
-    with pytest.raises(BusError, match="^1A00h does not answer$"):
+    with pytest.raises(BusError, match=r"^1A00h does not answer$"):
         images.restore()
     assert slave.take() == ["1C13:00 00", "1C13:00 00", "1C13:01 00 1A", "1C13:00 01"]
 
@@ -409,7 +409,7 @@ def test_images_are_not_changed_while_an_axis_is_enabled(bench, data, one):
     data.prepare()
     bench.slaves[1].objects[0x6841, 0] = bytes.fromhex("37 02")
     bench.master.log.clear()
-    with pytest.raises(ObjectAccessError, match="^6077h:00 Torque is not in the process image, which cannot be changed "
+    with pytest.raises(ObjectAccessError, match=r"^6077h:00 Torque is not in the process image, which cannot be changed "
                        "while axis 3 is enabled; record or play it once before enabling ") as error:  # fmt: skip
         data.map(one(0x6040), one(0x6041, 0x6077))
     assert error.value.abort_code == 0x08000022
@@ -423,7 +423,9 @@ def test_what_is_in_no_image_can_be_neither_recorded_nor_played(data, one):
     data.check_sampled(one(0x6041, 0x6064, 0x6040))
     data.check_played(one(0x6040, 0x60FF))
     for entry, verb in ((0x6061, "recorded"), (0x60FF, "recorded"), (0x6081, "recorded")):
-        with pytest.raises(ObjectAccessError, match=f"^{entry:04X}h:00 .* cannot be {verb}: it is no process data ") as e:
+        with pytest.raises(
+            ObjectAccessError, match=f"^{entry:04X}h:00 .* cannot be {verb}: it is no process data "
+        ) as e:
             data.check_sampled(one(0x6041, entry))
         assert e.value.abort_code == 0x06040041
     for entry in (0x6041, 0x6098, 0x6081):
@@ -434,7 +436,9 @@ def test_what_is_in_no_image_can_be_neither_recorded_nor_played(data, one):
 def test_what_a_ready_made_image_has_can_be_recorded_whatever_the_eds_says(tgz):
     """3325h is in image 1B21h, and the EDS has it as no process data."""
     data = EtherCatProcessData(Segment(), (0,), tgz, False)
-    data.connect([SimpleNamespace(read=lambda index, sub, label, timeout: {0x1C13: b"\1\x1b"}.get(index, b"") if sub else b"\1")])
+    data.connect(
+        [SimpleNamespace(read=lambda index, sub, label, timeout: {0x1C13: b"\1\x1b"}.get(index, b"") if sub else b"\1")]
+    )
     assert not tgz.dictionary.find(0x3325).pdo_mappable
     data.check_sampled([tgz.dictionary.find(0x3325)])
     with pytest.raises(ObjectAccessError, match="cannot be recorded: it is no process data"):
@@ -482,7 +486,9 @@ def test_in_lockstep_an_enabled_axis_keeps_its_image_and_the_rest_is_read(lockst
     master.log.clear()
     data.map(one(0x6040), one(0x6041, 0x6077))
     assert master.take() == [] and data.sampled_entries() == one(0x6041, 0x6064, 0x6077)
-    with pytest.raises(ObjectAccessError, match="^6071h:00 Target torque is not in the process image, .* while axis 0"):
+    with pytest.raises(
+        ObjectAccessError, match=r"^6071h:00 Target torque is not in the process image, .* while axis 0"
+    ):
         data.map(one(0x6071), one(0x6041))
 
 

@@ -12,7 +12,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.master.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.ethercat import clocks, ethercat_link, frame_ways
+from drive_env.master.ethercat import ethercat_link, frame_ways
 from drive_env.master.ethercat.clocks import check_clocks, set_offsets, start_sync0
 from drive_env.master.ethercat.ethercat_link import EtherCatLink
 from drive_env.master.ethercat.ethercat_master import SlaveStatus, Sync0
@@ -181,7 +181,7 @@ def test_distributed_clocks_are_those_of_all_slaves_with_the_drive_s_cycle(drive
     assert [one for one in master.log if one != "begin"] == [("register", k, 0x0008, 2) for k in range(4)]
     assert EtherCatLink(master, (1,), drive, True).process.phase is None and master.clock is None
     master.registers[0x0008] = b"\xfb\xff"
-    with pytest.raises(BusError, match="^position 0 has no distributed clocks; open it without sync0$"):
+    with pytest.raises(BusError, match=r"^position 0 has no distributed clocks; open it without sync0$"):
         EtherCatLink(master, (1, 3), drive, False, sync0=True)
 
 
@@ -233,7 +233,7 @@ def test_a_reset_is_three_letters_and_a_wait_until_it_is_back(link, master, cloc
 @pytest.mark.parametrize("state", [2, 3, 4, 8])
 def test_a_slave_that_does_not_restart_is_told(link, master, state):
     master.states[3] = state
-    with pytest.raises(BusError, match="^position 3 does not restart by its reset register; switch it off and on$"):
+    with pytest.raises(BusError, match=r"^position 3 does not restart by its reset register; switch it off and on$"):
         link.reset([1])
     master.states[3] = 1
     link.reset([1])
@@ -242,7 +242,7 @@ def test_a_slave_that_does_not_restart_is_told(link, master, state):
 def test_a_slave_that_does_not_come_back_is_told_after_10_s(link, master, clock, monkeypatch):
     monkeypatch.setattr(ethercat_link, "LOOK", 0.5)
     master.states[1], master.errors = 0, {1: NoAnswerError("it is silent")}
-    with pytest.raises(NoAnswerError, match="^it is silent$"):
+    with pytest.raises(NoAnswerError, match=r"^it is silent$"):
         link.reset([0])
     assert clock.now == 1010.5, "at 1010.0 the time is not over"
 
@@ -251,12 +251,16 @@ def test_another_master_is_noticed_by_the_states(link, master):
     others = link.other_masters()
     others.check()
     master.states[3] = OP
-    with pytest.raises(BusError, match="^position 3 is in Op, and this program took it to Pre-Op: another master uses"):
+    with pytest.raises(
+        BusError, match=r"^position 3 is in Op, and this program took it to Pre-Op: another master uses"
+    ):
         others.check()
     link.start()
     others.check()
     master.states[1] = SAFE_OP
-    with pytest.raises(BusError, match="^position 1 is in Safe-Op, and this program took it to Op: another master uses"):
+    with pytest.raises(
+        BusError, match=r"^position 1 is in Safe-Op, and this program took it to Op: another master uses"
+    ):
         others.check()
 
 
@@ -370,12 +374,12 @@ def test_a_read_is_told_by_position_and_name(master, data):
     assert sdo.read(0x6064, 0, "Position", 0.5) == b"\1\2\3\4"
     assert master.log == [("upload", 3, 0x6064, 0, 0.5)]
     master.objects[0x6064, 0] = [SdoAbortError(0x06020000, "none"), NoAnswerError("silent"), BusError("damaged")]
-    with pytest.raises(ObjectAccessError, match="position 3.*the read of Position") as error:
+    with pytest.raises(ObjectAccessError, match=r"position 3.*the read of Position") as error:
         sdo.read(0x6064, 0, "Position", 0.5)
     assert error.value.abort_code == 0x06020000
     with pytest.raises(NoAnswerError, match=r"^position 3 did not answer the read of Position within 0.5 s; check its"):
         sdo.read(0x6064, 0, "Position", 0.5)
-    with pytest.raises(BusError, match="^position 3, the read of Position: damaged$"):
+    with pytest.raises(BusError, match=r"^position 3, the read of Position: damaged$"):
         sdo.read(0x6064, 0, "Position", 0.5)
 
 
@@ -460,7 +464,7 @@ def test_a_clock_is_bit_2_of_the_features(features, has):
     if has:
         check_clocks(found, [4, 3])
     else:
-        with pytest.raises(BusError, match="^position 3 has no distributed clocks; open it without sync0$"):
+        with pytest.raises(BusError, match=r"^position 3 has no distributed clocks; open it without sync0$"):
             check_clocks(found, [4, 3])
 
 
@@ -487,17 +491,17 @@ def test_a_start_that_was_too_late_is_tried_again_twice_as_far_ahead():
 @pytest.mark.parametrize(("lockstep", "starts"), [(False, 5), (True, 1)])
 def test_sync0_that_does_not_start_is_told(lockstep, starts):
     found = Registers(late=100)
-    with pytest.raises(BusError, match="^SYNC0 of position 5 does not start; this computer or the cable is too slow$"):
+    with pytest.raises(BusError, match=r"^SYNC0 of position 5 does not start; this computer or the cable is too slow$"):
         start_sync0(found, [3, 5], 0.001, lockstep)
     assert sum(address == 0x0990 and k == 5 for k, address, _, _ in found.writes) == starts
 
 
 def test_clocks_of_slaves_that_do_not_answer_are_told():
     found = Registers()
-    with pytest.raises(NoAnswerError, match="^position 0 does not answer; check cable and power$"):
+    with pytest.raises(NoAnswerError, match=r"^position 0 does not answer; check cable and power$"):
         set_offsets(found, 2)
     found.found[0, 0x0910] = None
-    with pytest.raises(NoAnswerError, match="^position 0 does not answer; check cable and power$"):
+    with pytest.raises(NoAnswerError, match=r"^position 0 does not answer; check cable and power$"):
         start_sync0(found, [3], 0.001, True)
 
 
@@ -601,7 +605,9 @@ class Raw:
 
 def test_a_raw_socket_is_bound_to_the_interface_and_ethercat(monkeypatch):
     found, asked = Raw(), []
-    fake = SimpleNamespace(AF_PACKET=17, SOCK_RAW=3, htons=socket.htons, socket=lambda *what: asked.append(what) or found)
+    fake = SimpleNamespace(
+        AF_PACKET=17, SOCK_RAW=3, htons=socket.htons, socket=lambda *what: asked.append(what) or found
+    )
     monkeypatch.setattr(frame_ways, "socket", fake)
     way = RawWay("veth0")
     assert asked == [(17, 3, socket.htons(0x88A4))] and found.bound == ("veth0", 0x88A4) and found.blocks is False
@@ -620,9 +626,9 @@ def test_an_interface_that_cannot_be_opened_is_told(monkeypatch):
     fake = SimpleNamespace(AF_PACKET=17, SOCK_RAW=3, htons=socket.htons, socket=lambda *what: found,
                            if_nameindex=lambda: [(1, "lo"), (2, "eth0")])  # fmt: skip
     monkeypatch.setattr(frame_ways, "socket", fake)
-    with pytest.raises(OpenError, match="^veth0 cannot be opened: No such device; there are lo, eth0$"):
+    with pytest.raises(OpenError, match=r"^veth0 cannot be opened: No such device; there are lo, eth0$"):
         RawWay("veth0")
     assert not found.open
     monkeypatch.setattr(frame_ways, "socket", SimpleNamespace())
-    with pytest.raises(OpenError, match="has no raw sockets for veth0; use --interface ethercat-udp$"):
+    with pytest.raises(OpenError, match=r"has no raw sockets for veth0; use --interface ethercat-udp$"):
         RawWay("veth0")

@@ -13,7 +13,7 @@ from ethercat_rig import Rig, category
 
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
-from drive_env.ethercat.datagrams import Datagram, DatagramCommand, at_station
+from drive_env.ethercat.datagrams import DatagramCommand
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.ethercat import frame_master
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
@@ -194,7 +194,7 @@ def test_slaves_are_counted_by_a_broadcast_that_is_tried_fifty_times(way, lost):
     assert len(master.look()) == 2
     assert way.take()[:51] == ["BRD 0000 0130 2"] * 50 + ["APRD 0000 0130 6"]
     way.change = lambda asked, found: nothing(asked)
-    with pytest.raises(NoAnswerError, match="^no slave answers on the cable; check cable, power and channel$"):
+    with pytest.raises(NoAnswerError, match=r"^no slave answers on the cable; check cable, power and channel$"):
         master.begin()
     assert len(way.sent) == 50
 
@@ -353,7 +353,9 @@ def test_a_state_is_waited_for(way, master, clock):
 def test_a_state_is_waited_for_5_s(way, master, clock, monkeypatch):
     monkeypatch.setattr(frame_master, "LOOK", 0.5)
     way.change = status_of((4, 0))
-    with pytest.raises(BusError, match="^position 1 stays in Safe-Op and does not come to Pre-Op; it gives no reason$"):
+    with pytest.raises(
+        BusError, match=r"^position 1 stays in Safe-Op and does not come to Pre-Op; it gives no reason$"
+    ):
         master.leave_op(1)
     assert clock.now == 1005.5, "at 1005.0 the time is not over"
 
@@ -361,7 +363,7 @@ def test_a_state_is_waited_for_5_s(way, master, clock, monkeypatch):
 @pytest.mark.parametrize("status", [0x12, 0x14])
 def test_a_state_that_is_refused_is_not_waited_for(way, master, clock, status):
     way.change = status_of((status, 0x16))
-    with pytest.raises(BusError, match="AL status code 0016h: its mailbox is not set as its EEPROM says$"):
+    with pytest.raises(BusError, match=r"AL status code 0016h: its mailbox is not set as its EEPROM says$"):
         master.leave_op(1)
     assert clock.slept == []
 
@@ -407,7 +409,7 @@ def test_an_eeprom_that_may_be_written_is_not_busy(way, clock):
 def test_an_eeprom_that_stays_busy_is_told_after_5_s(way, clock, monkeypatch):
     monkeypatch.setattr(frame_master, "LOOK", 0.5)
     way.change = busy(10**6)
-    with pytest.raises(NoAnswerError, match="^the EEPROM of the slave at 0000h stays busy; check its power$"):
+    with pytest.raises(NoAnswerError, match=r"^the EEPROM of the slave at 0000h stays busy; check its power$"):
         FrameMaster(way).look()
     assert clock.now == 1005.5
     way.change = lambda asked, found: [] if asked[0].address & 0xFFFF == 0xFFFF and asked[0].command == 2 else [found]
@@ -468,9 +470,7 @@ MAP = """
 def test_images_lie_one_behind_the_other(way, master):
     """Outputs of a slave (FMMU 0, written) and its inputs (FMMU 1, read), from 10000h on; then Safe-Op."""
     master.map({0: SIZES, 1: SIZES})
-    assert way.take() == split(
-        MAP.format(k=1, outputs="00", inputs="04") + MAP.format(k=2, outputs="0A", inputs="0E")
-    )
+    assert way.take() == split(MAP.format(k=1, outputs="00", inputs="04") + MAP.format(k=2, outputs="0A", inputs="0E"))
 
 
 def test_a_slave_that_has_its_images_keeps_them(way, master):
@@ -498,7 +498,7 @@ def test_an_image_of_nothing_is_switched_off(rig, way, master):
 def test_all_images_together_have_1400_bytes_at_most(way):
     master = FrameMaster(way)
     master.map({0: ImageSizes(500, 200), 1: ImageSizes(600, 100)})
-    with pytest.raises(BusError, match="^the images of 2 slaves have 1401 bytes, and a frame 1400; open fewer$"):
+    with pytest.raises(BusError, match=r"^the images of 2 slaves have 1401 bytes, and a frame 1400; open fewer$"):
         master.map({0: ImageSizes(500, 200), 1: ImageSizes(600, 101)})
 
 
@@ -563,14 +563,14 @@ def test_an_error_is_acknowledged_in_safe_op_before_op_is_asked_for(way, master,
 def test_op_that_does_not_come_in_time_is_told(way, master, clock, monkeypatch):
     monkeypatch.setattr(frame_master, "LOOK", 0.5)
     way.change = status_of((4, 0))
-    with pytest.raises(BusError, match="^position 0 stays in Safe-Op and does not come to Op; it gives no reason$"):
+    with pytest.raises(BusError, match=r"^position 0 stays in Safe-Op and does not come to Op; it gives no reason$"):
         master.operate([0, 1], None, 1.0)
     assert clock.now == 1001.5
 
 
 def test_op_that_is_refused_is_told_at_once_and_of_the_slave_that_refuses(way, master, clock):
     way.change = status_of((4, 0), (4, 0), (4, 0), (0x14, 0x1D))
-    with pytest.raises(BusError, match="^position 1 stays in Safe-Op and does not come to Op; AL status code 001Dh"):
+    with pytest.raises(BusError, match=r"^position 1 stays in Safe-Op and does not come to Op; AL status code 001Dh"):
         master.operate([0, 1], None, 1.0)
     assert clock.slept == []
 
@@ -663,7 +663,10 @@ def test_a_message_whose_frame_is_lost_is_asked_for_again(way, master, answers):
 
 
 def test_emergencies_are_those_of_their_slaves(rig, way, master):
-    rig.devices[1].pending = [bytes.fromhex("00 10 11 86 20 01 02 03 04 05"), bytes.fromhex("00 10 00 00 00 00 00 00 00 00")]
+    rig.devices[1].pending = [
+        bytes.fromhex("00 10 11 86 20 01 02 03 04 05"),
+        bytes.fromhex("00 10 00 00 00 00 00 00 00 00"),
+    ]
     rig.world.cycle()
     assert master.take_emergencies() == [(1, 0x8611, 0x20, (1, 2, 3, 4, 5)), (1, 0, 0, (0, 0, 0, 0, 0))]
     assert master.take_emergencies() == []

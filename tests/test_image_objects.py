@@ -58,7 +58,9 @@ def refused(code, said):
 
 # --- what there is ----------------------------------------------------------------------------------------------------
 def test_a_device_without_sync_managers_has_no_image():
-    with pytest.raises(ValueError, match="^tmcm1636 has no process image: its dictionary lacks 1C12h; its process data"):
+    with pytest.raises(
+        ValueError, match=r"^tmcm1636 has no process image: its dictionary lacks 1C12h; its process data"
+    ):
         Image("tmcm1636")
 
 
@@ -88,7 +90,7 @@ def test_outputs_take_effect_and_inputs_are_as_they_are(image):
     assert image.objects.read_inputs()[12:16].hex(" ") == "fe ff ff ff"
     assert image.objects.write_outputs(bytes(range(30)))
     assert image.values[0x6040, 0] == 0x0100 and image.values[0x707A, 0] == 0x19181716
-    with pytest.raises(ValueError, match="^outputs have 30 bytes as they are mapped, not 29$"):
+    with pytest.raises(ValueError, match=r"^outputs have 30 bytes as they are mapped, not 29$"):
         image.objects.write_outputs(bytes(29))
 
 
@@ -140,7 +142,9 @@ def test_it_stays_as_it_is_while_the_node_says_so(image):
 
 
 # --- complete access --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("index", "whole"), [(0x1C12, True), (0x1600, True), (0x1A00, True), (0x1C00, False), (0x6040, False)])
+@pytest.mark.parametrize(
+    ("index", "whole"), [(0x1C12, True), (0x1600, True), (0x1A00, True), (0x1C00, False), (0x6040, False)]
+)
 def test_assignments_and_mappings_are_written_whole(image, index, whole):
     assert image.objects.writes_whole(index) is whole
 

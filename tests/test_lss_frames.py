@@ -6,7 +6,16 @@ import pytest
 
 from drive_env.canopen.lss import LssIdentity
 from drive_env.master.can import lss
-from drive_env.master.can.lss import LssError, LssMaster, await_node, identity_of, is_taken, parse_identity, row_of, show
+from drive_env.master.can.lss import (
+    LssError,
+    LssMaster,
+    await_node,
+    identity_of,
+    is_taken,
+    parse_identity,
+    row_of,
+    show,
+)
 from drive_env.master.errors import BusError, NoAnswerError
 
 IDENTITY = LssIdentity(0x286, 0x664, 0x10009, 5)
@@ -81,7 +90,9 @@ def test_all_slaves_are_switched_at_once():
 
 def test_a_slave_is_selected_by_its_identity():
     bus = Bus("44")
-    with pytest.raises(LssError, match="^no LSS slave has the identity 286:664:10009:5; look with `drive-env lss scan`"):
+    with pytest.raises(
+        LssError, match=r"^no LSS slave has the identity 286:664:10009:5; look with `drive-env lss scan`"
+    ):
         LssMaster(bus).select(IDENTITY)
     bus = Bus("44 00 00 00 00 00 00 00")
     LssMaster(bus, 0.25).select(IDENTITY)
@@ -136,7 +147,9 @@ def test_a_slave_that_answers_at_first_and_not_at_last_is_told():
         bus = Slaves(IDENTITY)
         answer = bus.answer
         bus.answer = lambda data, bus=bus, answer=answer, steps=steps: answer(data) if bus.steps < steps else None
-        with pytest.raises(LssError, match="^a slave stopped answering within a scan; slaves are slow, or frames are lo"):
+        with pytest.raises(
+            LssError, match=r"^a slave stopped answering within a scan; slaves are slow, or frames are lo"
+        ):
             LssMaster(bus).fastscan()
 
 
@@ -149,9 +162,13 @@ def test_the_slave_in_configuration_tells_its_identity_and_its_node_id():
     assert bus.sent == ["5A", "5B", "5C", "5D", "5E"] and bus.waits == [0.1] * 5
 
 
-@pytest.mark.parametrize("answer", ["5F 05 00 00 00 00 00 00", "5E 05 00 00 00 00 00", "5E 05 00 00 00 00 00 00 00", None])
+@pytest.mark.parametrize(
+    "answer", ["5F 05 00 00 00 00 00 00", "5E 05 00 00 00 00 00", "5E 05 00 00 00 00 00 00 00", None]
+)
 def test_an_answer_of_another_service_or_length_is_none(answer):
-    with pytest.raises(LssError, match="^no LSS slave in configuration answered service 5Eh within 0.1 s; check power "):
+    with pytest.raises(
+        LssError, match=r"^no LSS slave in configuration answered service 5Eh within 0.1 s; check power "
+    ):
         LssMaster(Bus(answer)).node_id()
 
 
@@ -181,7 +198,9 @@ def test_a_bit_rate_is_given_by_its_row(rate, row):
 
 
 def test_a_bit_rate_that_there_is_not_is_told_with_those_that_there_are():
-    with pytest.raises(ValueError, match="^123456 bit/s is no bit rate of LSS; there are 1000000, 800000, 500000, 250000"):
+    with pytest.raises(
+        ValueError, match=r"^123456 bit/s is no bit rate of LSS; there are 1000000, 800000, 500000, 250000"
+    ):
         row_of(123_456)
 
 
@@ -197,7 +216,9 @@ def test_a_bit_rate_is_activated_after_milliseconds(delay, row):
 ])  # fmt: skip
 def test_what_is_not_stored_is_told(answer, why):
     bus = Bus(f"{answer} 00 00 00 00 00")
-    with pytest.raises(LssError, match=f"^the node has not stored its node-ID and bit rate: {why}; they last until power"):
+    with pytest.raises(
+        LssError, match=f"^the node has not stored its node-ID and bit rate: {why}; they last until power"
+    ):
         LssMaster(bus).store(2.0)
     assert bus.waits == [2.0] and bus.sent == ["17"]
 
@@ -285,7 +306,7 @@ def test_a_node_is_waited_for_until_it_answers_under_its_new_node_id(nodes):
     assert len(nodes.asked) == 4 and {one[0] for one in nodes.asked} == {9}
     assert nodes.asked[0][-1] == 0.3
     nodes[9] = IDENTITY._replace(serial=6)
-    with pytest.raises(LssError, match="^the node 286:664:10009:5 took the node-ID 9, and does not answer under it within "
+    with pytest.raises(LssError, match=r"^the node 286:664:10009:5 took the node-ID 9, and does not answer under it within "
                        "1 s; switch it off and on, and look with `drive-env scan`$"):  # fmt: skip
         await_node(None, IDENTITY, 9, 5, 1.0)
     del nodes[9]
@@ -300,7 +321,7 @@ def test_a_node_whose_node_id_is_taken_away_is_waited_for_until_it_is_silent(nod
     await_node(None, IDENTITY, 255, None, 1.0)
     assert nodes.asked == [(5, 0x1000, 0, "1000h:00", 0.3)]
     nodes[5] = IDENTITY
-    with pytest.raises(LssError, match="^the node 286:664:10009:5 took the node-ID 255, and after 1 s it still answers "
+    with pytest.raises(LssError, match=r"^the node 286:664:10009:5 took the node-ID 255, and after 1 s it still answers "
                        "under 5; switch it off and on$"):  # fmt: skip
         await_node(None, IDENTITY, 255, 5, 1.0)
 

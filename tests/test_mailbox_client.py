@@ -193,7 +193,7 @@ def test_of_nothing_a_write_is_no_expedited_one(size, first):
 
 def test_an_abort_is_told_with_its_code():
     mailbox = Mailbox([answer(f"80 {KEY.hex()} 10 00 09 06", 1)])
-    with pytest.raises(SdoAbortError, match="^abort 06090010h") as error:
+    with pytest.raises(SdoAbortError, match=r"^abort 06090010h") as error:
         mailbox.client.download(0x2005, 1, b"\1", 1.0)
     assert error.value.abort_code == 0x06090010
 
@@ -235,7 +235,7 @@ def test_segments_are_answered_by_segments_alone(clock):
 
 def test_an_error_of_the_mailbox_is_told():
     error = struct.pack("<HHBBHH", 4, 0, 0, 1 << 4, 1, 6)
-    with pytest.raises(BusError, match="^a mailbox error of the slave, detail 6$"):
+    with pytest.raises(BusError, match=r"^a mailbox error of the slave, detail 6$"):
         Mailbox([error]).client.upload(0x2005, 1, 1.0)
 
 
@@ -247,7 +247,7 @@ def test_an_answer_is_waited_for_and_the_program_told(clock):
 
 def test_an_answer_that_does_not_come_in_time_is_told(clock, monkeypatch):
     monkeypatch.setattr(mailbox_client, "LOOK", 0.25)
-    with pytest.raises(NoAnswerError, match="^no answer came in time$"):
+    with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
         Mailbox([]).client.upload(0x2005, 1, 1.0)
     assert clock.now == 1001.25, "at 1.0 s the time is not over"
     with pytest.raises(NoAnswerError):

@@ -253,10 +253,10 @@ def test_the_history_has_the_newest_first_and_so_many():
     history = ErrorHistory(3)
     history.add(0x1000)
     assert history.read(1) == 0x1000
-    with pytest.raises(ObjectAccessError, match="^1003h:02 holds no error; there are 1 ") as error:
+    with pytest.raises(ObjectAccessError, match=r"^1003h:02 holds no error; there are 1 ") as error:
         history.read(2)
     assert error.value.abort_code == 0x08000024
-    with pytest.raises(ObjectAccessError, match="^1003h:00 cannot be 1; 0 clears it ") as error:
+    with pytest.raises(ObjectAccessError, match=r"^1003h:00 cannot be 1; 0 clears it ") as error:
         history.write(1)
     assert error.value.abort_code == 0x06090030 and history.read(0) == 1
     history.write(0)

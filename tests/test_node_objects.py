@@ -135,7 +135,7 @@ def test_a_command_wants_its_signature():
     command = signed_command(SAVE, 0x08000020, lambda: done.append(1))
     command(SAVE)
     assert done == [1]
-    with pytest.raises(ObjectAccessError, match="^64616F6Ch is not the signature 65766173h ") as error:
+    with pytest.raises(ObjectAccessError, match=r"^64616F6Ch is not the signature 65766173h ") as error:
         command(LOAD)
     assert error.value.abort_code == 0x08000020 and done == [1]
 
@@ -239,7 +239,7 @@ def test_what_cannot_be_written_is_a_hardware_error(node):
         raise OSError("disk full")
 
     node.store.save = fails
-    with pytest.raises(ObjectAccessError, match="^the parameters cannot be stored: disk full ") as error:
+    with pytest.raises(ObjectAccessError, match=r"^the parameters cannot be stored: disk full ") as error:
         node.write(0x1010, 1, SAVE)
     assert error.value.abort_code == 0x06060000 and node.axes.stored is None
 
@@ -248,7 +248,7 @@ def test_a_stored_value_that_fits_no_object_is_told(node, tmp_path):
     node.store.sections = {"communication": {(0x1017, 0): 500}}
     node.parameters.check(tmp_path)
     node.store.sections = {"communication": {(0x1017, 0): 70_000}}
-    with pytest.raises(ValueError, match="does not fit tmcm1636: .*1017h:00 .*; delete it$"):
+    with pytest.raises(ValueError, match=r"does not fit tmcm1636: .*1017h:00 .*; delete it$"):
         node.parameters.check(tmp_path)
     asked = []
     node.parameters.check(tmp_path, lambda *what: asked.append(what) or True)
@@ -311,7 +311,9 @@ def test_a_file_of_something_else_is_told(tmp_path, change, why):
     path.write_text(json.dumps(GOOD))
     assert Store(path, "tmcm1636").sections == {"bus": {(0x2704, 0): 5}}
     path.write_text(json.dumps({**GOOD, **change}))
-    with pytest.raises(ValueError, match="has no parameters of a tmcm1636 .*; give another file, or delete it") as error:
+    with pytest.raises(
+        ValueError, match=r"has no parameters of a tmcm1636 .*; give another file, or delete it"
+    ) as error:
         Store(path, "tmcm1636")
     assert why in str(error.value)
 

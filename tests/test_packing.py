@@ -307,6 +307,6 @@ def test_a_dummy_passes_over_what_comes_in(raw, transmit, taken):
     else:
         with pytest.raises(ObjectAccessError):
             mapping.check_mappable(entry(0x1600, sub=1), raw, transmit, find)
-    with pytest.raises(ObjectAccessError, match="^1600h:01 an object cannot map 0005h:03: none ") as error:
+    with pytest.raises(ObjectAccessError, match=r"^1600h:01 an object cannot map 0005h:03: none ") as error:
         mapping.check_mappable(entry(0x1600, sub=1), 0x00050308, False, Objects().find)
     assert error.value.abort_code == CANNOT_BE_MAPPED

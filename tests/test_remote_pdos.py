@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_eds import I8, I16, I32, TEXT, U8, U16, described, small_eds
+from small_eds import I8, I16, I32, TEXT, U16, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.can import pdo
@@ -131,7 +131,7 @@ def test_what_no_pdo_carries_is_told_with_what_one_does(drive, one):
         f"6061h:00 Mode display cannot be recorded: no TPDO of small carries it; they carry {listed}, {further}. "
         "Read or write it instead"
     )
-    with pytest.raises(ObjectAccessError, match="^6041h:00 Statusword cannot be played: no RPDO of small carries it"):
+    with pytest.raises(ObjectAccessError, match=r"^6041h:00 Statusword cannot be played: no RPDO of small carries it"):
         pdo.check_mappable(drive, one(0x6041), INTO_DRIVE)
     none = described(small_eds([(0x6041, "Statusword", U16, "ro", 0)], []), 1)
     assert pdo.mappable_names(none, INTO_DRIVE) == "none"
@@ -232,7 +232,9 @@ def test_an_identifier_that_the_node_has_is_kept(pdos, node, one):
 
 def test_an_identifier_of_29_bits_is_none_of_ours(pdos, node, one):
     node.put(0x1400, 1, 0x20000321, 4)
-    with pytest.raises(BusError, match=r"^RPDO 1 of node 5 has no 11-bit identifier \(20000321h in 1400h:01\); give it "):
+    with pytest.raises(
+        BusError, match=r"^RPDO 1 of node 5 has no 11-bit identifier \(20000321h in 1400h:01\); give it "
+    ):
         pdos.configure([one(0x6040)], INTO_DRIVE)
 
 
@@ -264,7 +266,7 @@ def test_only_the_first_four_pdos_of_a_further_axis_can_borrow(borrowed):
         node.put(0x1600 + number, 1, 0, 4)
     node.put(0x1404, 1, 0x321, 4)
     groups = [[drive.dictionary.find(0x6040)]] * 5
-    with pytest.raises(BusError, match="^RPDO 10 of node 5 has no 11-bit identifier "):
+    with pytest.raises(BusError, match=r"^RPDO 10 of node 5 has no 11-bit identifier "):
         PdoConfiguration(5, node, drive, borrowed).configure(groups, INTO_DRIVE)
     assert [row for row in node.take() if row[:7] in ("1408:01",)][-1] == f"1408:01 {0x500 + 51:08X}"
 
@@ -279,7 +281,7 @@ def test_of_the_types_that_wait_for_sync_the_first_is_taken_that_the_drive_takes
 
 def test_a_drive_that_takes_none_of_them_is_told(pdos, node, one):
     node.refused[0x1400, 2] = (0, 1)
-    with pytest.raises(RefusedError, match="^0 is none"):
+    with pytest.raises(RefusedError, match=r"^0 is none"):
         pdos.configure([one(0x6040)], INTO_DRIVE)
 
 
@@ -332,7 +334,7 @@ def test_what_cannot_be_put_back_keeps_nothing_else_from_it(pdos, node, one):
     pdos.configure([one(0x6040)], INTO_DRIVE)
     node.take()
     node.silent = {0x1800}
-    with pytest.raises(BusError, match="^1800h is silent$"):
+    with pytest.raises(BusError, match=r"^1800h is silent$"):
         pdos.restore()
     assert {row[:4] for row in node.take()} == {"1803", "1A03", "1400", "1600", "1403", "1603"}
 
@@ -430,7 +432,9 @@ class Configured:
             for entry in group:
                 members.append(Member(entry, 0, start, entry.bits // 8))
                 start += entry.bits // 8
-            pdos.append(RemotePdo(f"PDO {number + 1}", direction.identifiers[number] + self.node, start, tuple(members)))
+            pdos.append(
+                RemotePdo(f"PDO {number + 1}", direction.identifiers[number] + self.node, start, tuple(members))
+            )
         return pdos
 
     def forget(self):
@@ -492,7 +496,7 @@ def test_nothing_counts_as_mapped_of_nodes_that_have_restarted(process, nodes, o
 
 def test_what_does_not_fit_into_pdos_is_told_and_maps_nothing(process, nodes, of):
     five = of(0x6064, 0x606C, 0x6081, 0x6041, 0x6060)
-    with pytest.raises(ObjectAccessError, match="^6 objects of 152 bits do not fit"):
+    with pytest.raises(ObjectAccessError, match=r"^6 objects of 152 bits do not fit"):
         process.map((), (*five, of(0x6064)[0]))
     assert process.mapping == 0 and nodes[0].asked == []
 
@@ -503,7 +507,7 @@ def test_what_is_welcome_comes_as_far_as_there_is_room(process, single, nodes, b
     assert process.choose(wanted, welcome) == of(0x6064, 0x6041, 0x606C, 0x6081, 0x6060)
     more = (*welcome, *of(0x6064, 0x606C))
     assert process.choose(wanted, more)[:5] == of(0x6064, 0x6041, 0x606C, 0x6081, 0x6060)
-    with pytest.raises(ObjectAccessError, match="^5 objects of 160 bits do not fit"):
+    with pytest.raises(ObjectAccessError, match=r"^5 objects of 160 bits do not fit"):
         process.choose(of(0x6064, 0x606C, 0x6081) + of(0x6064, 0x606C), welcome)
     # With all stuff bits: SYNC 47, of each PDO 47 + 64 + 24, of two nodes; the RPDO 47 + 16 + 12.
     for bits, expected in ((47 + 2 * 135 + 2 * 75, of(0x6064, 0x606C)), (47 + 2 * 135 + 2 * 75 - 1, of(0x6064))):
@@ -529,7 +533,11 @@ def test_rows_go_out_node_by_node(process, bus, of):
     assert process.outputs({}) is None
     process.map(of(0x607A, 0x6040, 0x6060), ())
     controlword, target, mode = of(0x6040, 0x607A, 0x6060)
-    played = {controlword: np.array([[6, 7], [8, 9]]), target: np.array([[1, -1], [2, -2]]), mode: np.array([[8, 9]] * 2)}
+    played = {
+        controlword: np.array([[6, 7], [8, 9]]),
+        target: np.array([[1, -1], [2, -2]]),
+        mode: np.array([[8, 9]] * 2),
+    }
     rows = process.outputs(played)
     rows.send(1)
     assert bus.sent == [(0x205, "02 00 00 00 08 00 08"), (0x207, "fe ff ff ff 09 00 09")]
@@ -588,7 +596,9 @@ def test_nodes_that_do_not_boot_are_told(network, bus):
     network.on_restart = restarted.append
     bus.takers[0x707](b"\0")  # before the reset: that is no boot-up after it
     bus.wait = lambda done, timeout: bus.takers[0x705](b"\0") or done()
-    with pytest.raises(NoAnswerError, match=r"^node 7 sent no boot-up message \(700h \+ node\) within 5 s of its reset; "):
+    with pytest.raises(
+        NoAnswerError, match=r"^node 7 sent no boot-up message \(700h \+ node\) within 5 s of its reset; "
+    ):
         network.reset((5, 7))
     bus.takers[0x705](b"\0")
     assert restarted == [7, 5], "and the reset is over"

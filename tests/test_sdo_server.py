@@ -416,11 +416,14 @@ ABORTED_BLOCK = """
 def test_what_follows_an_aborted_block_out_of_turn_ends_its_segments(blocks, after):
     blocks.play(ABORTED_BLOCK)
     blocks.play(after)
-    blocks.play("""
+    blocks.play(
+        """
         04 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05
         00 41 42 43 44 45 46 47 -> 80 00 00 00 01 00 04 05
         40 00 20 00 00 00 00 00 -> 4F 00 20 00 %s 00 00 00
-    """ % ("2A" if after[:2] == "2F" else "07"))
+    """
+        % ("2A" if after[:2] == "2F" else "07")
+    )
 
 
 @pytest.mark.parametrize("transcript", [

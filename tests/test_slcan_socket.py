@@ -293,7 +293,7 @@ def test_who_does_not_take_the_token_is_let_go(answers, said):
 
 def test_what_is_no_token_is_not_sent():
     connection = Connection()
-    with pytest.raises(OpenError, match="; take the one that `drive-env serve` printed$"):
+    with pytest.raises(OpenError, match=r"; take the one that `drive-env serve` printed$"):
         slcan_socket._present("short", connection, "chan")
     assert connection.sent == b"" and not connection.is_open
     connection = Connection(b"\r")
@@ -312,5 +312,7 @@ def test_a_connection_is_tried_for_3_s(monkeypatch):
 def test_a_question_for_the_token_is_told(joined):
     bus, adapter = joined
     adapter.sendall(b"K\r")
-    with pytest.raises(OpenError, match="asks for a token; set DRIVE_ENV_TOKEN to the one that `drive-env serve` print"):
+    with pytest.raises(
+        OpenError, match="asks for a token; set DRIVE_ENV_TOKEN to the one that `drive-env serve` print"
+    ):
         bus.recv(20.0)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from drive_env.ethercat.application import AlState
 from drive_env.master.errors import BusError, NoAnswerError, OpenError
 from drive_env.master.ethercat import clocks, soem_master
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
@@ -211,20 +210,22 @@ def test_soem_waits_longer_than_it_would_for_a_chip(pysoem):
 
 
 def test_an_interface_that_cannot_be_opened_is_told(pysoem):
-    with pytest.raises(OpenError, match="^eth7 cannot be opened: it is no network interface here, or the right CAP_NE"):
+    with pytest.raises(
+        OpenError, match=r"^eth7 cannot be opened: it is no network interface here, or the right CAP_NE"
+    ):
         SoemMaster("eth7")
 
 
 def test_without_pysoem_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pysoem", None)
-    with pytest.raises(OpenError, match="^a master on EtherCAT needs pysoem: pip install"):
+    with pytest.raises(OpenError, match=r"^a master on EtherCAT needs pysoem: pip install"):
         SoemMaster("eth0")
 
 
 @pytest.mark.parametrize("count", [0, -1])
 def test_nobody_there_is_told(master, soem, count):
     soem.count = count
-    with pytest.raises(NoAnswerError, match="^no slave answers on eth0; check cable, power and channel$"):
+    with pytest.raises(NoAnswerError, match=r"^no slave answers on eth0; check cable, power and channel$"):
         master.begin()
     soem.count = 1
     assert master.begin() == 1
@@ -254,7 +255,7 @@ def test_all_slaves_come_to_pre_op(master, soem, clock):
     assert take(soem) == ["find"]
     assert clock.slept == [0.001] * 2 and len(told) == 2
     soem.slaves[1].statuses = [(0x12, 0x16)]
-    with pytest.raises(BusError, match="^position 1 stays in Pre-Op and .* to Pre-Op; AL status code 0016h"):
+    with pytest.raises(BusError, match=r"^position 1 stays in Pre-Op and .* to Pre-Op; AL status code 0016h"):
         master.begin()
     assert len(clock.slept) == 2, "a refusal is told at once"
 
@@ -262,7 +263,9 @@ def test_all_slaves_come_to_pre_op(master, soem, clock):
 def test_a_state_is_waited_for_5_s(master, soem, clock):
     clock.sleep = lambda seconds: setattr(clock, "now", clock.now + 0.5)
     soem.slaves[0].statuses = [(4, 0)]
-    with pytest.raises(BusError, match="^position 0 stays in Safe-Op and does not come to Pre-Op; it gives no reason$"):
+    with pytest.raises(
+        BusError, match=r"^position 0 stays in Safe-Op and does not come to Pre-Op; it gives no reason$"
+    ):
         master.leave_op(0)
     assert clock.now == 1005.5, "at 1005.0 the time is not over"
     assert take(soem) == [(0, "state", 0x12)]
@@ -298,7 +301,7 @@ def test_a_register_that_is_not_taken_is_told(master, soem):
     master.write_register(1, 0x0420, b"\x01\x02")
     assert take(soem) == [(1, "write", 0x0420, b"\x01\x02")]
     soem.slaves[1].silent = 1
-    with pytest.raises(NoAnswerError, match="^position 1 does not answer; check cable and power$"):
+    with pytest.raises(NoAnswerError, match=r"^position 1 does not answer; check cable and power$"):
         master.write_register(1, 0x0420, b"\x01\x02")
 
 
@@ -315,17 +318,17 @@ def test_images_are_soem_s_to_map_and_must_have_the_length_that_is_expected(mast
     master.map({0: SIZES, 1: SIZES})
     assert take(soem) == ["map"]
     soem.slaves[1].input = b"input"
-    with pytest.raises(BusError, match="^position 1 has images of 4 and 5 bytes, not of 4 and 6; compare the EDS"):
+    with pytest.raises(BusError, match=r"^position 1 has images of 4 and 5 bytes, not of 4 and 6; compare the EDS"):
         master.map({0: SIZES, 1: SIZES})
     soem.error = ConfigMapError("no room")
-    with pytest.raises(BusError, match="^SOEM cannot map the images: no room; see the drive's manual$"):
+    with pytest.raises(BusError, match=r"^SOEM cannot map the images: no room; see the drive's manual$"):
         master.map({0: SIZES, 1: SIZES})
 
 
 def test_a_slave_that_refuses_its_images_is_told(master, soem):
     soem.slaves[1].statuses = [(0x12, 0x1D)]
     soem.slaves[0].statuses = [(4, 0)]
-    with pytest.raises(BusError, match="^position 1 .* does not come to Safe-Op; AL status code 001Dh"):
+    with pytest.raises(BusError, match=r"^position 1 .* does not come to Safe-Op; AL status code 001Dh"):
         master.map({0: SIZES, 1: SIZES})
 
 
@@ -340,7 +343,7 @@ def test_clocks_are_soem_s_and_sync0_starts_in_pre_op_alone(master, soem, monkey
         (1, "write", 0x09A0, struct.pack("<I", 1_000_000)), (1, "write", 0x0981, b"\x03"), "map",
     ]  # fmt: skip
     soem.slaves[1].registers[0x0008] = b"\0\0"
-    with pytest.raises(BusError, match="^position 1 has no distributed clocks; open it without sync0$"):
+    with pytest.raises(BusError, match=r"^position 1 has no distributed clocks; open it without sync0$"):
         master.map({0: SIZES})
 
 
@@ -358,14 +361,14 @@ def test_slaves_are_taken_to_op_while_images_are_exchanged(master, soem, clock):
 def test_op_that_does_not_come_in_time_is_told(master, soem, clock):
     clock.sleep = lambda seconds: setattr(clock, "now", clock.now + 0.5)
     soem.slaves[0].statuses, soem.slaves[1].statuses = [(4, 0)], [(8, 0)]
-    with pytest.raises(BusError, match="^position 0 stays in Safe-Op and does not come to Op; it gives no reason$"):
+    with pytest.raises(BusError, match=r"^position 0 stays in Safe-Op and does not come to Op; it gives no reason$"):
         master.operate([1, 0], None, 1.0)
     assert clock.now == 1001.5
 
 
 def test_op_that_is_refused_is_told_at_once_and_of_the_slave_that_refuses(master, soem, clock):
     soem.slaves[0].statuses, soem.slaves[1].statuses = [(4, 0)], [(4, 0), (0x14, 0x1D)]
-    with pytest.raises(BusError, match="^position 1 stays in Safe-Op and does not come to Op; AL status code 001Dh"):
+    with pytest.raises(BusError, match=r"^position 1 stays in Safe-Op and does not come to Op; AL status code 001Dh"):
         master.operate([0, 1], None, 1.0)
     assert clock.slept == []
 
@@ -438,7 +441,7 @@ def test_an_abort_and_a_mailbox_error_are_told(master, soem):
     with pytest.raises(SdoAbortError) as error:
         master.upload(0, 0x2005, 0, 1.0)
     assert error.value.abort_code == 0x06020000
-    with pytest.raises(BusError, match="^a mailbox error of the slave, detail 4$"):
+    with pytest.raises(BusError, match=r"^a mailbox error of the slave, detail 4$"):
         master.upload(0, 0x2005, 0, 1.0)
 
 
@@ -455,7 +458,7 @@ def test_a_read_that_was_not_answered_is_tried_again_until_its_time_is_over(mast
     soem.slaves[0].answers = [after(clock, 0.5, error), after(clock, 0.5, error), b"\1"]
     assert master.upload(0, 0x2005, 0, 1.0) == b"\1"
     soem.slaves[0].answers = [after(clock, 0.5, error), after(clock, 0.6, error), b"\1"]
-    with pytest.raises(NoAnswerError, match="^no answer came in time$"):
+    with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
         master.upload(0, 0x2005, 0, 1.0)
 
 
@@ -463,7 +466,7 @@ def test_a_write_is_tried_again_only_where_it_was_not_sent(master, soem, clock):
     soem.slaves[0].answers = [after(clock, 0.25, WkcError()), None]
     master.download(0, 0x2005, 0, b"\1", 1.0)
     soem.slaves[0].answers = [after(clock, 0.26, WkcError()), None]
-    with pytest.raises(NoAnswerError, match="^no answer came in time$"):
+    with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
         master.download(0, 0x2005, 0, b"\1", 1.0)
 
 
