@@ -60,6 +60,28 @@ PROFILE = """
 60FF target velocity RPDO
 6502 supported drive modes No
 """
+# The same of the other objects: "CAN PDO mapping" of those of communication, and the text on 4000h to 4003h. Those of
+# 2000h to 3FFFh have no column.
+OTHERS = """
+1000 No
+1001 TPDO
+1003 No 64
+1010 No 1
+1011 No 1
+1018 No 4
+1400 No 2
+1600 No 8
+1800 No 2
+1A00 No 8
+1C12 No 1
+1C13 No 1
+1C32 No 2
+1C33 No 2
+4000 TPDO
+4001 RPDO
+4002 TPDO 2
+4003 TPDO 2
+"""
 # Mode of operation, and the D-Mode that it requires.
 D_MODES = {1: 7, 3: 6, 4: 1, 6: 7, 7: 3, 8: 3, 9: 2, 10: 1}
 # Default mapping of PDOs: objects of RPDO and TPDO 1 to 4.
@@ -133,9 +155,28 @@ def test_an_object_of_the_profile_is_there_for_both_axes(row, axis):
         if mapping == "TPDO":
             assert entry.access == "ro"
         elif mapping == "RPDO":
-            assert entry.access == "rw"
+            assert entry.access == "rww"  # CiA 306: RPDOs alone carry it
     if last.isdigit():
         assert entries.find((index, 0)).default == int(last)
+
+
+@pytest.mark.parametrize("row", [*rows(PROFILE), *rows(OTHERS)], ids=lambda row: row[0])
+def test_a_pdo_carries_what_the_column_of_its_direction_says_and_nothing_else(row):
+    """Over the wire, both ways: another one is refused with 06040041h, and the default mapping stays."""
+    index = int(row[0], 16)
+    *name, last = row[1:]
+    subs, column = (range(1, int(last) + 1), name[-1]) if last.isdigit() else ([0], last)
+    with two_axes() as drives:
+        wire, entries = Wire(drives), drives.device.new_dictionary()
+        for way, communication, mapping in (("RPDO", 0x1402, 0x1602), ("TPDO", 0x1802, 0x1A02)):
+            off = wire.value(communication, 1) | 1 << 31
+            assert wire.download(communication, 1, off, 4) == 0
+            assert wire.download(mapping, 0, 0, 1) == 0
+            for axis in range(2 if index >= 0x6000 else 1):
+                for sub in list(subs)[:10]:
+                    entry = entries.find((index + 0x800 * axis, sub))
+                    code = wire.download(mapping, 1, entry.index << 16 | sub << 8 | entry.bits, 4)
+                    assert code == (0 if column == way else 0x06040041), (way, entry.label)
 
 
 @pytest.mark.parametrize("row", rows(MAPPINGS), ids=lambda row: row[0])
@@ -366,6 +407,34 @@ def test_both_axes_have_the_same_outputs_by_either_object(wire):
     assert (wire.value(0x60FE, 1), wire.value(0x68FE, 1)) == (0x2A0000, 0x2A0000)
     assert wire.download(0x60FE, 2, 0x00030000, 4) == 0  # the mask holds the others back
     assert wire.drives.machine.outputs.tolist() == [0x02, 0x02]
+
+
+def test_every_parameter_is_stored_also_those_of_rpdos_and_the_outputs_mask(wire):
+    """1010h stores settings (M has no list of them); what commands an axis or sets outputs begins anew."""
+    known, changed = wire.drives.device.new_dictionary(5), {}
+    commands = {0x23C6, 0x4001, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}
+    own = [entry for entry in known if entry.index >= 0x2000 and entry.bits <= 32 and entry.access in ("rw", "rww")]
+    # 60FEh:01 is what 4001h is a part of.
+    writable = [entry for entry in own if (entry.index & 0xF7FF, entry.sub) != (0x60FE, 1)]
+    for entry in writable:
+        base = wire.drives.device.locate(entry.index)[1]
+        before = wire.value(entry.index, entry.sub)
+        for raw in {0x3F0000, 1, 2, 3, 0, 0x1721, 0x1B21} - {before}:
+            fits = raw < 1 << entry.bits - entry.signed
+            if fits and wire.download(entry.index, entry.sub, raw, entry.bits // 8) == 0:
+                changed[entry.index, entry.sub] = base in commands
+                break
+    assert set(changed) == {(entry.index, entry.sub) for entry in writable}
+    before = {key: wire.value(*key) for key in changed}
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    wire.play("""
+        rx 000  81 05
+        tx 705  00
+    """)
+    for key, is_command in changed.items():
+        expected = known.find(key).default if is_command else before[key]
+        assert wire.value(*key) == expected, f"{key[0]:04X}h:{key[1]:02X}"
+    assert wire.drives.machine.outputs.tolist() == [0, 0]
 
 
 def test_both_axes_of_a_machine_show_the_same_inputs_in_bits_16_to_23():

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, UNSUPPORTED_ACCESS, ObjectAccessError
+from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
 
 MAX_BITS = 64
@@ -51,9 +52,10 @@ def check_mappable(entry: Entry, raw: int, transmit: bool, find: Callable[[int, 
         ) from error
     if index in DUMMIES and not transmit and mapped.bits == bits and bits in LAYOUT:
         return mapped  # room of a frame that is passed over; only those are there that the EDS allows
-    wrong_way = "wo" if transmit else "ro"
-    if not mapped.pdo_mappable or mapped.access in (wrong_way, "const") or mapped.bits not in LAYOUT:
-        raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot map {mapped.label}, {mapped.access}")
+    if not fits_pdo(mapped, transmit) or mapped.bits not in LAYOUT:
+        other = "TPDOs" if fits_pdo(mapped, True) else "RPDOs" if fits_pdo(mapped, False) else ""
+        ways = f"{other} alone carry it" if other and mapped.bits in LAYOUT else "no PDO carries it"
+        raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot map {mapped.label}, {mapped.access}: {ways}")
     if mapped.bits != bits:
         raise ObjectAccessError(
             CANNOT_BE_MAPPED, f"{entry.label}: {mapped.label} has {mapped.bits} bits, not {bits}; write the object's"
