@@ -464,6 +464,23 @@ def test_a_motor_that_oscillates_has_no_wrong_commutation(load):
         assert all(one.code != 0x7122 for one in drives.emergencies())
 
 
+@pytest.mark.parametrize("velocity_i", [0, 300])
+def test_nor_has_one_that_oscillates_in_few_periods_of_supervision(velocity_i):
+    """At some 250 Hz each look of 1 kHz finds another sign of current and speed: none of them lasts."""
+    gains = np.rint(np.geomspace(3000, 24_000, 16)).astype(int)
+    with EmulatedDrives("tgz_d", "inertia", num_machines=len(gains), num_threads=1, seed=0) as drives:
+        drives.write(cia402.FOLLOWING_WINDOW, 0)
+        drives.write(0x23D2, gains)
+        drives.write(0x23D3, velocity_i)
+        drives.write(0x23D4, 1000)
+        motion.enable(drives, mode="csp")
+        targets = np.where(np.arange(600) // 60 % 2 == 0, 0, TURN // 8)
+        trace = drives.record([cia402.VELOCITY_ACTUAL], 0.6, play={cia402.TARGET_POSITION: targets})
+        turns = np.abs(np.diff(np.sign(trace[cia402.VELOCITY_ACTUAL][200:]), axis=0)).sum(axis=0) / 2
+        assert np.count_nonzero(turns > 100) >= 4, "some of them swing"
+        assert {hex(one.code) for one in drives.emergencies()} <= {"0x2200", "0x8400"}
+
+
 def test_a_cyclic_set_point_that_no_motor_could_follow_is_no_trajectory(drives):
     motion.enable(drives, mode="csp")
     drives.write(cia402.FOLLOWING_WINDOW, 0)

@@ -374,6 +374,33 @@ def test_an_axis_whose_mains_are_cut_tells_of_them_and_of_the_link_that_empties(
         assert of_axis == [bit for bit in range(32) if bits >> bit & 1] == [1, 4], axis
 
 
+@pytest.mark.parametrize("word", [None, 0x06], ids=["switch on disabled", "ready to switch on"])
+def test_an_error_that_is_there_acts_in_every_state(wire, word):
+    """M, 1001h: bit 0 is "any active bit"; CiA 402: a fault leads from every state to fault."""
+    for index in (0x6040, 0x6840):
+        assert word is None or wire.download(index, 0, word, 2) == 0
+    for axis, bit, code in ((0, 20, 0xF001), (1, 2, 0x8A00)):
+        wire.drives.machine.error_bits = [(1 << bit) * (axis == k) for k in range(2)]
+        wire.wait(3)
+        assert wire.value(0x6041 + 0x800 * axis, 0) & FAULT[0] == FAULT[1]
+        assert wire.value(0x6841 - 0x800 * axis, 0) & FAULT[0] != FAULT[1]
+        assert wire.value(0x1001, 0) == (0x81 if axis else 0x01)
+        assert wire.value(0x1003, 1) == bit << 24 | axis << 16 | code
+        wire.take()
+        motion_word = 0x6040 + 0x800 * axis
+        assert wire.download(motion_word, 0, 0x80, 2) == 0
+        wire.wait(2)
+        assert wire.value(0x6041 + 0x800 * axis, 0) & FAULT[0] == FAULT[1], "it is there still"
+        wire.drives.machine.error_bits = 0
+        wire.wait(2)
+        assert wire.download(motion_word, 0, 0, 2) == 0
+        assert wire.download(motion_word, 0, 0x80, 2) == 0
+        wire.wait(2)
+        wire.take()
+        assert wire.value(0x6041 + 0x800 * axis, 0) & 0x4F == 0x40
+        assert wire.value(0x1001, 0) == 0
+
+
 def test_a_lost_network_is_an_error_of_each_axis(wire):
     """Bit 17 of the manual's table, host communication (8100h), whatever the emergency's code is by CiA 301."""
     motion.enable(wire.drives, mode="pp")
@@ -504,11 +531,40 @@ def test_two_drives_of_one_axis_share_nothing_though_they_turn_one_machine():
 def test_of_four_axes_each_drive_has_a_link_of_its_own():
     with EmulatedDrives("tgz_d", "inertia", num_machines=4, num_threads=1) as drives:
         World().add(drives, [1, 2])
-        drives.machine.supply = [560.0, 500.0, 450.0, 400.0]
+        drives.machine.supply = [560.0, 560.0, 450.0, 450.0]
         drives.advance(1.0)  # until the idle power has drawn both links down to their mains
         link = get_lanes(drives.inside.records, "u_dc", 4)
         assert link[0] == link[1] > link[2] + 50.0
         assert link[2] == link[3]
+
+
+def test_axes_of_one_link_have_one_supply():
+    """Two values are refused, and change nothing; a dip or a short circuit of either axis is the link's."""
+    with two_axes() as drives:
+        drives.machine.supply = [560.0, 500.0]  # two machines by themselves
+        with pytest.raises(ValueError, match="axes 0 and 1 share a DC link, which has one supply, not 560 V and 500 V"):
+            World().add(drives, [1])
+        drives.advance(1.0)
+        link = get_lanes(drives.inside.records, "u_dc", 2)
+        assert link[0] > link[1] + 20.0, "they have two links still"
+        drives.machine.supply = 560.0
+        World().add(drives, [1])
+        assert drives.machine.links.tolist() == [0, 0]
+        with pytest.raises(ValueError, match="not 560 V and 0 V; give both the same"):
+            drives.machine.supply = [560.0, 0.0]
+        assert drives.machine.supply.tolist() == [560.0, 560.0]
+        drives.machine.supply = [540.0, 540.0]
+        for axis in range(2):
+            drives.machine.fault("supply_dip", voltage=450.0, where=np.arange(2) == axis)
+            drives.advance(2.0)  # the idle power draws it down
+            link = get_lanes(drives.inside.records, "u_dc", 2)
+            assert link[0] == link[1] < 460.0, "of either axis"
+            drives.machine.clear_fault()
+            drives.advance(0.5)
+            assert get_lanes(drives.inside.records, "u_dc", 2).min() > 500.0
+    for name, links in (("tgz_d", [0, 0]), ("tgz_s", [0, 1])):
+        with EmulatedDrives(name, "gantry", num_threads=1) as drives:
+            assert drives.machine.links.tolist() == links
 
 
 def energies(drives):
