@@ -203,6 +203,30 @@ def test_torque_is_added_to_the_set_point_of_the_current_in_csp_and_ip(drives, m
     assert field(drives, "torque_feed_forward")[0] == 0.0
 
 
+@pytest.mark.parametrize(("mode", "acts"), [
+    ("pp", False), ("pv", False), ("hm", False), ("csv", False),
+    ("tq", True), ("ip", True), ("csp", True), ("cst", True),
+])  # fmt: skip
+def test_target_torque_acts_in_the_modes_of_its_section_alone(mode, acts):
+    """M, 6071h: pt and cst; "also in cyclic positioning modes IP and CSP". The images' comments say PP for IP."""
+    seen = []
+    for torque in (0, 3000):
+        with new_drives() as drives:
+            drives.write(cia402.FOLLOWING_WINDOW, 0)
+            drives.write(cia402.HOMING_METHOD, 37)
+            motion.enable(drives, mode=mode)
+            drives.write(cia402.TARGET_TORQUE, torque)
+            if mode in ("pp", "ip", "csp"):
+                drives.write(cia402.TARGET_POSITION, 500)
+            if mode in ("pv", "csv"):
+                drives.write(cia402.TARGET_VELOCITY, 50_000)
+            if mode in ("pp", "hm"):
+                drives.write(cia402.CONTROLWORD, 0x1F)
+            trace = drives.record([cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], 0.02)
+            seen.append([trace[name][:, 0].tolist() for name in (cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL)])
+    assert (seen[0] != seen[1]) == acts
+
+
 # --- positions --------------------------------------------------------------------------------------------------------
 def test_positions_are_kept_to_a_part_of_an_increment_over_a_whole_turn_of_the_counter(drives):
     """int32 outside, 2^28 increments a revolution inside: 4096 : 1 of 608Fh."""
