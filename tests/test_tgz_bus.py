@@ -45,6 +45,8 @@ from test_parity import assert_equal
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame
+from drive_env.commands.options import default_samples
+from drive_env.commands.scope import DEFAULT
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.firmware.record import set_lanes
@@ -178,6 +180,14 @@ def test_quantities_are_by_the_scales_of_each_axis_over_the_bus(inside):
         raw = trace[0x606C].mean(axis=0)
         np.testing.assert_allclose(raw, [500_000, 143], rtol=0.01)
         np.testing.assert_allclose(trace[0x6077, "A"], trace[0x6077] * peak / 32767, rtol=1e-9)
+
+
+def test_what_a_scope_shows_by_default_can_be_recorded(inside):
+    """60FFh is not among it: no TPDO carries it."""
+    with lockstep(inside) as drives:
+        names = default_samples(drives.description.dictionary, DEFAULT)
+        assert names == ["6062", "6064", "606C", "6077"]
+        assert len(drives.record([int(name, 16) for name in names], 0.003).t) == 3
 
 
 def test_modes_are_changed_over_the_bus_while_the_axes_are_enabled(inside):
