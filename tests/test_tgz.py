@@ -771,3 +771,60 @@ def test_the_second_axis_of_a_tgz_s_is_there_and_does_nothing():
         motion.move_to(drives, 65_536, relative=True, timeout=3.0)
         assert abs(wire.value(0x6864, 0)) == 0
         assert wire.value(0x1001, 0) == 0
+
+
+# --- motion profile types ---------------------------------------------------------------------------------------------
+# Acceleration over the time of a ramp, as a share of its greatest, of speeding up and of slowing down: -3 sinusoidal,
+# -2 fast acceleration and deceleration, -1 fast acceleration and slow deceleration, 0 trapezoidal, 1 sin^2.
+ACCELERATIONS = {
+    -3: (lambda y: np.sin(np.pi * y),) * 2,
+    -2: (lambda y: np.cos(0.5 * np.pi * y), lambda y: np.sin(0.5 * np.pi * y)),
+    -1: (lambda y: np.cos(0.5 * np.pi * y),) * 2,
+    0: (np.ones_like,) * 2,
+    1: (lambda y: np.sin(np.pi * y) ** 2,) * 2,
+}
+
+
+def way_of(kind, distance, speed, up, down, times):
+    """Return the position at times [s] of a move that gets to its speed, by integrating accelerations."""
+    y = np.linspace(0.0, 1.0, 20_001)
+    ramps = [
+        np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]))]) * y[1] for a in (f(y) for f in ACCELERATIONS[kind])
+    ]
+    lengths = [speed / (rate * gained[-1]) for gained, rate in zip(ramps, (up, down), strict=True)]  # s
+    rising, falling = ramps[0] / ramps[0][-1] * speed, speed - ramps[1] / ramps[1][-1] * speed
+    ways = [np.trapezoid(v, y) * length for v, length in zip((rising, falling), lengths, strict=True)]
+    even = (distance - sum(ways)) / speed
+    assert even > 0.0, "it gets to its speed"
+    t = np.concatenate([y * lengths[0], lengths[0] + even + y * lengths[1]])
+    v = np.concatenate([rising, falling])
+    x = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
+    return np.interp(times, t, x), t[-1]
+
+
+def test_6062h_goes_the_way_of_each_motion_profile_type():
+    """-3 to 1, each by the closed form of its acceleration, with other rates up and down; both ways."""
+    kinds, turn = np.repeat(list(ACCELERATIONS), 2), 65_536
+    sign = np.tile([1, -1], len(ACCELERATIONS))
+    with EmulatedDrives("tgz_d", "inertia", num_machines=len(kinds), num_threads=1) as drives:
+        drives.write(0x6065, 0)
+        drives.write(0x6086, kinds)
+        drives.write(0x6081, "600 rpm")
+        drives.write(0x6083, "6000 rpm/s")
+        drives.write(0x6084, "3000 rpm/s")
+        motion.enable(drives, mode="pp")
+        drives.write(0x607A, sign * 6 * turn)
+        drives.write(0x6040, 0x1F)
+        seen = drives.record([0x6062], 1.3)[0x6062] * sign
+        with pytest.raises(ObjectAccessError):
+            drives.write(0x6086, 2)
+        with pytest.raises(ObjectAccessError):
+            drives.write(0x6086, -4)
+    times = 1e-3 * np.arange(len(seen))
+    for k, kind in enumerate(kinds):
+        far = min(
+            np.abs(seen[:, k] - way_of(kind, 6.0 * turn, 10.0 * turn, 100.0 * turn, 50.0 * turn, times - late)[0]).max()
+            for late in (-1e-3, 0.0, 1e-3)
+        )
+        assert far < 40.0, (kind, sign[k], far)  # inc of 65,536: of a period in which ramps meet
+        assert seen[-1, k] == 6 * turn
