@@ -412,6 +412,17 @@ def test_a_lost_network_is_an_error_of_each_axis(wire):
     assert [wire.value(0x1003, sub) for sub in range(3)] == [2, 17 << 24 | 1 << 16 | 0x8100, 17 << 24 | 0x8100]
 
 
+def test_a_lost_network_is_an_error_of_the_axis_that_was_in_operation(wire):
+    motion.enable(wire.drives, mode="pp", where=np.array([False, True]))
+    wire.start()
+    wire.receive(0, "02 05")
+    wire.wait(5)
+    assert [wire.value(0x33C1, 0), wire.value(0x34C1, 0)] == [0, 1 << 17]
+    assert wire.value(0x1001, 0) == 0x91
+    wire.receive(0, "01 05")
+    assert [wire.value(0x1003, sub) for sub in range(2)] == [1, 17 << 24 | 1 << 16 | 0x8100]
+
+
 def test_the_history_holds_sixty_four():
     from drive_env.node.error_history import ErrorHistory
 

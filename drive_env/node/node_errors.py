@@ -10,6 +10,7 @@ from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Protocol
 
+from drive_env.cia402 import State
 from drive_env.devices import Device, EmergencyCode
 from drive_env.firmware.common.protection import CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency
@@ -149,10 +150,20 @@ class NodeErrors:
             self._react()
 
     def _note_lost_network(self) -> None:
-        """Note the error that each axis has of it, where the history has the device's own number of errors."""
+        """Note the error that each axis has of it, where the history has the device's own number of errors.
+
+        Of axes that are in operation, or went into fault by it just now; of all where none is.
+        """
         firmware = self._device.firmware
         cause = firmware.causes[firmware.communication_lost].name
-        for axis in range(len(self._axes)):
+        register = firmware.causes[firmware.communication_lost].error_register
+        concerned = [
+            number
+            for number, axis in enumerate(self._axes)
+            if axis.state == State.OPERATION_ENABLED
+            or (axis.state in (State.FAULT, State.FAULT_REACTION_ACTIVE) and axis.error_register & register)
+        ]
+        for axis in concerned or range(len(self._axes)):
             emergency = self._device.emergencies[cause].of_axis(axis)
             self.history.add(emergency.code, axis, self._number_of(emergency))
 
