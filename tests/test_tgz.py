@@ -374,6 +374,21 @@ def test_an_axis_whose_mains_are_cut_tells_of_them_and_of_the_link_that_empties(
         assert of_axis == [bit for bit in range(32) if bits >> bit & 1] == [1, 4], axis
 
 
+def test_mains_that_come_back_are_enough_to_go_on(wire):
+    """The empty link is charged again, the faults are reset, and both axes move."""
+    wire.drives.machine.supply = 0.0
+    wire.wait(12_000)
+    assert wire.value(0x1001, 0) == 0x85
+    assert get_lanes(wire.drives.inside.records, "u_dc", 2).max() < 20.0
+    wire.drives.machine.supply = 560.0
+    wire.wait(400)
+    assert get_lanes(wire.drives.inside.records, "u_dc", 2).min() > 500.0
+    motion.reset_fault(wire.drives)
+    assert wire.value(0x1001, 0) == 0
+    motion.enable(wire.drives, mode="pp")
+    motion.move_to(wire.drives, [20_000, -20_000], relative=True)
+
+
 @pytest.mark.parametrize("word", [None, 0x06], ids=["switch on disabled", "ready to switch on"])
 def test_an_error_that_is_there_acts_in_every_state(wire, word):
     """M, 1001h: bit 0 is "any active bit"; CiA 402: a fault leads from every state to fault."""
