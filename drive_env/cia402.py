@@ -97,6 +97,7 @@ COMMANDED = (
     CONTROLWORD, MODE, TARGET_TORQUE, TARGET_POSITION, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
     INTERPOLATION_DATA, DIGITAL_OUTPUTS, TARGET_VELOCITY,
 )  # fmt: skip
+OUTPUTS_MASK = (DIGITAL_OUTPUTS, 2)  # which outputs follow: a setting beside the command
 # --- modes of operation (6060h) --------------------------------------------------------------------------------------
 PP, VL, PV, TQ, HM, IP, CSP, CSV, CST = 1, 2, 3, 4, 6, 7, 8, 9, 10
 MODES = {"pp": PP, "pv": PV, "tq": TQ, "hm": HM, "ip": IP, "csp": CSP, "csv": CSV, "cst": CST}

@@ -68,7 +68,7 @@ def run_module(records, rates, periods, sums, trace):
                     on = drive.chopper[lane] > 0.5
                     square = 0.5 * (before[lane] * before[lane] + u * u)
                     sums[RESISTOR, lane] += square / drive.chopper_resistance[lane] * dt if on else 0.0
-                    sums[IDLE, lane] += drive.idle_power[lane] * dt
+                    sums[IDLE, lane] += drive.idle_now[lane] * dt
                     for start, mean, last in (
                         (drive.i_d_before[lane], drive.i_d_mean[lane], drive.i_d[lane]),
                         (drive.i_q_before[lane], drive.i_q_mean[lane], drive.i_q[lane]),
@@ -198,6 +198,20 @@ def test_an_empty_link_is_charged_through_the_resistance():
     assert at_tau == pytest.approx(560.0 * 3.0 / np.pi * (1.0 - np.exp(-1.0)), rel=0.02)
     assert module["link_charged"][0, 0] == 1.0
     assert trace[-1, 0] == pytest.approx(560.0, rel=0.01)
+
+
+def test_an_empty_link_is_charged_again_though_logic_takes_its_power():
+    """Below the under-voltage logic is a resistor: u falls as exp(-P t / (C u_min^2)), and rises with the mains."""
+    module = new_module(u_dc=300.0, supply_voltage=0.0, stage_on=0.0, undervoltage=300.0, idle_power=12.0)
+    before = stored(module)
+    sums, trace = run(module, 3000, (0.0, 0.0))
+    tau = 500e-6 * 300.0**2 / (2.0 * 12.0)
+    assert trace[-1, 0] == pytest.approx(300.0 * np.exp(-3.0 / tau), rel=2e-3)
+    assert stored(module)[0][0] - before[0][0] == pytest.approx(-sums[IDLE, :2].sum(), rel=1e-6)
+    module["supply_voltage"] = 560.0
+    _, trace = run(module, 300, (0.0, 0.0))
+    assert module["link_charged"][0, 0] == 1.0
+    assert trace[-1, 0] == pytest.approx(560.0, rel=0.02)
 
 
 def test_a_rectifier_without_a_phase_gives_less_and_ripples_more():

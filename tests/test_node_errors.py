@@ -1,4 +1,4 @@
-"""What a node tells of errors of its axes and of its bus, with axes of this test: 1001h, 1003h, emergencies, reactions."""
+"""What a node tells of errors of its axes and its bus, with axes of this test: 1001h, 1003h, emergencies, reactions."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from drive_env.cia402 import State
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node.axis import QueuedEmergency
@@ -19,7 +20,7 @@ class Axis:
     """An axis that had some emergencies, and its share of 1001h."""
 
     def __init__(self):
-        self.error_register, self.queued = 0, []
+        self.error_register, self.queued, self.state = 0, [], State.SWITCH_ON_DISABLED
 
     def take_emergencies(self):
         taken, self.queued = self.queued, []
@@ -212,6 +213,19 @@ def test_a_lost_network_is_noted_of_each_axis_where_the_history_has_the_device_s
     assert other.history() == [0x8100 | 1 << 16 | 17 << 24, 0x8100 | 17 << 24]
     other.errors.condition("pdo_too_short", 3.0)
     assert other.history()[0] == 0x8210
+
+
+def test_a_lost_network_is_an_error_of_the_axes_in_operation(other):
+    """1001h shows with its bit 6 that a further axis has it; of axes that are off it is an error where none is on."""
+    other.axes[0].state = State.OPERATION_ENABLED
+    other.errors.condition("heartbeat_lost", 3.0)
+    assert other.history() == [0x8100 | 17 << 24]
+    assert other.errors.register() == GENERIC | COMMUNICATION
+    other.errors.restart()
+    other.axes[0].state, other.axes[1].state = State.SWITCH_ON_DISABLED, State.OPERATION_ENABLED
+    other.errors.condition("heartbeat_lost", 4.0)
+    assert other.history()[0] == 0x8100 | 1 << 16 | 17 << 24
+    assert other.errors.register() & ~(GENERIC | COMMUNICATION)
 
 
 def test_a_condition_that_a_device_s_table_lacks_is_not_told(node):

@@ -203,6 +203,30 @@ def test_torque_is_added_to_the_set_point_of_the_current_in_csp_and_ip(drives, m
     assert field(drives, "torque_feed_forward")[0] == 0.0
 
 
+@pytest.mark.parametrize(("mode", "acts"), [
+    ("pp", False), ("pv", False), ("hm", False), ("csv", False),
+    ("tq", True), ("ip", True), ("csp", True), ("cst", True),
+])  # fmt: skip
+def test_target_torque_acts_in_the_modes_of_its_section_alone(mode, acts):
+    """M, 6071h: pt and cst; "also in cyclic positioning modes IP and CSP". The images' comments say PP for IP."""
+    seen = []
+    for torque in (0, 3000):
+        with new_drives() as drives:
+            drives.write(cia402.FOLLOWING_WINDOW, 0)
+            drives.write(cia402.HOMING_METHOD, 37)
+            motion.enable(drives, mode=mode)
+            drives.write(cia402.TARGET_TORQUE, torque)
+            if mode in ("pp", "ip", "csp"):
+                drives.write(cia402.TARGET_POSITION, 500)
+            if mode in ("pv", "csv"):
+                drives.write(cia402.TARGET_VELOCITY, 50_000)
+            if mode in ("pp", "hm"):
+                drives.write(cia402.CONTROLWORD, 0x1F)
+            trace = drives.record([cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], 0.02)
+            seen.append([trace[name][:, 0].tolist() for name in (cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL)])
+    assert (seen[0] != seen[1]) == acts
+
+
 # --- positions --------------------------------------------------------------------------------------------------------
 def test_positions_are_kept_to_a_part_of_an_increment_over_a_whole_turn_of_the_counter(drives):
     """int32 outside, 2^28 increments a revolution inside: 4096 : 1 of 608Fh."""
@@ -462,6 +486,23 @@ def test_a_motor_that_oscillates_has_no_wrong_commutation(load):
         speed = trace[cia402.VELOCITY_ACTUAL][:, 0]
         assert np.count_nonzero(np.diff(np.sign(speed[200:]))) > 10
         assert all(one.code != 0x7122 for one in drives.emergencies())
+
+
+@pytest.mark.parametrize("velocity_i", [0, 300])
+def test_nor_has_one_that_oscillates_in_few_periods_of_supervision(velocity_i):
+    """At some 250 Hz each look of 1 kHz finds another sign of current and speed: none of them lasts."""
+    gains = np.rint(np.geomspace(3000, 24_000, 16)).astype(int)
+    with EmulatedDrives("tgz_d", "inertia", num_machines=len(gains), num_threads=1, seed=0) as drives:
+        drives.write(cia402.FOLLOWING_WINDOW, 0)
+        drives.write(0x23D2, gains)
+        drives.write(0x23D3, velocity_i)
+        drives.write(0x23D4, 1000)
+        motion.enable(drives, mode="csp")
+        targets = np.where(np.arange(600) // 60 % 2 == 0, 0, TURN // 8)
+        trace = drives.record([cia402.VELOCITY_ACTUAL], 0.6, play={cia402.TARGET_POSITION: targets})
+        turns = np.abs(np.diff(np.sign(trace[cia402.VELOCITY_ACTUAL][200:]), axis=0)).sum(axis=0) / 2
+        assert np.count_nonzero(turns > 100) >= 4, "some of them swing"
+        assert {hex(one.code) for one in drives.emergencies()} <= {"0x2200", "0x8400"}
 
 
 def test_a_cyclic_set_point_that_no_motor_could_follow_is_no_trajectory(drives):

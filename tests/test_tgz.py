@@ -60,6 +60,28 @@ PROFILE = """
 60FF target velocity RPDO
 6502 supported drive modes No
 """
+# The same of the other objects: "CAN PDO mapping" of those of communication, and the text on 4000h to 4003h. Those of
+# 2000h to 3FFFh have no column.
+OTHERS = """
+1000 No
+1001 TPDO
+1003 No 64
+1010 No 1
+1011 No 1
+1018 No 4
+1400 No 2
+1600 No 8
+1800 No 2
+1A00 No 8
+1C12 No 1
+1C13 No 1
+1C32 No 2
+1C33 No 2
+4000 TPDO
+4001 RPDO
+4002 TPDO 2
+4003 TPDO 2
+"""
 # Mode of operation, and the D-Mode that it requires.
 D_MODES = {1: 7, 3: 6, 4: 1, 6: 7, 7: 3, 8: 3, 9: 2, 10: 1}
 # Default mapping of PDOs: objects of RPDO and TPDO 1 to 4.
@@ -133,9 +155,28 @@ def test_an_object_of_the_profile_is_there_for_both_axes(row, axis):
         if mapping == "TPDO":
             assert entry.access == "ro"
         elif mapping == "RPDO":
-            assert entry.access == "rw"
+            assert entry.access == "rww"  # CiA 306: RPDOs alone carry it
     if last.isdigit():
         assert entries.find((index, 0)).default == int(last)
+
+
+@pytest.mark.parametrize("row", [*rows(PROFILE), *rows(OTHERS)], ids=lambda row: row[0])
+def test_a_pdo_carries_what_the_column_of_its_direction_says_and_nothing_else(row):
+    """Over the wire, both ways: another one is refused with 06040041h, and the default mapping stays."""
+    index = int(row[0], 16)
+    *name, last = row[1:]
+    subs, column = (range(1, int(last) + 1), name[-1]) if last.isdigit() else ([0], last)
+    with two_axes() as drives:
+        wire, entries = Wire(drives), drives.device.new_dictionary()
+        for way, communication, mapping in (("RPDO", 0x1402, 0x1602), ("TPDO", 0x1802, 0x1A02)):
+            off = wire.value(communication, 1) | 1 << 31
+            assert wire.download(communication, 1, off, 4) == 0
+            assert wire.download(mapping, 0, 0, 1) == 0
+            for axis in range(2 if index >= 0x6000 else 1):
+                for sub in list(subs)[:10]:
+                    entry = entries.find((index + 0x800 * axis, sub))
+                    code = wire.download(mapping, 1, entry.index << 16 | sub << 8 | entry.bits, 4)
+                    assert code == (0 if column == way else 0x06040041), (way, entry.label)
 
 
 @pytest.mark.parametrize("row", rows(MAPPINGS), ids=lambda row: row[0])
@@ -333,6 +374,48 @@ def test_an_axis_whose_mains_are_cut_tells_of_them_and_of_the_link_that_empties(
         assert of_axis == [bit for bit in range(32) if bits >> bit & 1] == [1, 4], axis
 
 
+def test_mains_that_come_back_are_enough_to_go_on(wire):
+    """The empty link is charged again, the faults are reset, and both axes move."""
+    wire.drives.machine.supply = 0.0
+    wire.wait(12_000)
+    assert wire.value(0x1001, 0) == 0x85
+    assert get_lanes(wire.drives.inside.records, "u_dc", 2).max() < 20.0
+    wire.drives.machine.supply = 560.0
+    wire.wait(400)
+    assert get_lanes(wire.drives.inside.records, "u_dc", 2).min() > 500.0
+    motion.reset_fault(wire.drives)
+    assert wire.value(0x1001, 0) == 0
+    motion.enable(wire.drives, mode="pp")
+    motion.move_to(wire.drives, [20_000, -20_000], relative=True)
+
+
+@pytest.mark.parametrize("word", [None, 0x06], ids=["switch on disabled", "ready to switch on"])
+def test_an_error_that_is_there_acts_in_every_state(wire, word):
+    """M, 1001h: bit 0 is "any active bit"; CiA 402: a fault leads from every state to fault."""
+    for index in (0x6040, 0x6840):
+        assert word is None or wire.download(index, 0, word, 2) == 0
+    for axis, bit, code in ((0, 20, 0xF001), (1, 2, 0x8A00)):
+        wire.drives.machine.error_bits = [(1 << bit) * (axis == k) for k in range(2)]
+        wire.wait(3)
+        assert wire.value(0x6041 + 0x800 * axis, 0) & FAULT[0] == FAULT[1]
+        assert wire.value(0x6841 - 0x800 * axis, 0) & FAULT[0] != FAULT[1]
+        assert wire.value(0x1001, 0) == (0x81 if axis else 0x01)
+        assert wire.value(0x1003, 1) == bit << 24 | axis << 16 | code
+        wire.take()
+        motion_word = 0x6040 + 0x800 * axis
+        assert wire.download(motion_word, 0, 0x80, 2) == 0
+        wire.wait(2)
+        assert wire.value(0x6041 + 0x800 * axis, 0) & FAULT[0] == FAULT[1], "it is there still"
+        wire.drives.machine.error_bits = 0
+        wire.wait(2)
+        assert wire.download(motion_word, 0, 0, 2) == 0
+        assert wire.download(motion_word, 0, 0x80, 2) == 0
+        wire.wait(2)
+        wire.take()
+        assert wire.value(0x6041 + 0x800 * axis, 0) & 0x4F == 0x40
+        assert wire.value(0x1001, 0) == 0
+
+
 def test_a_lost_network_is_an_error_of_each_axis(wire):
     """Bit 17 of the manual's table, host communication (8100h), whatever the emergency's code is by CiA 301."""
     motion.enable(wire.drives, mode="pp")
@@ -342,6 +425,17 @@ def test_a_lost_network_is_an_error_of_each_axis(wire):
     assert [wire.value(0x33C1, 0) >> 17 & 1, wire.value(0x34C1, 0) >> 17 & 1] == [1, 1]
     wire.receive(0, "01 05")
     assert [wire.value(0x1003, sub) for sub in range(3)] == [2, 17 << 24 | 1 << 16 | 0x8100, 17 << 24 | 0x8100]
+
+
+def test_a_lost_network_is_an_error_of_the_axis_that_was_in_operation(wire):
+    motion.enable(wire.drives, mode="pp", where=np.array([False, True]))
+    wire.start()
+    wire.receive(0, "02 05")
+    wire.wait(5)
+    assert [wire.value(0x33C1, 0), wire.value(0x34C1, 0)] == [0, 1 << 17]
+    assert wire.value(0x1001, 0) == 0x91
+    wire.receive(0, "01 05")
+    assert [wire.value(0x1003, sub) for sub in range(2)] == [1, 17 << 24 | 1 << 16 | 0x8100]
 
 
 def test_the_history_holds_sixty_four():
@@ -366,6 +460,34 @@ def test_both_axes_have_the_same_outputs_by_either_object(wire):
     assert (wire.value(0x60FE, 1), wire.value(0x68FE, 1)) == (0x2A0000, 0x2A0000)
     assert wire.download(0x60FE, 2, 0x00030000, 4) == 0  # the mask holds the others back
     assert wire.drives.machine.outputs.tolist() == [0x02, 0x02]
+
+
+def test_every_parameter_is_stored_also_those_of_rpdos_and_the_outputs_mask(wire):
+    """1010h stores settings (M has no list of them); what commands an axis or sets outputs begins anew."""
+    known, changed = wire.drives.device.new_dictionary(5), {}
+    commands = {0x23C6, 0x4001, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}
+    own = [entry for entry in known if entry.index >= 0x2000 and entry.bits <= 32 and entry.access in ("rw", "rww")]
+    # 60FEh:01 is what 4001h is a part of.
+    writable = [entry for entry in own if (entry.index & 0xF7FF, entry.sub) != (0x60FE, 1)]
+    for entry in writable:
+        base = wire.drives.device.locate(entry.index)[1]
+        before = wire.value(entry.index, entry.sub)
+        for raw in {0x3F0000, 1, 2, 3, 0, 0x1721, 0x1B21} - {before}:
+            fits = raw < 1 << entry.bits - entry.signed
+            if fits and wire.download(entry.index, entry.sub, raw, entry.bits // 8) == 0:
+                changed[entry.index, entry.sub] = base in commands
+                break
+    assert set(changed) == {(entry.index, entry.sub) for entry in writable}
+    before = {key: wire.value(*key) for key in changed}
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    wire.play("""
+        rx 000  81 05
+        tx 705  00
+    """)
+    for key, is_command in changed.items():
+        expected = known.find(key).default if is_command else before[key]
+        assert wire.value(*key) == expected, f"{key[0]:04X}h:{key[1]:02X}"
+    assert wire.drives.machine.outputs.tolist() == [0, 0]
 
 
 def test_both_axes_of_a_machine_show_the_same_inputs_in_bits_16_to_23():
@@ -435,11 +557,40 @@ def test_two_drives_of_one_axis_share_nothing_though_they_turn_one_machine():
 def test_of_four_axes_each_drive_has_a_link_of_its_own():
     with EmulatedDrives("tgz_d", "inertia", num_machines=4, num_threads=1) as drives:
         World().add(drives, [1, 2])
-        drives.machine.supply = [560.0, 500.0, 450.0, 400.0]
+        drives.machine.supply = [560.0, 560.0, 450.0, 450.0]
         drives.advance(1.0)  # until the idle power has drawn both links down to their mains
         link = get_lanes(drives.inside.records, "u_dc", 4)
         assert link[0] == link[1] > link[2] + 50.0
         assert link[2] == link[3]
+
+
+def test_axes_of_one_link_have_one_supply():
+    """Two values are refused, and change nothing; a dip or a short circuit of either axis is the link's."""
+    with two_axes() as drives:
+        drives.machine.supply = [560.0, 500.0]  # two machines by themselves
+        with pytest.raises(ValueError, match="axes 0 and 1 share a DC link, which has one supply, not 560 V and 500 V"):
+            World().add(drives, [1])
+        drives.advance(1.0)
+        link = get_lanes(drives.inside.records, "u_dc", 2)
+        assert link[0] > link[1] + 20.0, "they have two links still"
+        drives.machine.supply = 560.0
+        World().add(drives, [1])
+        assert drives.machine.links.tolist() == [0, 0]
+        with pytest.raises(ValueError, match="not 560 V and 0 V; give both the same"):
+            drives.machine.supply = [560.0, 0.0]
+        assert drives.machine.supply.tolist() == [560.0, 560.0]
+        drives.machine.supply = [540.0, 540.0]
+        for axis in range(2):
+            drives.machine.fault("supply_dip", voltage=450.0, where=np.arange(2) == axis)
+            drives.advance(2.0)  # the idle power draws it down
+            link = get_lanes(drives.inside.records, "u_dc", 2)
+            assert link[0] == link[1] < 460.0, "of either axis"
+            drives.machine.clear_fault()
+            drives.advance(0.5)
+            assert get_lanes(drives.inside.records, "u_dc", 2).min() > 500.0
+    for name, links in (("tgz_d", [0, 0]), ("tgz_s", [0, 1])):
+        with EmulatedDrives(name, "gantry", num_threads=1) as drives:
+            assert drives.machine.links.tolist() == links
 
 
 def energies(drives):
@@ -646,3 +797,60 @@ def test_the_second_axis_of_a_tgz_s_is_there_and_does_nothing():
         motion.move_to(drives, 65_536, relative=True, timeout=3.0)
         assert abs(wire.value(0x6864, 0)) == 0
         assert wire.value(0x1001, 0) == 0
+
+
+# --- motion profile types ---------------------------------------------------------------------------------------------
+# Acceleration over the time of a ramp, as a share of its greatest, of speeding up and of slowing down: -3 sinusoidal,
+# -2 fast acceleration and deceleration, -1 fast acceleration and slow deceleration, 0 trapezoidal, 1 sin^2.
+ACCELERATIONS = {
+    -3: (lambda y: np.sin(np.pi * y),) * 2,
+    -2: (lambda y: np.cos(0.5 * np.pi * y), lambda y: np.sin(0.5 * np.pi * y)),
+    -1: (lambda y: np.cos(0.5 * np.pi * y),) * 2,
+    0: (np.ones_like,) * 2,
+    1: (lambda y: np.sin(np.pi * y) ** 2,) * 2,
+}
+
+
+def way_of(kind, distance, speed, up, down, times):
+    """Return the position at times [s] of a move that gets to its speed, by integrating accelerations."""
+    y = np.linspace(0.0, 1.0, 20_001)
+    ramps = [
+        np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]))]) * y[1] for a in (f(y) for f in ACCELERATIONS[kind])
+    ]
+    lengths = [speed / (rate * gained[-1]) for gained, rate in zip(ramps, (up, down), strict=True)]  # s
+    rising, falling = ramps[0] / ramps[0][-1] * speed, speed - ramps[1] / ramps[1][-1] * speed
+    ways = [np.trapezoid(v, y) * length for v, length in zip((rising, falling), lengths, strict=True)]
+    even = (distance - sum(ways)) / speed
+    assert even > 0.0, "it gets to its speed"
+    t = np.concatenate([y * lengths[0], lengths[0] + even + y * lengths[1]])
+    v = np.concatenate([rising, falling])
+    x = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
+    return np.interp(times, t, x), t[-1]
+
+
+def test_6062h_goes_the_way_of_each_motion_profile_type():
+    """-3 to 1, each by the closed form of its acceleration, with other rates up and down; both ways."""
+    kinds, turn = np.repeat(list(ACCELERATIONS), 2), 65_536
+    sign = np.tile([1, -1], len(ACCELERATIONS))
+    with EmulatedDrives("tgz_d", "inertia", num_machines=len(kinds), num_threads=1) as drives:
+        drives.write(0x6065, 0)
+        drives.write(0x6086, kinds)
+        drives.write(0x6081, "600 rpm")
+        drives.write(0x6083, "6000 rpm/s")
+        drives.write(0x6084, "3000 rpm/s")
+        motion.enable(drives, mode="pp")
+        drives.write(0x607A, sign * 6 * turn)
+        drives.write(0x6040, 0x1F)
+        seen = drives.record([0x6062], 1.3)[0x6062] * sign
+        with pytest.raises(ObjectAccessError):
+            drives.write(0x6086, 2)
+        with pytest.raises(ObjectAccessError):
+            drives.write(0x6086, -4)
+    times = 1e-3 * np.arange(len(seen))
+    for k, kind in enumerate(kinds):
+        far = min(
+            np.abs(seen[:, k] - way_of(kind, 6.0 * turn, 10.0 * turn, 100.0 * turn, 50.0 * turn, times - late)[0]).max()
+            for late in (-1e-3, 0.0, 1e-3)
+        )
+        assert far < 40.0, (kind, sign[k], far)  # inc of 65,536: of a period in which ramps meet
+        assert seen[-1, k] == 6 * turn

@@ -43,8 +43,10 @@ from fault_injection import (
 )
 from test_parity import assert_equal
 
-from drive_env import CanDrives, EmulatedDrives, SafetyError, cia402, motion
+from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame
+from drive_env.commands.options import default_samples
+from drive_env.commands.scope import DEFAULT
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.firmware.record import set_lanes
@@ -167,9 +169,25 @@ def test_quantities_are_by_the_scales_of_each_axis_over_the_bus(inside):
         drives.write("Target torque", "2 A")
         peak = inside.read(Role.PEAK_CURRENT) * 1e-3
         assert drives.read("Target torque").tolist() == np.rint(2.0 * 32767 / peak).astype(int).tolist()
-        trace = drives.record([0x60FF, 0x6071], 0.001)
-        np.testing.assert_allclose(trace[0x60FF, "rpm"], [[500.0, 500.5]])
-        np.testing.assert_allclose(trace[0x6071, "A"], [[2.0, 2.0]], rtol=1e-3)
+        with pytest.raises(ObjectAccessError, match="60FFh:00 Target velocity cannot be recorded: no TPDO of tgz_d"):
+            drives.record([0x60FF], 0.001)
+        motion.enable(drives, mode="pv")
+        drives.write("Profile acceleration", "20000 rpm/s")
+        drives.write("Target velocity", "500 rpm")
+        drives.advance(0.3)
+        trace = drives.record([0x606C, 0x6077], 0.1)
+        np.testing.assert_allclose(trace[0x606C, "rpm"].mean(axis=0), [500.0, 500.5], rtol=0.01)
+        raw = trace[0x606C].mean(axis=0)
+        np.testing.assert_allclose(raw, [500_000, 143], rtol=0.01)
+        np.testing.assert_allclose(trace[0x6077, "A"], trace[0x6077] * peak / 32767, rtol=1e-9)
+
+
+def test_what_a_scope_shows_by_default_can_be_recorded(inside):
+    """60FFh is not among it: no TPDO carries it."""
+    with lockstep(inside) as drives:
+        names = default_samples(drives.description.dictionary, DEFAULT)
+        assert names == ["6062", "6064", "606C", "6077"]
+        assert len(drives.record([int(name, 16) for name in names], 0.003).t) == 3
 
 
 def test_modes_are_changed_over_the_bus_while_the_axes_are_enabled(inside):

@@ -281,6 +281,13 @@ def default_objects(known: ObjectDictionary, names: Iterable[str]) -> list[str]:
     return [name for name in names if known.has(object_name(name))]
 
 
+def default_samples(known: ObjectDictionary, names: Iterable[str]) -> list[str]:
+    """Return those of a command's default objects that a drive can send with every cycle."""
+    from drive_env.dictionary.access import fits_pdo
+
+    return [name for name in default_objects(known, names) if fits_pdo(known.find(object_name(name)), transmit=True)]
+
+
 def cycle_for(known: Description) -> float | None:
     """Return a time between SYNCs [s] in which the bus has room for all axes of a node; None of a node with one."""
     return None if known.num_axes == 1 else AXIS_CYCLE * known.num_axes

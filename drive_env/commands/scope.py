@@ -26,7 +26,7 @@ from drive_env.commands.options import (
     check_free,
     check_writable,
     connect,
-    default_objects,
+    default_samples,
     errors_as_exit_codes,
     fail,
     object_name,
@@ -90,7 +90,7 @@ def scope(
         refuse_other_masters(interface, channel, node, bitrate)
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
-            entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
+            entries = [known.find(object_name(name)) for name in objects or default_samples(known, DEFAULT)]
             condition = None if trigger is None else _parse(trigger, known)
             axes = axes_of_nodes(drives, axis)
             every_scale = scales_of(drives)

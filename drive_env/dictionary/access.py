@@ -27,6 +27,14 @@ def check_readable(entry: Entry) -> None:
         raise ObjectAccessError(WRITE_ONLY, f"{entry.label} can only be written")
 
 
+def fits_pdo(entry: Entry, transmit: bool) -> bool:
+    """Return whether a PDO of this direction can carry an entry, by PDOMapping and AccessType of its EDS (CiA 306).
+
+    `rww` is written by a process image, so RPDOs alone carry it; `rwr` is read by one, so TPDOs alone do.
+    """
+    return entry.pdo_mappable and entry.access in (("ro", "rw", "rwr") if transmit else ("wo", "rw", "rww"))
+
+
 def check_writable(entry: Entry) -> None:
     """Raise 06010002h for an entry that can only be read."""
     if entry.access in ("ro", "const"):

@@ -73,6 +73,9 @@ class Inside:
         Args:
             first: The drive's first axis.
             number: Its axes that turn a machine.
+
+        Raises:
+            ValueError: If they share a DC link, and their machines have different supplies.
         """
         drives = self._drives
         if drives._kind.connect is not None and drives.load.num_axes == 1:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask
-from drive_env.emulator.parameters import check_known, check_parameter
+from drive_env.emulator.parameters import check_known, check_one_supply, check_parameter
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
@@ -30,6 +30,7 @@ Mask = NDArray[np.bool_]
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors
+LINK_FIELD = "link_shared"  # of firmware whose axes 2k and 2k + 1 may have one DC link
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
 _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
@@ -188,15 +189,27 @@ class Machines:
 
     @property
     def supply(self) -> Floats:
-        """Open-circuit supply voltage [V], shape (num_axes,)."""
+        """Open-circuit supply voltage [V], shape (num_axes,); set one value or one per axis.
+
+        Axes that share a DC link have one supply: ValueError for two values.
+        """
         return self._axis_field("supply_voltage")
 
     @supply.setter
     def supply(self, value: ArrayLike) -> None:
         drives = self._drives
         volts = checked_supply(value, drives.num_axes)
+        check_one_supply(volts, self.links)
         with drives._faults.suspended():
             set_lanes(drives._records, "supply_voltage", volts)
+
+    @property
+    def links(self) -> NDArray[np.int64]:
+        """Which DC link each axis has, shape (num_axes,): the number of the first axis that has it."""
+        drives, axes = self._drives, np.arange(self._drives.num_axes)
+        if not drives.device.firmware.layout.has(LINK_FIELD):
+            return axes
+        return np.where(self._axis_field(LINK_FIELD) > 0.5, axes - axes % 2, axes)
 
     @property
     def rotor_angle(self) -> Floats:

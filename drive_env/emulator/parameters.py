@@ -140,6 +140,17 @@ _MAY_VANISH = (
 )  # fmt: skip
 
 
+def check_one_supply(volts: Floats, links: NDArray[np.int64]) -> None:
+    """Raise ValueError for axes that share a DC link and would have different supplies [V]."""
+    axes = np.flatnonzero(volts != volts[links])
+    if axes.size:
+        axis, first = int(axes[0]), int(links[axes[0]])
+        raise ValueError(
+            f"axes {first} and {axis} share a DC link, which has one supply, not {volts[first]:g} V and "
+            f"{volts[axis]:g} V; give both the same"
+        )
+
+
 def check_parameter(name: str, values: Floats) -> None:
     """Raise ValueError unless every value is one that a machine can have."""
     if not np.all(np.isfinite(values)):

@@ -12,9 +12,16 @@ import numpy as np
 
 from drive_env.devices import Device
 from drive_env.emulator import servo_machine
-from drive_env.emulator.parameters import Floats, MachineKind, MachineParameter, Mask, Records
+from drive_env.emulator.parameters import (
+    Floats,
+    MachineKind,
+    MachineParameter,
+    Mask,
+    Records,
+    check_one_supply,
+)
 from drive_env.emulator.servo_machine import SERVO
-from drive_env.firmware.record import LANES, set_lanes
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
 from drive_env.motors import Motor
 
@@ -84,6 +91,9 @@ def connect(records: Records, device: Device, axes: Mask) -> None:
     pairs = np.zeros(len(axes) + len(axes) % 2, bool)
     pairs[: len(axes)] = axes
     both = np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: len(axes)]
+    number = np.arange(len(axes))
+    volts = get_lanes(records, "supply_voltage", len(axes)).astype(float)
+    check_one_supply(volts, np.where(both, number - number % 2, number))
     set_lanes(records, "link_shared", both.astype(float), both)
 
 

@@ -281,7 +281,8 @@ class RandomMachines:
                 self._set_one(lane, rngs[lane], stage)
         # Supply before the reset, which charges the link from it; temperatures after: it sets them to 25 degC.
         axes = np.repeat(mask, self._drives.num_axes // self._drives.num_machines)
-        machine.supply = np.where(axes, self._per_axis("supply.voltage"), machine.supply)
+        supply = np.where(axes, self._per_axis("supply.voltage"), machine.supply)
+        machine.supply = supply[machine.links]
         machine.reset(mask)
         winding, power_stage = machine.temperatures
         machine.set_temperatures(

@@ -104,7 +104,7 @@ def _access(variable: ODVariable) -> int:
     is_image = variable.index in IMAGE or any(variable.index in one for one in MAPPINGS)
     bits = (READ if reads else 0) | ((WRITE_PRE_OP if is_image else WRITE) if writes else 0)
     if variable.pdo_mappable:
-        bits |= (MAPS_OUTPUT if writes else 0) | (MAPS_INPUT if reads else 0)
+        bits |= (MAPS_OUTPUT if writes and kind != "rwr" else 0) | (MAPS_INPUT if reads and kind != "rww" else 0)
     elif reads and writes and variable.index >= 0x2000:
         bits |= SETTING
     return bits

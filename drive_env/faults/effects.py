@@ -61,6 +61,8 @@ def _multiplied(sound: Floats, given: Given, rated: float) -> Floats:
     return sound * given["factor"]
 
 
+# Fields of the record that a DC link has once, whichever of its axes is named.
+OF_LINK = ("supply_voltage", "short_conductance")
 ENCODER_GAIN = Quantity("record", "encoder_gain")
 ENCODER_DIRECTION = Quantity("record", "encoder_true_direction")
 ENCODER_NOISE = Quantity("record", "encoder_noise")

@@ -19,6 +19,7 @@ from drive_env.faults.effects import (
     ENCODER_GAIN,
     ENCODER_NOISE,
     MOMENTS,
+    OF_LINK,
     Change,
     Quantity,
     changes_of,
@@ -314,6 +315,9 @@ class MachineFaults:
             if not one.changes_some(quantity):
                 continue
             mask = one.axes & np.repeat(one.state == ON, self._axes_per_machine)
+            if quantity.name in OF_LINK:
+                links = self._drives.machine.links
+                mask = np.isin(links, links[mask])
             for change in one.changes:
                 if change.quantity == quantity:
                     changed = change.value(wanted, one.given, self._drives.motor.rated_torque)

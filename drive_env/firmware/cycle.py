@@ -105,6 +105,7 @@ class FirmwareStages:
         remote: Stage (drive, lane) -> whether the axis takes commands; one that does not ignores the controlword, and
             statusword bit 9 is 0. None: always.
         tells_all: Whether a drive in fault tells of further errors, see `protection_of`.
+        faults_when_off: Whether it goes into fault before it is switched on, too, see `protection_of`.
     """
 
     name: str
@@ -122,6 +123,7 @@ class FirmwareStages:
     halt: Sequence[Stage]
     remote: Stage | None = None
     tells_all: bool = False
+    faults_when_off: bool = False
 
 
 class Firmware(NamedTuple):
@@ -601,7 +603,7 @@ def compose(stages: FirmwareStages, source: str) -> Firmware:
     """
     layout = RecordLayout((*fields.PARAMETERS, *stages.parameters), (*fields.STATE, *stages.state))
     machinery = _machinery(stages.name, layout, source)
-    guard = protection_of(stages.causes, tells_all=stages.tells_all)
+    guard = protection_of(stages.causes, tells_all=stages.tells_all, faults_when_off=stages.faults_when_off)
     events = _events(guard.causes_gone, guard.statusword_bits, stages.remote or _always)
     supervise = _supervise(stages, guard.protect, events.tell_state)
     start_window, tick = in_turn(stages.window, 2), in_turn(stages.tick, 3)

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, UNSUPPORTED_ACCESS, ObjectAccessError
+from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
 
 MAX_BITS = 64
 DUMMIES = range(0x0002, 0x0008)  # CiA 301: data types of 8 bits and more, each as an object that a PDO can map
-# What a PDO of a direction cannot carry (CiA 306: rww is written, rwr read as process data), by whether it is sent.
-WRONG_WAY = {True: ("wo", "rww"), False: ("ro", "const", "rwr")}
 # Characters of `struct` by width [bits], unsigned and signed: what travels in a PDO is whole bytes.
 LAYOUT = {8: ("B", "b"), 16: ("H", "h"), 32: ("I", "i"), 64: ("Q", "q")}
 
@@ -53,8 +52,10 @@ def check_mappable(entry: Entry, raw: int, transmit: bool, find: Callable[[int, 
         ) from error
     if index in DUMMIES and not transmit and mapped.bits == bits and bits in LAYOUT:
         return mapped  # room of a frame that is passed over; only those are there that the EDS allows
-    if not mapped.pdo_mappable or mapped.access in WRONG_WAY[transmit] or mapped.bits not in LAYOUT:
-        raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot map {mapped.label}, {mapped.access}")
+    if not fits_pdo(mapped, transmit) or mapped.bits not in LAYOUT:
+        other = "TPDOs" if fits_pdo(mapped, True) else "RPDOs" if fits_pdo(mapped, False) else ""
+        ways = f"{other} alone carry it" if other and mapped.bits in LAYOUT else "no PDO carries it"
+        raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot map {mapped.label}, {mapped.access}: {ways}")
     if mapped.bits != bits:
         raise ObjectAccessError(
             CANNOT_BE_MAPPED, f"{entry.label}: {mapped.label} has {mapped.bits} bits, not {bits}; write the object's"

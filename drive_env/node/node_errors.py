@@ -10,6 +10,7 @@ from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Protocol
 
+from drive_env.cia402 import State
 from drive_env.devices import Device, EmergencyCode
 from drive_env.firmware.common.protection import CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency
@@ -68,6 +69,7 @@ class NodeErrors:
         self._flush = flush
         self._react = react
         self._told_last = 0  # axis of the last emergency
+        self._last_of: dict[Hashable, int] = {}  # last axis whose a condition is, for 1001h
         self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
         self.conditions: dict[Hashable, ErrorCondition] = {}
         self.history = ErrorHistory(depth)
@@ -92,9 +94,8 @@ class NodeErrors:
         for number, axis in enumerate(self._axes):
             if axis is not without:
                 register |= self._of_axis(number, axis.error_register)
-        for condition in self.conditions.values():
-            last = len(self._axes) - 1 if self._is_of_axes(condition.name) else 0
-            register |= self._of_axis(last, condition.error_register)
+        for key, condition in self.conditions.items():
+            register |= self._of_axis(self._last_of.get(key, 0), condition.error_register)
         return register
 
     def _of_axis(self, number: int, register: int) -> int:
@@ -111,13 +112,14 @@ class NodeErrors:
         key = name if key is None else key
         if self.conditions.get(key) is condition:
             return
-        if condition.lasts:
-            self.conditions[key] = condition
-        told, axes = name, 1
+        told, axes = name, [0]
         if self._is_of_axes(name):
             firmware = self._device.firmware
-            told, axes = firmware.causes[firmware.communication_lost].name, len(self._axes)
-        for axis in range(axes):
+            told, axes = firmware.causes[firmware.communication_lost].name, self._concerned()
+        if condition.lasts:
+            self.conditions[key] = condition
+            self._last_of[key] = axes[-1]
+        for axis in axes:
             emergency = self._device.emergencies[told].of_axis(axis)
             self._told_last = axis
             self._sink.push(emergency, self.register() | condition.error_register)
@@ -157,6 +159,18 @@ class NodeErrors:
     def _is_of_axes(self, name: str) -> bool:
         """Return whether a lost network is an error of each axis: the device's table has none of the node for it."""
         return name in NETWORK_LOST and name not in self._device.emergencies
+
+    def _concerned(self) -> list[int]:
+        """Return the axes whose error a lost network is: those in operation, or in fault by it just now; else all."""
+        firmware = self._device.firmware
+        register = firmware.causes[firmware.communication_lost].error_register
+        concerned = [
+            number
+            for number, axis in enumerate(self._axes)
+            if axis.state == State.OPERATION_ENABLED
+            or (axis.state in (State.FAULT, State.FAULT_REACTION_ACTIVE) and axis.error_register & register)
+        ]
+        return concerned or list(range(len(self._axes)))
 
     def _number_of(self, emergency: EmergencyCode) -> int:
         """Return the device's own number of an error, as 1003h has it."""

@@ -14,6 +14,7 @@ from nicegui import run, ui
 from nicegui.events import GenericEventArguments
 
 from drive_env import cia402
+from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
 from drive_env.master import quantities
 from drive_env.studio.page import StudioPage
@@ -351,11 +352,7 @@ class ScopePanel:
 def _choices(session: Session) -> dict[tuple[int, int], Entry]:
     """Return the objects that a scope can show: numbers that can be sampled, those that people look for first."""
     known = session.description
-    entries = [
-        entry
-        for entry in known.dictionary
-        if entry.pdo_mappable and entry.bits is not None and entry.access not in ("wo", "const")
-    ]
+    entries = [entry for entry in known.dictionary if fits_pdo(entry, transmit=True) and entry.bits is not None]
     entries.sort(key=lambda one: (one.index not in FIRST, one.index, one.sub))
     return {(entry.index, entry.sub): entry for entry in entries}
 

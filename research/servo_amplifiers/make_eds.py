@@ -17,6 +17,8 @@ HERE = Path(__file__).parent
 EDS = HERE.parents[1] / "drive_env" / "devices" / "tgz_d" / "tgz_d.eds"
 # Data types of CiA 301, table 44.
 TYPES = {"I8": 0x02, "I16": 0x03, "I32": 0x04, "U8": 0x05, "U16": 0x06, "U32": 0x07, "I64": 0x15}
+# AccessType, by CiA 306, of what can be written and goes in a PDO: by whether received or sent ones carry it.
+PROCESS_DATA = {"in": "rww", "out": "rwr"}
 MANDATORY = (0x1000, 0x1001, 0x1018)
 MAKERS = range(0x2000, cia402.PROFILE_AREAS.start)
 VARIABLE, ARRAY, RECORD = "0x7", "0x8", "0x9"
@@ -100,8 +102,9 @@ def number(text: str) -> str:
 
 def entry(row: Row, section: str) -> str:
     """Return the section of an entry."""
+    access = PROCESS_DATA.get(row["pdo"], "rw") if row["access"] == "rw" else row["access"]
     lines = [f"[{section}]", f"ParameterName={row['name']}", f"ObjectType={VARIABLE}"]
-    lines += [f"DataType=0x{TYPES[row['type']]:04X}", f"AccessType={row['access']}"]
+    lines += [f"DataType=0x{TYPES[row['type']]:04X}", f"AccessType={access}"]
     lines += [f"{key}={row[name]}" for key, name in (("LowLimit", "low"), ("HighLimit", "high")) if row[name]]
     lines += [f"DefaultValue={number(row['default'])}", f"PDOMapping={int(row['pdo'] != 'no')}"]
     if row["unit"]:

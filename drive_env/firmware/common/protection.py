@@ -173,7 +173,7 @@ def _masks(causes: Sequence[Cause]) -> _Masks:
     )
 
 
-def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool) -> Any:
+def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool, faults_when_off: bool) -> Any:
     """Return the stage (drive, lane) -> the causes that have appeared."""
     faults, stops, at_limits, warns = masks.faults, masks.stops, masks.at_limits, masks.warns
     positive, negative, software = masks.positive, masks.negative, masks.software
@@ -191,8 +191,10 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool) 
         present = conditions(drive, lane)
         drive.present[lane] = present
         faulted = drive.fsa[lane] == fsa.FAULTED
-        if drive.fsa[lane] < fsa.SWITCHED or (faulted and not tells_all):
-            # A drive whose supply or enable is missing is in no fault before anybody switches it on.
+        is_off = drive.fsa[lane] < fsa.SWITCHED and not faults_when_off
+        if is_off or (faulted and not tells_all):
+            # A drive whose supply or enable is missing is in no fault before anybody switches it on, unless its maker
+            # has every error act at once.
             present &= ~faults
         appeared = present & ~drive.active[lane]
         # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again; where
@@ -265,7 +267,7 @@ def _cause_flags(held: int, flags: tuple[int, ...], tells_all: bool) -> Any:
     return cause_flags
 
 
-def protection_of(causes: Sequence[Cause], *, tells_all: bool = False) -> Protection:
+def protection_of(causes: Sequence[Cause], *, tells_all: bool = False, faults_when_off: bool = False) -> Protection:
     """Return the stages of a table of causes.
 
     Args:
@@ -273,11 +275,13 @@ def protection_of(causes: Sequence[Cause], *, tells_all: bool = False) -> Protec
             appear together are told, and act, in the order of the rows.
         tells_all: Whether a drive in fault tells of further errors, each once until the reset; otherwise what else the
             stage that is cut sees follows from it, and is not told.
+        faults_when_off: Whether a cause takes the drive into fault in every state, or from switched on only.
     """
     masks = _masks(causes)
     register = tuple(cause.error_register for cause in causes)
     conditions = _conditions(causes)
-    look, react = _look(masks, conditions, len(causes) - 1, tells_all), _react(masks, register, tells_all)
+    look = _look(masks, conditions, len(causes) - 1, tells_all, faults_when_off)
+    react = _react(masks, register, tells_all)
     cause_flags = _cause_flags(masks.held, tuple(cause.status_flag for cause in causes), tells_all)
     faults, cuts, software, tried_again = masks.faults, masks.cuts, masks.software, masks.tried_again
     following_fault, csp, ip = row_of(causes, FOLLOWING_ERROR) + 1, cia402.CSP, cia402.IP

@@ -46,7 +46,9 @@ def watch_motion(drive, lane, dt):
     error = abs(drive.position_demand[lane] - drive.theta_meas[lane])
     follows = drive.drive_function[lane] > 0.0 and window > 0.0 and drive.loop_level[lane] > 0.0
     drive.following_time[lane] = drive.following_time[lane] + dt if follows and error > window else 0.0
-    asked = drive.i_q_ref[lane]
+    # The mean of the period: of a current that oscillates faster, single values are whatever moment they are of.
+    asked = drive.asked_mean[lane]
+    drive.asked_mean[lane] = 0.0
     most = REVERSE_SHARE * drive.i_max[lane] * drive.current_share[lane]
     omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
     # It gains speed against the current. One that oscillates has it against the current, too, and loses it then.
@@ -60,7 +62,10 @@ def watch_motion(drive, lane, dt):
         and asked * gained < 0.0
         and abs(omega) > drive.standstill[lane]
     )
-    drive.reverse_time[lane] = drive.reverse_time[lane] + dt if runs_away else 0.0
+    # All the time one way: with the other sign of the current it begins anew.
+    way = 1.0 if asked > 0.0 else -1.0
+    so_far = way * drive.reverse_time[lane]
+    drive.reverse_time[lane] = way * ((so_far if so_far > 0.0 else 0.0) + dt) if runs_away else 0.0
     held = (
         drive.brake_mode[lane] == CLOSED
         and drive.stage_on[lane] > 0.0
@@ -117,7 +122,7 @@ def feedback(drive, lane, told):
 def commutation(drive, lane, told):
     """Return whether the motor speeds up against its current, or its angle could not be found."""
     failed = drive.init_state[lane] == start_up.FAILED and drive.fsa[lane] >= fsa.SWITCHED
-    return failed or drive.reverse_time[lane] > REVERSE_TIME
+    return failed or abs(drive.reverse_time[lane]) > REVERSE_TIME
 
 
 @stage

@@ -42,6 +42,7 @@ STATE = (
     Field("link_charged", "f8", "", "1: the charging resistance is bridged", 1.0),
     Field("link_pull", "f8", "V^2/W", "square of voltage lost per watt in a tick"),
     Field("link_burn", "f8", "1", "what the brake resistor leaves of the voltage after a tick"),
+    Field("idle_now", "f8", "W", "that logic and gate drivers of an axis take at the link's present voltage"),
     Field("half_capacitance", "f8", "F", "half the capacitance of the link"),
     Field("partner_power", "f8", "W", "what the bridge of the other axis takes"),
     Field("mains_energy", "f8", "J", "taken from the mains, from power-on; of the whole link"),
@@ -90,12 +91,17 @@ def owner(drive, lane):
 def derive_link(drive, dt):
     """Compute the constants of a tick of dt [s]: a division costs a tick as much as ten products.
 
-    Writes tick_mobility, half_capacitance, link_pull, link_share, link_burn, link_decay, and brings the second axis of
-    a pair, which may have been started anew alone, back to the link's voltage.
+    What logic takes is constant down to the under-voltage; below, where its supply gives up, it falls with the square
+    of the voltage: a constant power would never let an empty link be charged again.
+
+    Writes tick_mobility, idle_now, half_capacitance, link_pull, link_share, link_burn, link_decay, and brings the
+    second axis of a pair, which may have been started anew alone, back to the link's voltage.
     """
     for lane in range(LANES):
         first = owner(drive, lane)
-        drive.u_dc[lane] = drive.u_dc[first]
+        u, least = drive.u_dc[first], drive.undervoltage[first]
+        drive.u_dc[lane] = u
+        drive.idle_now[lane] = drive.idle_power[first] * ((u / least) ** 2 if u < least else 1.0)
         for_charging = 0.0 if drive.link_charged[first] > 0.5 else drive.charging_resistance[first]
         resistance = drive.supply_resistance[first] + for_charging + SMALLEST_RESISTANCE
         step = dt / drive.dc_capacitance[first]
@@ -146,7 +152,7 @@ def move_link(drive, dt):
         chopper = 0.0 if drive.brake_hot[lane] > 0.5 else chopper
         drive.chopper[lane] = chopper
         shared = drive.link_shared[lane]
-        idle = (1.0 + shared) * drive.idle_power[lane]
+        idle = (1.0 + shared) * drive.idle_now[lane]
         # Whatever the order, both axes of a pair must find the same sum: one of two terms has only one.
         bridges = drive.bridge_power[lane] + drive.partner_power[lane]
         square = u * u - drive.link_pull[lane] * (bridges + idle)

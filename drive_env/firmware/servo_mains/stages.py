@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment
 from drive_env.firmware.servo import causes as servo_causes
 from drive_env.firmware.servo.derived import derive_sensors
@@ -55,8 +56,11 @@ def run_tick(drive, rates, k):
 
 @stage
 def regulate_motion(drive, rates):
-    """Run position and velocity loop."""
+    """Run position and velocity loop, and add what they ask for to its mean over the period."""
     motion_loops(drive)
+    share = rates.window / rates.period
+    for lane in range(LANES):
+        drive.asked_mean[lane] += share * drive.i_q_ref[lane]
 
 
 @stage
@@ -87,6 +91,7 @@ def connect(drive, lane):
     drive.disconnected[lane] = 0 if d_mode.fits(drive, lane) else 1
     drive.following_time[lane] = 0.0
     drive.reverse_time[lane] = 0.0
+    drive.asked_mean[lane] = 0.0
     drive.stuck_time[lane] = 0.0
     drive.off_time[lane] = 0.0
     drive.omega_before[lane] = 0.0
@@ -109,6 +114,7 @@ STAGES = FirmwareStages(
     halt=(halt, forget_link),
     remote=d_mode.is_remote,
     tells_all=True,  # TGZ manual, 1003h: each error bit generates one entry
+    faults_when_off=True,  # TGZ manual, 1001h: bit 0 is "any active bit", whatever the state
 )
 
 FIRMWARE = compose(STAGES, __name__)

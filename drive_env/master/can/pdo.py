@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
+from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
 from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.mapping import PDO_BITS, Slots, pack
@@ -57,10 +58,8 @@ class _Before(NamedTuple):
 
 def is_mappable(description: Description, entry: Entry, direction: Direction) -> bool:
     """Return whether the EDS allows an object in PDOs of this direction."""
-    accesses = {"RPDO": ("rw", "wo", "rww"), "TPDO": ("rw", "ro", "rwr", "const")}[direction.name]
-    return bool(
-        entry.pdo_mappable and entry.bits and entry.bits % 8 == 0 and entry.access in accesses
-    ) and description.is_number(entry)
+    carried = fits_pdo(entry, direction is OUT_OF_DRIVE)
+    return bool(carried and entry.bits and entry.bits % 8 == 0) and description.is_number(entry)
 
 
 def mappable_names(description: Description, direction: Direction) -> str:

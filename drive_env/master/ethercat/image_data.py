@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import NoAnswerError
@@ -144,11 +145,11 @@ class EtherCatProcessData:
     def check_sampled(self, entries: Sequence[Entry]) -> None:
         """Raise ObjectAccessError 06040041h for an object that cannot come with every cycle."""
         entries = [entry for entry in entries if not self._lockstep or entry.bits is None]
-        self._check(entries, INPUTS, "wo", "recorded")
+        self._check(entries, INPUTS, "recorded")
 
     def check_played(self, entries: Sequence[Entry]) -> None:
         """Raise ObjectAccessError 06040041h for an object that cannot be sent with every cycle."""
-        self._check(entries, OUTPUTS, "ro", "played")
+        self._check(entries, OUTPUTS, "played")
 
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
@@ -308,7 +309,7 @@ class EtherCatProcessData:
         fitting: tuple[Entry, ...] = ()
         for entry in wanted:
             with suppress(ObjectAccessError):
-                self._check([entry], INPUTS, "wo", "recorded")
+                self._check([entry], INPUTS, "recorded")
                 self._planner.plan(INPUTS, (*fitting, entry), self._layout(INPUTS))
                 fitting = (*fitting, entry)
         return fitting
@@ -346,11 +347,10 @@ class EtherCatProcessData:
     def _carries(self, direction: int, entries: tuple[Entry, ...]) -> bool:
         return set(entries) <= set(self._layouts[direction].entries)
 
-    def _check(self, entries: Sequence[Entry], direction: int, wrong_way: str, verb: str) -> None:
+    def _check(self, entries: Sequence[Entry], direction: int, verb: str) -> None:
         ready_made = {*self._layout(direction).entries, *self._planner.carried(direction)}
         for entry in entries:
-            can = entry.pdo_mappable and entry.access not in (wrong_way, "const")
-            if not can and entry not in ready_made:
+            if not fits_pdo(entry, direction == INPUTS) and entry not in ready_made:
                 raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot be {verb}: it is no process data")
 
     def _check_none_is_enabled(self, entries: Sequence[Entry]) -> None:
