@@ -308,6 +308,7 @@ class Bench:
         )
         limits = SimpleNamespace(user=Limits(stall=None), forget=self._lists("forget"))
         self.watch = Watch(drives, self.axes, limits, self.stops, self.watchdogs, self._lists("prepare"), self._poll)
+        self.judging = self.watch._judging
         self.watch._judging = SimpleNamespace(
             judge=lambda rows, judged: self.done.append(("judge", listed(rows), judged.tolist())),
             judge_heard=lambda rows, judged: self.done.append(("heard", judged.tolist())),
@@ -321,6 +322,7 @@ class Bench:
 
     def _poll(self):
         self.done.append(("poll",))
+        assert len(self.done) < 1000, "it polls without end"
         return self.polled.pop(0) if len(self.polled) > 1 else self.polled[0]
 
     def _stop_for(self, what, remedy):
@@ -444,6 +446,15 @@ def test_an_axis_that_is_live_by_its_answer_must_take_commands_and_another_axis_
     assert bench.asked_for("heard")[1] == ([False, False],)
 
 
+@pytest.mark.parametrize("gated", [True, False])
+def test_of_a_gated_drive_alone_it_is_judged_whether_it_takes_commands(gated):
+    bench = Bench(gated=gated)
+    bench.axes.clock = 10.0
+    said = pytest.raises(SafetyError, match="axis 1 has ceased to take commands .* 2303h:00 .* does not fit")
+    with said if gated else contextlib.nullcontext():
+        bench.judging.judge_heard({STATUS: np.array([[0x0637, 0x0437]])}, np.array([True, True]))
+
+
 def test_a_new_zero_has_the_limits_read_again():
     bench = Bench()
     bench.axes.take = lambda rows, epoch, where: True
@@ -482,6 +493,23 @@ def test_a_cycle_of_lockstep_counts_as_100_ms_where_nobody_answers(lacks, asked,
     bench.stops.current = object()
     bench.watch._pass_cycle()
     assert bench.names() == ["step"]
+
+
+def test_a_fresh_watch_counts_three_syncs_without_samples_and_has_been_told_nothing(clock):
+    bench = Bench(time_waits=False, polled=(False,))
+    bench.axes.live[:] = True
+    bench.watch.looks.ask = lambda entries: True
+    bench.watch.looks.ask_unsampled = lambda: None
+    for _ in range(2):
+        bench.axes.seen[:] = clock.now - 0.01
+        bench.watch._look()
+        bench.watch._look_after()
+    bench.watch._look()
+    bench.drives.link.wording.operational = "operational"
+    with pytest.raises(SafetyError, match="it left operational"):
+        bench.watch._look_after()
+    bench.stops.current = SimpleNamespace(is_over=False)
+    assert not bench.watch.is_told_to_end
 
 
 # --- the first look ---------------------------------------------------------------------------------------------------
