@@ -77,7 +77,7 @@ def watch_of(
     watch._supervisor = SimpleNamespace(is_this_thread=lambda: True) if is_supervised else None
     watch._pass_cycle = count("cycles")
     watch._missed, watch._alive, watch._pending = 0, BEGUN, None
-    watch.booted, watch._is_restart_told = set(), False
+    watch.booted, watch._told_of = set(), set()
     return watch, done
 
 
@@ -101,8 +101,9 @@ def stop_of(watch, axes=(0,), over_after=None):
 @pytest.mark.parametrize("cycles", [0, 1, 40])
 def test_in_lockstep_a_stop_takes_the_cycles_that_it_needs(clock, cycles):
     watch, done = watch_of(time_waits=True)
-    stop_of(watch, over_after=cycles)
+    stop = stop_of(watch, over_after=cycles)
     watch.await_stop()
+    assert done.words == [] and watch._stops.current is stop  # what it holds stays held
     assert (done.cycles, done.holds, clock.slept) == (cycles, cycles, [])
 
 
