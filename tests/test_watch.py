@@ -43,6 +43,7 @@ def watch_of(
     def count(name, result=None):
         def act(*_):
             setattr(done, name, getattr(done, name) + 1)
+            assert getattr(done, name) < 10_000, f"{name} without end"
             return result
 
         return act
