@@ -19,7 +19,8 @@ from drive_env.safety.envelope import Envelope, swinging_allowed
 WORD, STATUS, MODE, STORE, GATE = (0x6040, 0), (0x6041, 0), (0x6060, 0), (0x1010, 1), (0x2303, 0)
 TARGET, SPEED, PROFILE, OFFSET, RESOLUTION = (0x607A, 0), (0x60FF, 0), (0x6081, 0), (0x607C, 0), (0x608F, 1)
 QUICK, SLOW, FAST, HOMING, WINDOW = (0x605A, 0), (0x6084, 0), (0x6083, 0), (0x609A, 0), (0x6065, 0)
-OBJECTS = (WORD, STATUS, MODE, STORE, GATE, TARGET, SPEED, PROFILE, OFFSET, RESOLUTION, QUICK, SLOW, FAST, HOMING,
+PRODUCER = (0x100F, 0)  # below 1010h
+OBJECTS = (PRODUCER, WORD, STATUS, MODE, STORE, GATE, TARGET, SPEED, PROFILE, OFFSET, RESOLUTION, QUICK, SLOW, FAST, HOMING,
            WINDOW, CURRENT_LIMIT)  # fmt: skip
 OFF, ENABLED = 0x0240, 0x0637
 ENABLE, DISABLE, SHUTDOWN, STOP = 0x0F, 0x07, 0x06, 0x02
@@ -149,6 +150,10 @@ def test_a_ramp_by_which_an_axis_is_being_disabled_is_not_written(key):
     bench.before(key, where=FIRST)
     with pytest.raises(SafetyError, match=r"is the ramp by which axis 1 is being disabled.*Wait until it is off"):
         bench.before(key)
+    bench.envelope._disabling[:] = True
+    with pytest.raises(SafetyError, match="by which axis 0 is being disabled"):
+        bench.before(key)
+    bench.envelope._disabling[:] = SECOND
     bench.watch.answers["look_for_live"] = lambda: False
     bench.before(key)
     bench.watch.answers["look_for_live"] = lambda: True
@@ -223,6 +228,14 @@ def test_what_was_written_is_noted_for_the_axes_that_it_was_written_to():
     assert bench.axes.mode.tolist() == [8, 0]
     bench.after(SPEED, 7, SECOND)
     assert bench.done == [("note", SPEED, [7, 7], [False, True])]
+
+
+def test_other_objects_of_communication_are_no_store():
+    bench = Bench().is_ready()
+    bench.before(PRODUCER)
+    bench.after(PRODUCER)
+    bench.envelope.after_failed_write(bench.entry(PRODUCER))
+    assert "give_back" not in bench.names() and "lend" not in bench.names()
 
 
 # --- values that are lent -------------------------------------------------------------------------------------------
@@ -334,6 +347,7 @@ def test_what_somebody_else_has_enabled_is_armed_before_it_is_braked():
     [
         ((DISABLE, DISABLE), NONE, FIRST, BOTH, FIRST),
         ((DISABLE, DISABLE), NONE, BOTH, SECOND, SECOND),
+        ((DISABLE, DISABLE), NONE, BOTH, BOTH, BOTH),
         ((ENABLE, DISABLE), NONE, BOTH, BOTH, SECOND),
         ((DISABLE, DISABLE), BOTH, BOTH, BOTH, NONE),  # it cuts: braked otherwise
         ((DISABLE, DISABLE), NONE, NONE, BOTH, NONE),
@@ -421,31 +435,36 @@ def test_rows_of_controlwords_or_set_points_make_ready(rows, arms):
 
 def test_rows_that_take_the_voltage_after_they_enabled_are_refused():
     bench = Bench().is_ready()
-    bench.stops.answers["cuts"] = lambda: np.array([NONE, SECOND])
+    bench.stops.answers["cuts"] = lambda: np.array([NONE, SECOND, SECOND])
     with pytest.raises(SafetyError, match=r"axis 1: these rows take the voltage away after they have enabled it"):
-        bench.play(word=[ENABLE, (ENABLE, 0)])
+        bench.play(word=[ENABLE, (ENABLE, 0), (ENABLE, 0)])
+    bench.stops.answers["cuts"] = lambda: np.array([NONE, BOTH, NONE])
+    with pytest.raises(SafetyError, match="axis 0: these rows take"):  # the first that is wrong
+        bench.play(word=[ENABLE, 0, 0])
+    bench.stops.answers["cuts"] = lambda: np.array([NONE, SECOND, SECOND])
     bench.axes.speed[:] = 100.0
-    bench.play(word=[(ENABLE, STOP), (ENABLE, 0)])  # the other axis is enabled
+    bench.play(word=[(ENABLE, STOP), (ENABLE, 0), (ENABLE, 0)])  # the other axis is enabled
     assert bench.asked("begin") == [([False, True], False)]
 
 
 @pytest.mark.parametrize(
     ("rows", "slow", "refused"),
     [
-        ({"word": [ENABLE, (ENABLE, DISABLE)]}, SECOND, True),
-        ({"word": [ENABLE, (ENABLE, DISABLE)]}, FIRST, False),
-        ({"word": [ENABLE, (ENABLE, DISABLE)]}, NONE, False),
-        ({"word": [ENABLE, (ENABLE, DISABLE)], "slow": [5, 5]}, NONE, True),  # rows change the ramp
-        ({"word": [(STOP, DISABLE)]}, BOTH, False),  # before it is enabled
-        ({"word": [ENABLE, STOP]}, BOTH, False),
+        ({"word": [ENABLE, (ENABLE, DISABLE), STOP]}, SECOND, 1),
+        ({"word": [ENABLE, (ENABLE, DISABLE), STOP]}, FIRST, None),
+        ({"word": [ENABLE, (ENABLE, DISABLE), STOP]}, NONE, None),
+        ({"word": [ENABLE, (ENABLE, DISABLE), STOP], "slow": [5, 5, 5]}, NONE, 1),  # rows change the ramp
+        ({"word": [ENABLE, DISABLE, STOP]}, BOTH, 0),  # the first that is wrong
+        ({"word": [(STOP, DISABLE)]}, BOTH, None),  # before it is enabled
+        ({"word": [ENABLE, STOP, STOP]}, BOTH, None),
     ],
 )
 def test_rows_that_disable_by_a_slow_ramp_after_they_enabled_are_refused(rows, slow, refused):
     bench = Bench().is_ready()
     count = len(rows["word"])
     bench.stops.answers |= {"cuts": lambda: np.zeros((count, 2), bool), "may_ramp_slowly": lambda: np.array(slow)}
-    if refused:
-        with pytest.raises(SafetyError, match=r"axis 1: these rows disable operation after they have enabled it"):
+    if refused is not None:
+        with pytest.raises(SafetyError, match=rf"axis {refused}: these rows disable operation after they have enabled"):
             bench.play(**rows)
     else:
         bench.play(**rows)
@@ -631,6 +650,27 @@ def test_an_axis_that_somebody_else_has_enabled_is_armed_before_it_is_changed(st
     bench = Bench(values={STATUS: statuses})
     bench.before(PROFILE, where=where)
     assert bench.axes.is_armed == arms
+
+
+def test_a_new_envelope_is_idle_and_has_its_drives_mapped_and_polled(guarded):
+    """Made as drives on a bus make it, of parts that are the real ones."""
+    bench, done = Bench(), []
+    drives = bench.drives
+    drives.link = SimpleNamespace(watch=SimpleNamespace(end=lambda: done.append("end")))
+    drives.description.of_further_axes = dict
+    drives.prepare_watch = lambda envelope: done.append(("prepare", envelope))
+    drives.poll = lambda envelope: done.append(("poll", envelope)) or True
+    with pytest.raises(ValueError, match="current has 3 values for 2 axes"):
+        Envelope(Limits(current=(1.0, 2.0, 3.0)), drives)
+    envelope = Envelope(limits := Limits(current=5.0), drives)
+    assert envelope.limits is limits and envelope.epoch == 0
+    assert envelope.interrupt() is False  # nothing may turn
+    envelope._watch._prepare()
+    assert envelope._watch._poll() is True
+    assert done == [("prepare", envelope), ("poll", envelope)]
+    envelope.close()
+    assert done[2:] == ["end"] and guarded == ["release"]  # nothing was ours
+    assert not envelope._disabling.any() and envelope._disabling.shape == (2,)
 
 
 # --- swings that are meant ------------------------------------------------------------------------------------------

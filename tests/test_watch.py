@@ -183,6 +183,23 @@ def test_drives_are_looked_at_after_8_ms_and_after_15_where_all_are_off(clock, l
     assert (done.polls, done.looks) == (polls, 0)
 
 
+@pytest.mark.parametrize(("live", "asked"), [(True, [1]), (False, [])])
+def test_what_no_sample_carries_is_asked_for_of_axes_that_are_live(clock, live, asked):
+    watch, _ = watch_of()
+    seen = []
+    watch.looks.ask_unsampled = lambda: seen.append(1)
+    watch._axes.may_turn[:] = live
+    watch._look()
+    assert seen == asked
+
+
+def test_cycles_of_the_program_that_bring_no_sample_are_not_waited_for_at_any_time_of_the_clock(clock):
+    watch, done = watch_of(polled=None)
+    clock.now, watch._axes.seen[:] = 0.03, 0.01
+    watch._look()
+    assert done.looks == 1
+
+
 def test_the_oldest_sample_counts(clock):
     watch, done = watch_of(3)
     watch._axes.seen[1] -= 0.01
@@ -221,6 +238,13 @@ def test_an_axis_that_cannot_be_seen_for_a_fifth_of_a_second_is_stopped(clock, a
         assert done.stopped == []
 
 
+def test_of_several_axes_that_cannot_be_seen_the_first_is_named(clock):
+    watch, _ = watch_of(3)
+    watch._axes.seen -= (0.0, 0.3, 0.5)
+    with pytest.raises(SafetyError, match=r"axis 1 could not be seen for 0\.30 s"):
+        watch._look_after()
+
+
 def test_an_axis_that_is_off_need_not_be_seen(clock):
     watch, _ = watch_of(2, age=0.5)
     watch._axes.seen[0] = BEGUN
@@ -235,11 +259,13 @@ def test_three_syncs_in_a_row_without_samples_stop_once_and_have_the_node_starte
     watch, done = watch_of()
     watch._missed = 2
     watch._look_after()
-    watch._missed = 3
-    with pytest.raises(SafetyError, match="a node sends no process data any more: it left operational"):
+    for missed in (3, 4):
+        watch._missed = missed
+        with pytest.raises(SafetyError, match="a node sends no process data any more: it left operational"):
+            watch._look_after()
+        assert watch._missed == 0
         watch._look_after()
-    watch._look_after()
-    assert (done.started, len(done.stopped)) == (1, 1)
+    assert (done.started, len(done.stopped)) == (2, 2)
 
 
 def test_a_node_that_restarts_is_told_of_once_by_its_number(clock):
