@@ -306,7 +306,7 @@ def test_a_node_that_has_restarted_is_armed_anew_before_it_is_enabled():
 
 
 @pytest.mark.parametrize(("cuts", "speed", "velocity", "stopped"), [
-    (FIRST, 11.0, 0.0, FIRST), (FIRST, 10.0, -10.0, NONE), (FIRST, 0.0, -11.0, FIRST), (BOTH, -11.0, 0.0, BOTH),
+    (FIRST, 11.0, 0.0, FIRST), (FIRST, 10.0, -10.0, NONE), (FIRST, 5.0, 0.0, NONE), (FIRST, 0.0, -11.0, FIRST), (BOTH, -11.0, 0.0, BOTH),
     (NONE, 11.0, 0.0, NONE),
 ])  # fmt: skip
 def test_what_turns_is_braked_before_its_voltage_is_cut(cuts, speed, velocity, stopped):

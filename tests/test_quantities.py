@@ -14,6 +14,7 @@ from drive_env.master.quantities import (
     UNITS,
     AxisScale,
     find_unit,
+    follows_scale,
     in_unit,
     integers,
     is_quantity,
@@ -167,3 +168,11 @@ def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
     drives.description.dictionary.roles.update(roles)
     drives.read = lambda name: np.array(drives.values[roles.get(name, name)])
     assert scales_of(drives) == expected
+
+
+@pytest.mark.parametrize(("unit", "follows"), [
+    ("inc", True), ("pps", True), ("pps^2", True), ("velocity unit", True), ("velocity unit/s", True),
+    ("1/32767 M-Ipeak", True), ("10 pps", True), ("rpm", False), ("mA", False), ("", False), ("0.1 rpm", False),
+])  # fmt: skip
+def test_which_units_follow_a_scale_that_the_drive_is_asked_for(unit, follows):
+    assert follows_scale(unit) is follows
