@@ -425,6 +425,19 @@ def test_a_record_has_a_row_for_every_period(two):
         drives.record(0x6064, 0.005, period=0.0)
 
 
+def test_a_call_is_known_again_until_64_others_were_made(two):
+    drives, _ = two
+    names = [(entry.index, entry.sub) for entry in drives.description.dictionary if entry.access in ("ro", "rw")][:65]
+    first = drives._cycle_runner.call(names[:1], ())
+    for name in names[1:64]:
+        drives._cycle_runner.call([name], ())
+        assert drives._cycle_runner.call(names[:1], ()) is first
+    drives._cycle_runner.call(names[64:], ())
+    assert drives._cycle_runner.call(names[:1], ()) is not first
+    with pytest.raises(ObjectAccessError):
+        drives._cycle_runner.call([[1, 2]], ())  # a name that is none
+
+
 def test_rows_are_played_for_all_axes_or_each(two):
     drives, link = two
     drives.record(0x6064, 0.002, play={0x60FF: [1, 2], 0x6040: [[6, 7], [8, 9]]})

@@ -14,6 +14,7 @@ from drive_env import CanDrives
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import Entry
 from drive_env.master.parameters import (
+    COMMANDS,
     CommandObjectError,
     Difference,
     NotRestoredError,
@@ -181,6 +182,14 @@ def test_commands_of_further_axes_are_commands_and_what_makes_a_node_mute_is_nev
     check_no_commands([(0x6081, 0)], "f", hints)
     address = next(iter(hints.addresses))
     assert restorable({(address, 0): 1, (0x6081, 0): 2}, hints) == {(0x6081, 0): 2}
+
+
+def test_what_commands_and_serves_by_cia_301_and_402():
+    services = {0x1003, 0x1010, 0x1011, 0x1F50, 0x1F51, 0x1F52}
+    commands = {0x6040, 0x6042, 0x6060, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60B8, 0x60C1, 0x60FE, 0x60FF}
+    assert set(COMMANDS) == services | commands
+    for index, told in COMMANDS.items():
+        assert told.endswith(": a service" if index in services else ": a command")
 
 
 # --- at rest ----------------------------------------------------------------------------------------------------------
