@@ -136,6 +136,9 @@ def test_arming_is_refused_where_it_cannot_be_seen_to_have_worked():
     assert step.text.endswith("it leaves 1016h, since the pace is lockstep") and step.after.drive.consumer == 0
     _, found = steps(at=At.ARM, rows=(ENABLE,), troubles=1)
     assert of("NMT start lost", found).at is At.PROGRAM
+    for nmt in NmtState:
+        _, found = steps(at=At.ARM, rows=(ENABLE,), troubles=1, drive=READY._replace(nmt=nmt))
+        assert ("NMT start lost" in {step.kind for step in found}) == (nmt is not NmtState.OPERATIONAL)
     _, found = steps(TODAY, at=At.ARM, rows=(ENABLE,), troubles=1)
     assert of("NMT start lost", found).at is At.ARMED, "TODAY sends it and does not look"
 
