@@ -36,6 +36,8 @@ from drive_env.safety.model.rules import (
     Assumptions,
 )
 from drive_env.safety.model.situation import At, Hand, Held, Situation, StopStage
+from drive_env.safety.model.steps import attended
+from drive_env.safety.model.supervisor import supervisor_steps
 
 LIVE = Drive(fsa=State.OPERATION_ENABLED, turns=True, nmt=NmtState.OPERATIONAL)
 READY = Drive(fsa=State.READY_TO_SWITCH_ON, nmt=NmtState.OPERATIONAL)
@@ -215,6 +217,45 @@ def test_a_request_that_was_held_back_comes_before_the_next_where_a_bus_keeps_or
     first = next(transfers(made, cia402.CONTROLWORD, SHUTDOWN, Assumptions(keeps_order=keeps_order)))
     assert [frame for frame in first.after.held if frame.kind == "request"] == waiting
     assert first.after.drive.fsa is State.READY_TO_SWITCH_ON
+
+
+# --- the supervisor ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("rules", "situation", "acts"),
+    [
+        (OURS, {}, False),
+        (OURS, {"armed": True}, False),  # nothing is new
+        (OURS, {"armed": True, "drive": LIVE}, True),  # a live axis that was taken for off
+        (OURS, {"drive": LIVE}, False),  # without its thread
+        (OURS, {"stop": StopStage.CUT}, True),
+        (TODAY, {"stop": StopStage.CUT}, False),  # there is none
+    ],
+)
+def test_who_attends_to_a_situation(rules, situation, acts):
+    assert attended(Situation(**situation), rules) is acts
+
+
+@pytest.mark.parametrize(
+    ("situation", "told"),
+    [
+        ({"stop": StopStage.QUICK}, ["the stop sends 6040h = 02h"]),
+        ({"stop": StopStage.RAMP}, ["the stop sees that the axis stands, or is off"]),
+        ({"stop": StopStage.RAMP, "drive": LIVE}, ["the stop sees that the axis is not on its ramp"]),
+        ({"stop": StopStage.CUT}, ["the stop sends 6040h = 00h"]),
+        ({"stop": StopStage.PROVE, "acknowledged": True}, ["the stop reads 6041h: switch on disabled"]),
+        ({"stop": StopStage.PROVE, "drive": LIVE}, ["the stop reads 6041h: operation enabled; so it stops"]),
+        ({"stop": StopStage.PROVE, "drive": LIVE, "ramped": True},
+         ["the stop reads 6041h: operation enabled; no proof, so the heartbeats end",
+          "the stop reads 6041h: operation enabled; no proof, so once more"]),
+        ({"stop": StopStage.PROVE, "drive": LIVE._replace(nmt=NmtState.STOPPED)},
+         ["the stop reads 6041h; so it stops; the node answers no SDO in its NMT state"]),
+        ({"armed": True, "believed": True, "drive": LIVE}, ["the supervisor sees what is, and stops the axis"]),
+        ({"armed": True, "believed": True, "drive": READY._replace(consumer=OWN_ID, fsa=State.SWITCH_ON_DISABLED)},
+         ["the supervisor looks"]),
+    ],
+)  # fmt: skip
+def test_what_the_supervisor_does_is_told_step_by_step(situation, told):
+    assert [step.text for step in supervisor_steps(Situation(**situation), OURS, Assumptions(0))] == told
 
 
 # --- what was explored ------------------------------------------------------------------------------------------------

@@ -88,6 +88,13 @@ def test_it_is_a_thread_of_its_own_that_wakes_and_ends_at_once():
         sys.setswitchinterval(before)
 
 
+def test_a_turn_that_hangs_is_waited_for_two_seconds():
+    supervisor, waits = Supervisor(lambda: None, lambda: None), []
+    supervisor._thread = SimpleNamespace(is_alive=lambda: True, join=waits.append)
+    supervisor.close()
+    assert waits == [2.0]
+
+
 def test_a_shorter_switch_interval_of_the_program_stays():
     before = sys.getswitchinterval()
     sys.setswitchinterval(0.0001)
