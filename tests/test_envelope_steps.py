@@ -108,7 +108,9 @@ def guarded(monkeypatch):
     """Signals are not taken over."""
     told = []
     monkeypatch.setattr(
-        module, "signals", SimpleNamespace(guard=lambda one: told.append("guard"), release=lambda one: told.append("release"))
+        module,
+        "signals",
+        SimpleNamespace(guard=lambda one: told.append("guard"), release=lambda one: told.append("release")),
     )
     return told
 
@@ -362,7 +364,7 @@ def test_an_axis_that_its_disabling_would_let_run_on_is_quick_stopped(words, cut
     bench.before(WORD, words)
     expected = [(list(braked), False)] if any(braked) else []
     assert [what for what in bench.asked("begin") if what != (list(cuts), False)] == expected
-    told = f"axis {int(np.argmax(braked))}: by the ramp of \"disable operation\" (6084h)"
+    told = f'axis {int(np.argmax(braked))}: by the ramp of "disable operation" (6084h)'
     assert (told in caplog.text) == any(braked)
     if any(braked):
         assert "for longer than 1 s: it is quick-stopped" in caplog.text

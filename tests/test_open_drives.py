@@ -41,9 +41,7 @@ def made(monkeypatch):
     for name in ("CanLink", "Port", "DryPort", "BusTime", "open_bus"):
         monkeypatch.setattr(can_drives, name, part(name))
     process = SimpleNamespace(phase=None)
-    monkeypatch.setattr(
-        ethercat_drives, "EtherCatLink", lambda *given: SimpleNamespace(given=given, process=process)
-    )
+    monkeypatch.setattr(ethercat_drives, "EtherCatLink", lambda *given: SimpleNamespace(given=given, process=process))
     made.opened = []
     monkeypatch.setattr(ethercat_drives, "open_master", lambda *given: made.opened.append(given) or "a master")
     made.process = process

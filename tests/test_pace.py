@@ -235,7 +235,7 @@ def test_cycles_that_passed_while_a_sync_was_late_count_where_the_time_is_kept(c
         return wait(receive)
 
     pace.wait = slow
-    run_cycles(line, pace, 10, None, None, 1.0, skip_missed=skip_missed)
+    run_cycles(line, pace, 10, None, None, 1.0, **({"skip_missed": True} if skip_missed else {}))
     assert line.syncs == syncs
 
 

@@ -220,7 +220,12 @@ def held(values, axes=2, refused=()):
     drives = HeldObjects(values, axes, refused=refused)
     entries = {**drives.entries}
     drives.description.dictionary = type(
-        "Known", (), {"find": lambda self, key: entries[key if isinstance(key, tuple) else (key, 0)], "__iter__": lambda self: iter(entries.values())}
+        "Known",
+        (),
+        {
+            "find": lambda self, key: entries[key if isinstance(key, tuple) else (key, 0)],
+            "__iter__": lambda self: iter(entries.values()),
+        },
     )()
     drives.description.hints = find_device("tmcm1636").master
     drives.description.is_number = lambda entry: entry.index != 0x1008

@@ -82,6 +82,7 @@ def test_what_is_written_becomes_the_drives_integer(text, unit, raw):
         ("1e999", "pps", TURN, "'1e999' is beyond any number; .* takes -2147483648 to 2147483647 in pps"),
         ("1e308 rev/s", "pps", TURN, "'1e308 rev/s' is beyond any number"),
         ("3 A", "pps", TURN, "is not a quantity in 'A'; it takes pps, rev/s, rpm, rad/s, deg/s$"),
+        ("3 rpm", "mA", TURN, "is not a quantity in 'rpm'; it takes mA"),
         ("3 rpm", "", TURN, "has no unit that rpm could be turned into; give its integer"),
         ("3 rpm", "pps", None, "has no unit that rpm could be turned into"),
         ("3 knots", "pps", TURN, "is not a quantity in 'knots'"),
