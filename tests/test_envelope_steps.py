@@ -20,8 +20,8 @@ WORD, STATUS, MODE, STORE, GATE = (0x6040, 0), (0x6041, 0), (0x6060, 0), (0x1010
 TARGET, SPEED, PROFILE, OFFSET, RESOLUTION = (0x607A, 0), (0x60FF, 0), (0x6081, 0), (0x607C, 0), (0x608F, 1)
 QUICK, SLOW, FAST, HOMING, WINDOW = (0x605A, 0), (0x6084, 0), (0x6083, 0), (0x609A, 0), (0x6065, 0)
 PRODUCER = (0x100F, 0)  # below 1010h
-OBJECTS = (PRODUCER, WORD, STATUS, MODE, STORE, GATE, TARGET, SPEED, PROFILE, OFFSET, RESOLUTION, QUICK, SLOW, FAST, HOMING,
-           WINDOW, CURRENT_LIMIT)  # fmt: skip
+OBJECTS = (PRODUCER, WORD, STATUS, MODE, STORE, GATE, TARGET, SPEED, PROFILE, OFFSET, RESOLUTION, QUICK, SLOW, FAST,
+           HOMING, WINDOW, CURRENT_LIMIT)  # fmt: skip
 OFF, ENABLED = 0x0240, 0x0637
 ENABLE, DISABLE, SHUTDOWN, STOP = 0x0F, 0x07, 0x06, 0x02
 BOTH, FIRST, SECOND, NONE = (True, True), (True, False), (False, True), (False, False)
@@ -173,7 +173,7 @@ def test_what_is_stored_is_the_drives_own_and_no_ramp_that_coasts_while_an_axis_
     bench.stops.answers["lends_ramps"] = lends
     bench.watch.answers["look_for_live"] = live
     if refused:
-        with pytest.raises(SafetyError, match="what the drives store is their own.*Disable it first"):
+        with pytest.raises(SafetyError, match=r"what the drives store is their own.*Disable it first"):
             bench.before(STORE)
         assert not bench.asked("give_back")
     else:
@@ -308,8 +308,8 @@ def test_a_node_that_has_restarted_is_armed_anew_before_it_is_enabled():
 
 
 @pytest.mark.parametrize(("cuts", "speed", "velocity", "stopped"), [
-    (FIRST, 11.0, 0.0, FIRST), (FIRST, 10.0, -10.0, NONE), (FIRST, 5.0, 0.0, NONE), (FIRST, 0.0, -11.0, FIRST), (BOTH, -11.0, 0.0, BOTH),
-    (NONE, 11.0, 0.0, NONE),
+    (FIRST, 11.0, 0.0, FIRST), (FIRST, 10.0, -10.0, NONE), (FIRST, 5.0, 0.0, NONE),
+    (FIRST, 0.0, -11.0, FIRST), (BOTH, -11.0, 0.0, BOTH), (NONE, 11.0, 0.0, NONE),
 ])  # fmt: skip
 def test_what_turns_is_braked_before_its_voltage_is_cut(cuts, speed, velocity, stopped):
     bench = Bench().is_ready()
@@ -640,13 +640,14 @@ def test_drives_that_cannot_be_watched_are_stopped_and_given_back(guarded):
 def test_an_axis_that_could_not_be_proved_off_keeps_all_from_being_armed():
     bench = Bench()
     bench.axes.lost |= {1, 0}
-    with pytest.raises(SafetyError, match="axis 0 could not be confirmed to be off.*open the drives again"):
+    with pytest.raises(SafetyError, match=r"axis 0 could not be confirmed to be off.*open the drives again"):
         bench.before(SPEED)
     assert "start" not in bench.names()
 
 
 @pytest.mark.parametrize(("statuses", "where", "arms"), [
-    ((OFF, ENABLED), BOTH, True), ((OFF, ENABLED), FIRST, False), ((OFF, OFF), BOTH, False), ((ENABLED, OFF), FIRST, True),
+    ((OFF, ENABLED), BOTH, True), ((OFF, ENABLED), FIRST, False), ((OFF, OFF), BOTH, False),
+    ((ENABLED, OFF), FIRST, True),
 ])  # fmt: skip
 def test_an_axis_that_somebody_else_has_enabled_is_armed_before_it_is_changed(statuses, where, arms):
     bench = Bench(values={STATUS: statuses})

@@ -136,7 +136,7 @@ def test_what_no_limit_needs_is_not_watched(current, following, lacks, watched):
     ],
 )
 def test_what_comes_with_no_sync_is_asked_for(chosen, asked):
-    looks, drives, axes, _ = looks_of(400, 100)
+    looks, drives, _, _ = looks_of(400, 100)
     assert not looks.is_short
     looks.sampled([drives.entries[key] for key in chosen])
     assert looks.is_short == bool(asked)

@@ -1,4 +1,4 @@
-"""What the constructors of drives on CAN and EtherCAT make of their options, and which of them a program's options mean."""
+"""What the constructors of drives on CAN and EtherCAT make of their options, and which of them a program means."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def environment(monkeypatch):
 
 @pytest.fixture
 def made(monkeypatch):
-    """What drives are made of, without a bus: `link`, `description`, `pace`, `safety`, and what the parts were given."""
+    """What drives are made of, without a bus: `link`, `description`, `pace`, `safety`, with what parts were given."""
     made = SimpleNamespace()
 
     def init(self, link, description, pace, safety):
@@ -67,7 +67,7 @@ def test_a_longer_cycle_and_another_bit_rate(made):
     assert made.description.timeout == 0.25 and made.description.timeouts == {(0x1010, 0): 3.0}
     assert made.link[2] == (3, 4) and made.safety is False
     for options in ({"timeout": 0.0}, {"timeouts": {0x6041: -1.0}}):
-        with pytest.raises(ValueError, match="a time-out of .* is impossible"):
+        with pytest.raises(ValueError, match=r"a time-out of .* is impossible"):
             CanDrives(**options)
     with pytest.raises(ValueError, match="pace is 'real-time' or 'lockstep', not 'fast'"):
         CanDrives(pace="fast")

@@ -303,14 +303,14 @@ def test_a_program_that_stalls_is_stopped_in_its_place_and_told(clock, stall, pa
     watch.raise_pending()  # told once
 
 
-# --- samples, the supervisor's turns, and what it is told ---------------------------------------------------------------
+# --- samples, the supervisor's turns, and what it is told -------------------------------------------------------------
 STATUS, POSITION, VELOCITY, CURRENT, SHOWN_MODE = (0x6041, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0), (0x6061, 0)
 GATE = (0x2303, 0)
 OFF, ENABLED = 0x0240, 0x0637
 
 
 class Bench:
-    """A watch over two axes that are off at 0, made as the envelope makes it; its stops and judging list what they do."""
+    """A watch over two axes that are off, made as the envelope makes it; its stops and judging list what they do."""
 
     def __init__(self, *, time_waits=True, gated=False, lacks=(), polled=(True,)):
         self.done, self.polled = [], list(polled)
@@ -408,7 +408,8 @@ def test_a_stop_in_lockstep_goes_on_with_each_sample():
 
 
 @pytest.mark.parametrize(("time_waits", "where", "short", "asks"), [
-    (True, None, True, True), (True, None, False, False), (True, [True, False], True, False), (False, None, True, False),
+    (True, None, True, True), (True, None, False, False), (True, [True, False], True, False),
+    (False, None, True, False),
 ])  # fmt: skip
 def test_in_lockstep_what_no_sample_carries_is_asked_for_with_it(time_waits, where, short, asks):
     bench = Bench(time_waits=time_waits)
@@ -478,7 +479,7 @@ def test_an_axis_that_is_live_by_its_answer_must_take_commands_and_another_axis_
 def test_of_a_gated_drive_alone_it_is_judged_whether_it_takes_commands(gated):
     bench = Bench(gated=gated)
     bench.axes.clock = 10.0
-    said = pytest.raises(SafetyError, match="axis 1 has ceased to take commands .* 2303h:00 .* does not fit")
+    said = pytest.raises(SafetyError, match=r"axis 1 has ceased to take commands .* 2303h:00 .* does not fit")
     with said if gated else contextlib.nullcontext():
         bench.judging.judge_heard({STATUS: np.array([[0x0637, 0x0437]])}, np.array([True, True]))
 
@@ -574,7 +575,7 @@ def test_a_node_that_sends_no_samples_for_as_long_as_an_answer_takes_is_not_move
     bench = Bench(time_waits=False, polled=(False,))
     poll = bench.watch._poll
     bench.watch._poll = lambda: (setattr(clock, "now", clock.now + 0.25), poll())[1]
-    with pytest.raises(SafetyError, match="a node sends no process data at SYNC.*check the cable"):
+    with pytest.raises(SafetyError, match=r"a node sends no process data at SYNC.*check the cable"):
         bench.watch._prove_operational()
     assert bench.names().count("poll") == 3 and bench.names().count("start") == 2  # 0.25, 0.5 and 0.75 s
 

@@ -231,7 +231,7 @@ def test_a_drive_that_cannot_watch_is_not_moved():
         raise NoWatchdogError("node 1 has no 1016h")
 
     watchdogs._watch.begin = begin
-    with pytest.raises(SafetyError, match="^node 1 has no 1016h$"):
+    with pytest.raises(SafetyError, match=r"^node 1 has no 1016h$"):
         watchdogs.set()
     watchdogs._watch.is_in_force = lambda k: pytest.fail("none was set")
     watchdogs.check()
