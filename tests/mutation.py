@@ -31,8 +31,8 @@ HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
 LONGEST = 300.0  # s: tests that take longer hang, and have noticed
 # Of these no test could see anything: what only a type checker or a reader of warnings sees, checks of lengths, caches.
-# Of truth values a product is an "and", a sum an "or".
-LEFT_OUT = ("RemoveDecorator", "NoOp", "Variable", "BitAnd_Mul", "BitOr_Add")
+# Of truth values a product is an "and", a sum an "or". What is identical (None, a member of an enumeration) is equal.
+LEFT_OUT = ("RemoveDecorator", "NoOp", "Variable", "BitAnd_Mul", "BitOr_Add", "_Is_Eq", "_IsNot_NotEq")
 HARMLESS = ("strict=", "TYPE_CHECKING", "stacklevel=", "pragma: no cover")
 
 

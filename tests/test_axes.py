@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -40,6 +41,19 @@ def take(axes, epoch=None, where=None, seconds=0.001, **rows):
 
 
 # --- live or not --------------------------------------------------------------------------------------------------
+def test_at_first_nothing_is_seen_and_nothing_was_written():
+    drives = HeldObjects({STATUS: 0, POSITION: 0}, 2)
+    axes = Axes(drives)
+    assert (axes.seen == -math.inf).all() and (axes.mode_written == -math.inf).all()
+    assert not axes.may_turn.any() and not axes.is_armed and not axes.in_flight.any() and not axes.lost and not axes.aim
+    assert (axes.outside == -1).all() and not axes.has_scale.any() and (axes.epoch, axes.clock) == (0, 0.0)
+    assert not axes.is_counted  # it has no 606Ch
+    drives.time_waits = True
+    assert axes.now() == 0.0
+    drives.time_waits = False
+    assert abs(axes.now() - time.monotonic()) < 60.0
+
+
 def test_an_axis_is_live_by_its_newest_statusword():
     axes = axes_of()
     take(axes, status=[[OFF, ENABLED], [QUICK_STOP, OFF]])

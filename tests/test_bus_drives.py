@@ -7,9 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_description import TYPES, eds_of
 
 from drive_env import Limits
 from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.roles import Role
 from drive_env.master.bus_drives import BusDrives, checked_limits
 from drive_env.master.description import describe
 from drive_env.master.errors import BusError, NoAnswerError
@@ -107,11 +110,11 @@ class Line:
 
     is_dry = False
 
-    def __init__(self, description, *nodes):
+    def __init__(self, description, *nodes, whole=True):
         self.nodes, self.log, self.labels, self.syncs, self.starts = nodes, [], [], 0, 0
         self.axes, self.emergencies, self.is_closed = description.num_axes, [], False
         self.objects = [Objects(self, k) for k in range(len(nodes))]
-        for node in self.objects:
+        for node in self.objects if whole else ():
             for key in IDENTITY:
                 node.values[key] = int(description.dictionary.find(key).default).to_bytes(4, "little")
         self.process = Process(self)
@@ -246,6 +249,22 @@ def test_a_device_that_is_known_is_named_with_the_way_to_open_it():
         BusDrives(link, description, LockstepPace(), safety=False)
 
 
+@pytest.mark.parametrize(("kind", "said"), [
+    (0x420192, r"node 5 is a tmcm1636_fw109, not a tmcm1636: its device type \(1000h:00\) is 00420192h; name it so "
+     r"\(device='tmcm1636_fw109', --device tmcm1636_fw109\)"),
+    (0x420193, None),  # of no variant that is known
+])  # fmt: skip
+def test_another_variant_may_count_in_other_units_and_is_named(kind, said):
+    description = describe("tmcm1636", None)
+    link = Line(description, 5)
+    link.objects[0].values[0x1000, 0] = kind.to_bytes(4, "little")
+    if said is None:
+        BusDrives(link, description, LockstepPace(), safety=False).close()
+        return
+    with pytest.raises(BusError, match=said):
+        BusDrives(link, description, LockstepPace(), safety=False)
+
+
 def test_a_stopped_node_is_woken_and_told_of(caplog):
     description = describe("tmcm1636", None)
     link = Line(description, 5, 9)
@@ -335,6 +354,53 @@ def test_slow_objects_are_waited_for(two):
     assert link.objects[1].patience[0x1010, 1] >= drives.description.hints.timeouts.get(0x1010, 0.25)
 
 
+def test_a_scale_that_several_objects_make_is_reckoned():
+    """A stepper counts microsteps: full steps of a turn, times two to the power of the resolution."""
+    drives, link = opened(device="tmcm6212")
+    scale = position_scale(drives.description.dictionary.roles)
+    steps, exponent = (drives.description.dictionary.find(key) for key in scale.keys)
+    for axis in range(drives.num_axes):
+        for entry, value in ((steps, 200), (exponent, axis)):
+            key = drives.description.key(entry, axis)
+            link.objects[0].values[key] = drives.description.encode(entry, value)
+    found = drives.read(Role.POSITION_SCALE)
+    assert found.tolist() == [200, 400, 800, 1600, 3200, 6400] and found.dtype == np.int64
+    drives.close()
+    drives, link = opened()
+    link.objects[0].values[drives.description.role(Role.POSITION_SCALE)] = (4096).to_bytes(4, "little")
+    assert drives.read(Role.POSITION_SCALE).tolist() == [4096]  # that of one object is as the wire has it
+    drives.close()
+
+
+def test_a_quantity_becomes_the_integer_of_each_axis(two):
+    drives, link = two
+    scale = drives.description.role(Role.POSITION_SCALE)
+    for node, increments in zip(link.objects, (1000, 4000), strict=True):
+        node.values[scale] = increments.to_bytes(4, "little")
+    drives.write(0x60FF, "30 rpm")
+    assert [node.values[0x60FF, 0] for node in link.objects] == [b"\xf4\x01\0\0", b"\xd0\x07\0\0"]
+    link.log.clear()
+    drives.write(0x2003, "2 A", where=np.array([False, True]))
+    assert link.log == [("write", 1, 0x2003, 0)]  # what follows no scale needs none
+    assert link.objects[1].values[0x2003, 0] == b"\xd0\x07\0\0"
+
+
+@pytest.mark.parametrize(("kind", "dtype"), [("u64", np.uint64), ("i64", np.int64), ("u32", np.int64)])
+def test_an_unsigned64_comes_as_such_and_a_text_as_text(tmp_path, kind, dtype):
+    TYPES.setdefault("u64", "0x001B")
+    path = eds_of(tmp_path, (0x6041, "u16", "ro"), (0x2000, kind, "ro"), (0x2001, "text", "rw"))
+    description = describe(None, path)
+    link = Line(description, 5, whole=False)
+    drives = BusDrives(link, description, LockstepPace(), safety=False)
+    link.objects[0].values[0x2000, 0] = b"\xff" * (4 if kind == "u32" else 8)
+    found = drives.read(0x2000)
+    assert found.dtype == dtype and int(found[0]) == {"u64": 2**64 - 1, "i64": -1, "u32": 2**32 - 1}[kind]
+    drives.write(0x2001, "left arm")
+    assert link.objects[0].values[0x2001, 0] == b"left arm" and link.labels[-1] == "left arm to 2001h:00 object 2001"
+    assert drives.read(0x2001).tolist() == ["left arm"]
+    drives.close()
+
+
 # --- cycles -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("per_sync", "duration", "syncs"), [(1, 0.0, 0), (1, 0.005, 5), (4, 0.004, 1), (4, 0.005, 2), (4, 0.008, 2)]
@@ -357,6 +423,19 @@ def test_a_record_has_a_row_for_every_period(two):
     assert link.process.mapping == 1, "the same call costs no configuration"
     with pytest.raises(ValueError, match=r"period must be at least 0\.001 s, not 0 s"):
         drives.record(0x6064, 0.005, period=0.0)
+
+
+def test_a_call_is_known_again_until_64_others_were_made(two):
+    drives, _ = two
+    names = [(entry.index, entry.sub) for entry in drives.description.dictionary if entry.access in ("ro", "rw")][:65]
+    first = drives._cycle_runner.call(names[:1], ())
+    for name in names[1:64]:
+        drives._cycle_runner.call([name], ())
+        assert drives._cycle_runner.call(names[:1], ()) is first
+    drives._cycle_runner.call(names[64:], ())
+    assert drives._cycle_runner.call(names[:1], ()) is not first
+    with pytest.raises(ObjectAccessError):
+        drives._cycle_runner.call([[1, 2]], ())  # a name that is none
 
 
 def test_rows_are_played_for_all_axes_or_each(two):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 from drive_env.devices import find_device
 from drive_env.dictionary.eds_file import object_section
 from drive_env.dictionary.entries import EdsText, eds_file
-from drive_env.master.commissioned_eds import commissioned_eds
+from drive_env.master import commissioned_eds as module
+from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
+from drive_env.master.description import describe
 
 EDS = find_device("tmcm1636").eds
 VELOCITY, PRODUCER, LACKING, SUB_LACKING = (0x6081, 0), (0x1017, 0), (0x5ABC, 0), (0x607D, 9)
@@ -30,6 +35,28 @@ def test_values_stand_where_the_eds_has_the_object_and_nowhere_else(node_id, lin
     assert object_section(LACKING[0]) not in found and object_section(*SUB_LACKING) not in found
     changed = {name for name, row in found.items() if row != own().get(name)}
     assert changed == {object_section(VELOCITY[0]), "FileInfo"} | ({"DeviceComissioning"} if node_id else set())
+
+
+def test_what_emulated_drives_have_now_are_the_parameters_of_each_axis():
+    device = find_device("tmcm6212")
+    read = []
+
+    def value(name):
+        read.append(name)
+        return np.array([10, 11, 12])
+
+    found = commissioned_values(SimpleNamespace(bus=None, device=device, num_axes=3, read=value))
+    assert [found[0x6081 + 0x800 * axis, 0] for axis in range(3)] == [10, 11, 12]
+    assert (0x6081 + 0x1800, 0) not in found, "there are three axes of six"
+    assert not {index for index, _ in found} & {0x6040, 0x6041, 0x6840, 0x1010, 0x1008}
+    assert {name[0] for name in read} & {0x6881, 0x7081} == set(), "an axis is asked for by the first one's index"
+
+
+def test_what_drives_on_a_bus_have_are_the_parameters_of_one_of_its_nodes(monkeypatch):
+    bus = SimpleNamespace(description=describe("tmcm6212", None))
+    monkeypatch.setattr(module, "read_parameters", lambda drives, axis: {VELOCITY: axis, PRODUCER: 7})
+    found = commissioned_values(SimpleNamespace(bus=bus), 1)
+    assert found == {PRODUCER: 7, **{(0x6081 + 0x800 * axis, 0): 6 + axis for axis in range(6)}}
 
 
 def test_a_default_that_is_the_drives_stays_as_it_is_written():

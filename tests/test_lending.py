@@ -20,8 +20,8 @@ def lending_of(axes=2, **options):
 def test_what_is_lent_and_given_back():
     lending, drives = lending_of()
     assert not lending.is_lent(KEY, 0) and not lending.has_lent({0, 1})
-    assert lending.lend(KEY, 1, 40)
-    assert drives.values[KEY].tolist() == [100, 40]
+    assert lending.lend(KEY, 1, 40_000)
+    assert drives.values[KEY].tolist() == [100, 40_000]
     assert (lending.is_lent(KEY, 1), lending.is_lent(KEY, 0), lending.is_lent(OTHER, 1)) == (True, False, False)
     assert (lending.has_lent({1}), lending.has_lent({0}), lending.has_lent({0, 1})) == (True, False, True)
     assert lending.owned(KEY, 1) == 100

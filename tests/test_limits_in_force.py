@@ -134,6 +134,15 @@ def test_a_rotor_keeps_its_place_while_its_scale_and_zero_are_written():
     assert (made.bounds().low, made.bounds().high) == (-TURN * 3 // 4, TURN // 4)
 
 
+def test_a_drive_that_tells_no_position_is_taken_to_be_at_0():
+    made, drives, axes = in_force()
+    del drives.entries[POSITION]
+    for act in (made.place, made.keep_place):
+        axes.position[:] = 5
+        act()
+        assert axes.position == 0
+
+
 def test_other_limits_are_places_of_the_rotor_as_it_is_now():
     made, drives, _ = in_force(Limits(position=(-100, 100)))
     drives.values[POSITION][:] = 40

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 
 from drive_env import cia402
 from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State
+from drive_env.safety.model import __main__ as command_module
 from drive_env.safety.model.drive import Drive
+from drive_env.safety.model.exploration import (
+    GIVEN_UP,
+    LEFT,
+    RUNS_ON,
+    TAKEN_FOR_OFF,
+    UNWATCHED,
+    Counterexample,
+    Exploration,
+    described,
+    explore,
+)
 from drive_env.safety.model.frames import transfers
 from drive_env.safety.model.program import PLAYS, WORDS, program_steps
 from drive_env.safety.model.rules import (
@@ -22,6 +36,8 @@ from drive_env.safety.model.rules import (
     Assumptions,
 )
 from drive_env.safety.model.situation import At, Hand, Held, Situation, StopStage
+from drive_env.safety.model.steps import attended
+from drive_env.safety.model.supervisor import supervisor_steps
 
 LIVE = Drive(fsa=State.OPERATION_ENABLED, turns=True, nmt=NmtState.OPERATIONAL)
 READY = Drive(fsa=State.READY_TO_SWITCH_ON, nmt=NmtState.OPERATIONAL)
@@ -122,6 +138,9 @@ def test_arming_is_refused_where_it_cannot_be_seen_to_have_worked():
     assert step.text.endswith("it leaves 1016h, since the pace is lockstep") and step.after.drive.consumer == 0
     _, found = steps(at=At.ARM, rows=(ENABLE,), troubles=1)
     assert of("NMT start lost", found).at is At.PROGRAM
+    for nmt in NmtState:
+        _, found = steps(at=At.ARM, rows=(ENABLE,), troubles=1, drive=READY._replace(nmt=nmt))
+        assert ("NMT start lost" in {step.kind for step in found}) == (nmt is not NmtState.OPERATIONAL)
     _, found = steps(TODAY, at=At.ARM, rows=(ENABLE,), troubles=1)
     assert of("NMT start lost", found).at is At.ARMED, "TODAY sends it and does not look"
 
@@ -198,3 +217,112 @@ def test_a_request_that_was_held_back_comes_before_the_next_where_a_bus_keeps_or
     first = next(transfers(made, cia402.CONTROLWORD, SHUTDOWN, Assumptions(keeps_order=keeps_order)))
     assert [frame for frame in first.after.held if frame.kind == "request"] == waiting
     assert first.after.drive.fsa is State.READY_TO_SWITCH_ON
+
+
+# --- the supervisor ---------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("rules", "situation", "acts"),
+    [
+        (OURS, {}, False),
+        (OURS, {"armed": True}, False),  # nothing is new
+        (OURS, {"armed": True, "drive": LIVE}, True),  # a live axis that was taken for off
+        (OURS, {"drive": LIVE}, False),  # without its thread
+        (OURS, {"stop": StopStage.CUT}, True),
+        (TODAY, {"stop": StopStage.CUT}, False),  # there is none
+    ],
+)
+def test_who_attends_to_a_situation(rules, situation, acts):
+    assert attended(Situation(**situation), rules) is acts
+
+
+@pytest.mark.parametrize(
+    ("situation", "told"),
+    [
+        ({"stop": StopStage.QUICK}, ["the stop sends 6040h = 02h"]),
+        ({"stop": StopStage.RAMP}, ["the stop sees that the axis stands, or is off"]),
+        ({"stop": StopStage.RAMP, "drive": LIVE}, ["the stop sees that the axis is not on its ramp"]),
+        ({"stop": StopStage.CUT}, ["the stop sends 6040h = 00h"]),
+        ({"stop": StopStage.PROVE, "acknowledged": True}, ["the stop reads 6041h: switch on disabled"]),
+        ({"stop": StopStage.PROVE, "drive": LIVE}, ["the stop reads 6041h: operation enabled; so it stops"]),
+        ({"stop": StopStage.PROVE, "drive": LIVE, "ramped": True},
+         ["the stop reads 6041h: operation enabled; no proof, so the heartbeats end",
+          "the stop reads 6041h: operation enabled; no proof, so once more"]),
+        ({"stop": StopStage.PROVE, "drive": LIVE._replace(nmt=NmtState.STOPPED)},
+         ["the stop reads 6041h; so it stops; the node answers no SDO in its NMT state"]),
+        ({"armed": True, "believed": True, "drive": LIVE}, ["the supervisor sees what is, and stops the axis"]),
+        ({"armed": True, "believed": True, "drive": READY._replace(consumer=OWN_ID, fsa=State.SWITCH_ON_DISABLED)},
+         ["the supervisor looks"]),
+    ],
+)  # fmt: skip
+def test_what_the_supervisor_does_is_told_step_by_step(situation, told):
+    assert [step.text for step in supervisor_steps(Situation(**situation), OURS, Assumptions(0))] == told
+
+
+# --- what was explored ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("rules", "assumptions", "states", "transitions", "lengths"),
+    [
+        (TODAY, Assumptions(0), 2670, 13_734, {UNWATCHED: 2, RUNS_ON: 3, LEFT: 3, TAKEN_FOR_OFF: 7, GIVEN_UP: 7}),
+        (TODAY, Assumptions(1), 59_458, 367_525, {UNWATCHED: 2, RUNS_ON: 3, LEFT: 3, TAKEN_FOR_OFF: 4, GIVEN_UP: 7}),
+        (OURS, Assumptions(0), 2281, 8280, {}),
+        (OURS, Assumptions(1, coincidences=True), 55_203, 259_211, {RUNS_ON: 5}),
+    ],
+    ids=["before", "before, one trouble", "ours", "ours, one trouble"],
+)
+def test_the_model_that_was_explored_is_this_one(rules, assumptions, states, transitions, lengths):
+    """How large it is, and its shortest counterexamples. Whoever changes the model sees here how much of it changed."""
+    result = explore(rules, assumptions)
+    assert (result.states, result.transitions) == (states, transitions)
+    assert {wrong: len(one.trace) for wrong, one in result.found.items()} == lengths
+
+
+def test_both_rule_sets_are_explored_by_the_command(monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(command_module, "explore", lambda rules, assumptions: asked.append((rules, assumptions)) or (
+        Exploration(7, 9, 1.25, {} if rules is OURS else {RUNS_ON: "a trace"})
+    ))  # fmt: skip
+    for arguments, troubles in (([], 1), (["--troubles", "3"], 3), (["--troubles", "0"], 0)):
+        monkeypatch.setattr(sys, "argv", ["model", *arguments])
+        command_module.main()
+        assert asked[-2:] == [(TODAY, Assumptions(troubles)), (OURS, Assumptions(troubles))]
+        assert capsys.readouterr().out.splitlines() == [
+            "TODAY: 7 states, 9 steps, 1.2 s", "a trace", "OURS: 7 states, 9 steps, 1.2 s", "no counterexample"
+        ]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["model", "--troubles", "4"])
+    with pytest.raises(SystemExit):
+        command_module.main()
+
+
+@pytest.mark.parametrize(
+    ("drive", "told"),
+    [
+        (Drive(), "switch on disabled; pre-operational; no watchdog"),
+        (LIVE._replace(consumer=OWN_ID), "operation enabled, turns; operational; watches 126, not begun"),
+        (LIVE._replace(consumer=OWN_ID, heard=True), "operation enabled, turns; operational; watches 126"),
+        (LIVE._replace(consumer=OWN_ID, heard=True, nmt=NmtState.PRE_OPERATIONAL),
+         "operation enabled, turns; pre-operational; watches 126 without effect"),
+    ],
+)  # fmt: skip
+def test_a_drive_in_one_line(drive, told):
+    assert described(Situation(drive=drive)) == told
+
+
+@pytest.mark.parametrize(("drive", "lockstep", "told"), [
+    (Drive(), False, "off"), (LIVE, True, 'enabled by another master, turning, pace="lockstep"'),
+])  # fmt: skip
+def test_a_trace_begins_with_what_was_found(drive, lockstep, told):
+    found = Counterexample(RUNS_ON, (("kill", "it dies", Situation()),), Situation(drive=drive, lockstep=lockstep))
+    assert str(found).splitlines()[1:] == [
+        f"   0. the axis is {told}", "   1. it dies  [switch on disabled; pre-operational; no watchdog]"
+    ]  # fmt: skip
+    assert found.kinds == {"kill"}
+
+
+def test_names_of_beginnings_restrict_what_is_explored():
+    everything = explore(TODAY, Assumptions(0))
+    some = explore(TODAY, Assumptions(0), ("found enabled",))
+    more = explore(TODAY, Assumptions(0), ("found enabled", "lockstep"))
+    none = explore(TODAY, Assumptions(0), ())
+    assert none.states < some.states < more.states < everything.states
+    first = explore(TODAY, Assumptions(0), wanted=(UNWATCHED,))
+    assert list(first.found) == [UNWATCHED] and first.states < everything.states

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+from types import SimpleNamespace
+
 import pytest
+from held_objects import HeldObjects
 from scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import Entry
 from drive_env.master.parameters import (
+    COMMANDS,
     CommandObjectError,
     Difference,
     NotRestoredError,
     RollbackError,
     _in_order,
     _pdo_of,
+    check_at_rest,
     check_no_commands,
     command,
     compare,
     list_differences,
     parameters,
+    read_parameters,
     restorable,
     write_all_or_none,
 )
@@ -174,3 +182,113 @@ def test_commands_of_further_axes_are_commands_and_what_makes_a_node_mute_is_nev
     check_no_commands([(0x6081, 0)], "f", hints)
     address = next(iter(hints.addresses))
     assert restorable({(address, 0): 1, (0x6081, 0): 2}, hints) == {(0x6081, 0): 2}
+
+
+def test_what_commands_and_serves_by_cia_301_and_402():
+    services = {0x1003, 0x1010, 0x1011, 0x1F50, 0x1F51, 0x1F52}
+    commands = {0x6040, 0x6042, 0x6060, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60B8, 0x60C1, 0x60FE, 0x60FF}
+    assert set(COMMANDS) == services | commands
+    for index, told in COMMANDS.items():
+        assert told.endswith(": a service" if index in services else ": a command")
+
+
+# --- at rest ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("keys", "affected"),
+    [
+        ([(0x2003, 0), (0x6081, 0)], [4]),
+        ([(0x2000, 0)], [4]),
+        ([(0x1FFF, 0)], [3, 4, 5]),  # how a node talks is of all its axes
+        ([(0x6081, 0), (0x1400, 1)], [3, 4, 5]),
+        ([(0x6881, 0)], [3, 4, 5]),  # by a further axis' own index
+        ([], [4]),
+    ],
+)
+def test_no_axis_that_a_change_touches_may_be_enabled(keys, affected):
+    for live in range(6):
+        drives = SimpleNamespace(
+            description=SimpleNamespace(num_axes=3, dictionary=SimpleNamespace(find=lambda index: index)),
+            read_axis=lambda index, axis, live=live: 0x0637 if (index, axis) == (0x6041, live) else 0x0240,
+        )
+        said = pytest.raises(NotRestoredError, match="the axis is enabled, and parameters are not exchanged under way")
+        with said if live in affected else contextlib.nullcontext():
+            check_at_rest(drives, keys, 4)
+
+
+def held(values, axes=2, refused=()):
+    """Drives of one node that hold parameters, whose `log` has what was written."""
+    drives = HeldObjects(values, axes, refused=refused)
+    entries = {**drives.entries}
+    drives.description.dictionary = type(
+        "Known",
+        (),
+        {
+            "find": lambda self, key: entries[key if isinstance(key, tuple) else (key, 0)],
+            "__iter__": lambda self: iter(entries.values()),
+        },
+    )()
+    drives.description.hints = find_device("tmcm1636").master
+    drives.description.is_number = lambda entry: entry.index != 0x1008
+    drives.write_axis = drives.write_raw
+    return drives
+
+
+def test_the_parameters_of_an_axis_are_what_it_shows_of_all_that_stays():
+    drives = held({(0x6081, 0): (5, 6), (0x6040, 0): 1, (0x1008, 0): 2, (0x6064, 0): 3}, refused=((0x6065, 0),))
+    drives.entries[0x6064, 0] = None
+    assert read_parameters(drives) == {(0x6081, 0): 5, (0x6064, 0): 3}
+    assert read_parameters(drives, 1) == {(0x6081, 0): 6, (0x6064, 0): 3}
+
+
+@pytest.mark.parametrize(("access", "stays"), [("rw", True), ("rwr", True), ("rww", True), ("ro", False),
+                                               ("wo", False), ("const", False)])  # fmt: skip
+def test_a_parameter_can_be_read_and_written(access, stays):
+    drives = held({(0x6081, 0): 5})
+    entry = dataclasses.replace(drives.entries[0x6081, 0], access=access)
+    drives.description.dictionary = [entry]
+    assert parameters(drives) == ([entry] if stays else [])
+
+
+def test_where_an_axis_differs_and_what_it_has_not():
+    drives = held({(0x6081, 0): (5, 6)}, refused=((0x6065, 0),))
+    found = compare(drives, {(0x6081, 0): 6, (0x6065, 0): 7})
+    assert [(one.entry.index, one.wanted, one.found) for one in found] == [(0x6081, 6, 5), (0x6065, 7, None)]
+    assert [one.entry.index for one in compare(drives, {(0x6081, 0): 6, (0x6065, 0): 7}, 1)] == [0x6065]
+
+
+def test_a_pdo_that_changes_is_read_whole_before_and_written_back_whole():
+    """A value that the drive does not keep: what was changed is taken back, the last one first."""
+    values = {(0x6041, 0): 0x0240, **TPDO, (0x1801, 1): 0x281, (0x6081, 0): 1, (0x6065, 0): 3}
+    drives = held(values, axes=1)
+    drives.takes[0x6065, 0] = lambda value: 3
+    with pytest.raises(NotRestoredError, match=r"6065h.* is 3, not 4; everything was taken back"):
+        write_all_or_none(drives, {(0x6081, 0): 2, (0x1A00, 0): 1, (0x6065, 0): 4})
+    written = [(key, value) for key, _, value in drives.log]
+    off = [((0x1800, 1), 0x181 | OFF), ((0x1A00, 0), 0)]
+    assert written[:2] == [((0x6081, 0), 2), ((0x6065, 0), 4)]
+    assert written[2:] == [*off, ((0x1A00, 1), 0x60410010), ((0x1A00, 0), 1), ((0x1800, 1), 0x181),
+                           ((0x6081, 0), 1), *off, ((0x1A00, 1), 0x60410010), ((0x1A00, 2), 0x60640020),
+                           ((0x1A00, 0), 2), ((0x1800, 1), 0x181)]  # fmt: skip
+    assert {key: int(drives.values[key][0]) for key in values} == values
+
+
+def test_what_cannot_be_taken_back_is_named():
+    drives = held({(0x6041, 0): 0x0240, (0x6081, 0): 1, (0x6065, 0): 3}, axes=1)
+    drives.takes |= {(0x6065, 0): lambda value: 3, (0x6081, 0): lambda value: 2}
+    with pytest.raises(RollbackError, match=r"these could not be taken back: 6081h.* is 2, not 1. Reset the node"):
+        write_all_or_none(drives, {(0x6081, 0): 2, (0x6065, 0): 4})
+
+
+def test_what_an_interrupted_write_changed_is_taken_back_by_its_kind():
+    drives = held({(0x6041, 0): 0x0240, (0x6081, 0): 1, (0x6065, 0): 3}, axes=1)
+    write = drives.write_axis
+
+    def interrupted(entry, axis, value):
+        if value == 4:
+            raise KeyboardInterrupt
+        write(entry, axis, value)
+
+    drives.write_axis = interrupted
+    with pytest.raises(NotRestoredError, match=r"^KeyboardInterrupt; everything was taken back"):
+        write_all_or_none(drives, {(0x6081, 0): 2, (0x6065, 0): 4})
+    assert drives.values[0x6081, 0] == 1

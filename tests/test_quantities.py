@@ -14,6 +14,7 @@ from drive_env.master.quantities import (
     UNITS,
     AxisScale,
     find_unit,
+    follows_scale,
     in_unit,
     integers,
     is_quantity,
@@ -81,6 +82,7 @@ def test_what_is_written_becomes_the_drives_integer(text, unit, raw):
         ("1e999", "pps", TURN, "'1e999' is beyond any number; .* takes -2147483648 to 2147483647 in pps"),
         ("1e308 rev/s", "pps", TURN, "'1e308 rev/s' is beyond any number"),
         ("3 A", "pps", TURN, "is not a quantity in 'A'; it takes pps, rev/s, rpm, rad/s, deg/s$"),
+        ("3 rpm", "mA", TURN, "is not a quantity in 'rpm'; it takes mA"),
         ("3 rpm", "", TURN, "has no unit that rpm could be turned into; give its integer"),
         ("3 rpm", "pps", None, "has no unit that rpm could be turned into"),
         ("3 knots", "pps", TURN, "is not a quantity in 'knots'"),
@@ -110,7 +112,7 @@ def test_each_axis_has_its_own_scale_and_the_others_none():
 def test_integers_in_a_unit():
     raw = np.array([[500, 500], [1000, -1000]])
     np.testing.assert_allclose(in_unit(raw, entry("pps"), "rpm", [TURN, 2 * TURN]), [[30, 15], [60, -30]])
-    found = in_unit(raw, entry("pps"), "pps", [None, None])
+    found = in_unit(raw, entry("pps"), "".join(("p", "ps")), [None, None])  # as it is read from somewhere
     assert found.dtype == float and found.tolist() == raw.tolist()
 
 
@@ -167,3 +169,11 @@ def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
     drives.description.dictionary.roles.update(roles)
     drives.read = lambda name: np.array(drives.values[roles.get(name, name)])
     assert scales_of(drives) == expected
+
+
+@pytest.mark.parametrize(("unit", "follows"), [
+    ("inc", True), ("pps", True), ("pps^2", True), ("velocity unit", True), ("velocity unit/s", True),
+    ("1/32767 M-Ipeak", True), ("10 pps", True), ("rpm", False), ("mA", False), ("", False), ("0.1 rpm", False),
+])  # fmt: skip
+def test_which_units_follow_a_scale_that_the_drive_is_asked_for(unit, follows):
+    assert follows_scale(unit) is follows

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
-from drive_env.safety.stopping import AxisStop, Phase, Sample
+from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
 
 ENABLED, STOPPING, OFF = 0x0637, 0x0617, 0x0650  # statuswords (CiA 402)
 QUICK_STOP, DISABLE_VOLTAGE = 0x02, 0x00  # controlwords
@@ -27,11 +28,12 @@ class Axis:
     def __init__(self, speed, *, obeys=True, seen_until=math.inf):
         self.speed, self.obeys, self.seen_until = speed, obeys, seen_until
         self.status, self.begun, self.last = ENABLED, None, None
+        self.sense = 1.0  # of its movement
 
     def sample(self, now):
         if self.last is None or now <= self.seen_until:
             moving = SPEED if self.begun is None else self.speed(now - self.begun)
-            self.last = Sample(now, self.status, moving)
+            self.last = Sample(now, self.status, self.sense * moving)
         return self.last
 
     def take(self, word, now):
@@ -104,10 +106,16 @@ def swing(share, lasting):
         (swing(-0.4, 0.2), RAMP, "it does not slow down by its ramp", 0.1, 0.25),  # on again, not back
         (swing(0.4, 0.2), RAMP, "it does not slow down by its ramp", 0.1, 0.22),
         (down(RAMP, to=-0.1 * SPEED), RAMP, "it does not slow down by its ramp", 0.22, 0.28),  # it stays there
+        # As late as half of the ramp has it, back by no more than 15 % (and the speed of rest) for 0.1 s, or by more.
+        (down(0.55 * RAMP, to=-0.19 * SPEED), RAMP, "it does not slow down by its ramp", 0.29, 0.33),
+        (down(0.55 * RAMP, to=-0.21 * SPEED), RAMP, "it does not slow down by its ramp", 0.2, 0.27),
     ],
 )
-def test_an_axis_keeps_its_voltage_while_it_slows_down(speed, ramp, why, earliest, latest):
-    one, cut = stop(Axis(speed), ramp=ramp)
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+def test_an_axis_keeps_its_voltage_while_it_slows_down(speed, ramp, why, earliest, latest, sense):
+    axis = Axis(speed)
+    axis.sense = sense
+    one, cut = stop(axis, ramp=ramp)
     assert one.why == why
     assert one.phase is Phase.OFF
     assert earliest <= cut <= latest
@@ -130,7 +138,7 @@ def test_an_axis_that_is_held_keeps_its_voltage_at_rest_until_it_is_released():
     one, cut = stop(axis, holds=True)
     assert (one.phase, cut, axis.status) == (Phase.REST, None, STOPPING)
     assert one.rests_for(5.0) > 4.0
-    one.release(5.0)
+    one.release()
     assert one.step(5.0, axis.sample(5.0)) == DISABLE_VOLTAGE
 
 
@@ -153,3 +161,178 @@ def test_voltage_off_is_repeated_and_given_up_after_600_ms():
     assert one.phase is Phase.LOST
     assert sent[-1] - sent[0] == pytest.approx(0.6, abs=0.03)
     assert max(after - before for before, after in pairwise(sent)) <= 0.02 + PERIOD
+
+
+# --- exactly at a time, a speed or a rate is within it, and just beyond is not ------------------------------------
+def fed(samples, *, begun=0.0, speed=SPEED, ramp=RAMP, rest=REST, holds=True):
+    """Feed a stop with samples (time [s], speed [inc/s], statusword); return it, and its controlwords."""
+    one = AxisStop(begun, speed, ramp, rest, holds)
+    return one, [one.step(time, Sample(time, status, moving)) for time, moving, status in samples]
+
+
+def braked(*rows):
+    """Return samples in quick stop active."""
+    return [(time, moving, STOPPING) for time, moving in rows]
+
+
+def test_a_quick_stop_is_sent_every_20_ms_until_a_new_sample_shows_it():
+    one = AxisStop(1.0, SPEED, RAMP, REST, holds=False)
+    before = Sample(0.9, STOPPING, SPEED)  # from a stop before this one
+    assert [one.step(now, before) for now in (1.0, 1.019, 1.0201, 1.03)] == [QUICK_STOP, None, QUICK_STOP, None]
+    assert one.step(1.041, Sample(1.041, ENABLED, SPEED)) == QUICK_STOP
+    assert [one.step(now, Sample(now, STOPPING, 0.8 * SPEED)) for now in (1.05, 1.07)] == [None, None]
+    _, words = fed([(0.0, SPEED, ENABLED), (0.02, SPEED, ENABLED)])
+    assert words == [QUICK_STOP, QUICK_STOP]
+
+
+def test_an_axis_is_off_once_a_sample_from_after_the_first_command_shows_it():
+    one, words = fed([(0.01, 0.0, OFF), (0.02, 0.0, OFF)])
+    assert (words, one.phase) == ([QUICK_STOP, None], Phase.OFF)
+    one = AxisStop(0.0, SPEED, RAMP, REST, holds=False)
+    assert one.step(0.0, Sample(0.0, OFF, 0.0)) == QUICK_STOP
+    assert one.step(0.01, Sample(0.0, OFF, 0.0)) is None
+    assert one.phase is Phase.RAMP
+
+
+def test_an_axis_that_is_held_and_that_somebody_switches_off_is_off():
+    one, _ = fed(braked((0.05, 0.0), (0.1, 0.0)))
+    assert one.phase is Phase.REST and one.is_over
+    assert one.step(0.2, Sample(0.2, OFF, 0.0)) is None
+    assert one.phase is Phase.OFF and one.is_over
+
+
+@pytest.mark.parametrize(("time", "phase"), [(0.1, Phase.RAMP), (0.1001, Phase.CUT)])
+def test_a_drive_has_100_ms_to_begin_its_ramp(time, phase):
+    assert fed([(time, SPEED, ENABLED)])[0].phase is phase
+
+
+def test_a_fault_reaction_is_a_ramp_that_has_begun():
+    one, _ = fed([(0.15, 0.1 * SPEED, 0x021F)])
+    assert one.phase is Phase.RAMP
+
+
+@pytest.mark.parametrize(("time", "phase"), [(0.4, Phase.RAMP), (0.4001, Phase.CUT)])
+def test_an_axis_may_be_unseen_for_400_ms_while_it_brakes(time, phase):
+    one = AxisStop(0.0, SPEED, RAMP, REST, holds=True)
+    one.step(time, Sample(0.0, STOPPING, SPEED))
+    assert one.phase is phase
+    assert not one.is_unseen(0.1)  # for 100 ms
+    assert one.is_unseen(0.1001) == (phase is Phase.CUT)
+    assert one.rests_for(9.0) == 0.0 and not one.is_over
+
+
+@pytest.mark.parametrize(("time", "phase"), [(2.0, Phase.RAMP), (2.0001, Phase.CUT)])
+def test_a_ramp_may_take_two_seconds(time, phase):
+    one, _ = fed(braked((1.0, 0.5 * SPEED), (time, 0.5 * SPEED)), ramp=SPEED / 2.0)
+    assert one.phase is phase
+
+
+@pytest.mark.parametrize(
+    ("rows", "phase"),
+    [
+        ([(0.0, REST), (0.02, -REST)], Phase.REST),
+        ([(0.0, REST), (0.0199, REST)], Phase.RAMP),
+        ([(0.0, 1.001 * REST), (0.02, REST)], Phase.RAMP),
+        ([(0.0, REST), (0.01, 1.001 * REST), (0.02, REST)], Phase.RAMP),
+        ([(0.0, REST), (0.01, 1.001 * REST), (0.02, REST), (0.04, REST)], Phase.REST),
+    ],
+)
+def test_an_axis_is_at_rest_after_20_ms_below_its_speed_of_rest(rows, phase):
+    one, _ = fed(braked(*rows), begun=-1.0)
+    assert one.phase is phase
+    assert one.is_over == (phase is Phase.REST)
+    assert one.rests_for(rows[-1][0] + 0.5) == (pytest.approx(0.5) if phase is Phase.REST else 0.0)
+
+
+def test_an_axis_that_is_released_while_it_turns_comes_to_rest_first():
+    one, _ = fed(braked((0.05, 0.5 * SPEED)))
+    one.release()
+    assert one.step(0.08, Sample(0.08, STOPPING, 0.0)) is None
+    assert one.step(0.11, Sample(0.11, STOPPING, 0.0)) == DISABLE_VOLTAGE
+    assert (one.phase, one.why, one.is_over) == (Phase.CUT, "", False)
+
+
+@pytest.mark.parametrize(("speed", "phase"), [(10.0 * REST, Phase.REST), (10.01 * REST, Phase.CUT)])
+def test_an_axis_that_is_held_breaks_loose_at_ten_times_the_speed_of_rest(speed, phase):
+    one, _ = fed(braked((0.05, 0.0), (0.1, 0.0), (0.2, speed)))
+    assert one.phase is phase
+
+
+@pytest.mark.parametrize(("time", "phase"), [(0.6, Phase.CUT), (0.6001, Phase.LOST)])
+def test_an_axis_is_given_up_600_ms_after_its_voltage_should_have_gone(time, phase):
+    one, _ = fed(braked((-0.5, 0.0), (0.0, 0.0), (time, 0.0)), begun=-1.0, holds=False)
+    assert one.phase is phase
+    assert one.is_over == (phase is Phase.LOST)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "phase"),
+    [
+        ([0.0, 0.02, 0.039], Phase.RAMP),  # two measurements that are too low, each over 20 ms
+        ([0.0, 0.02, 0.04], Phase.CUT),
+        ([0.0, 0.019, 0.038], Phase.RAMP),
+    ],
+)
+def test_the_deceleration_is_measured_every_20_ms(speeds, phase):
+    one, _ = fed(braked(*((time, SPEED) for time in speeds)), begun=-1.0, ramp=0.0)
+    assert one.phase is phase
+
+
+SLOWER = SPEED * (1.0 + 2.0**-5)  # 2^-5 s before SPEED, at the rate that would bring it to rest within a second
+
+
+@pytest.mark.parametrize(
+    ("speeds", "phase"),
+    [
+        ([SLOWER, SLOWER, SPEED, SPEED], Phase.CUT),
+        ([SLOWER, SLOWER, SPEED], Phase.RAMP),
+        ([SLOWER, SLOWER, SPEED + 1.0], Phase.CUT),
+        ([SLOWER, SPEED, SPEED], Phase.CUT),  # once it brakes, one measurement is enough
+        ([SPEED, SPEED], Phase.RAMP),
+        ([SPEED, SPEED, SPEED], Phase.CUT),
+    ],
+)
+def test_an_axis_that_would_stand_within_a_second_brakes(speeds, phase):
+    one, _ = fed(braked(*((k / 32.0, speed) for k, speed in enumerate(speeds))), begun=-1.0, ramp=0.0)
+    assert one.phase is phase
+
+
+@pytest.mark.parametrize(("share", "phase"), [(0.78, Phase.RAMP), (0.82, Phase.CUT)])
+def test_half_of_the_ramp_is_enough(share, phase):
+    """Half a second after its first 20 ms a ramp of a second has come to a quarter less; three speeds of rest more."""
+    rows = [(0.5, 0.5), (0.52, share), (0.54, share)]
+    one, _ = fed(braked(*((time, part * SPEED) for time, part in rows)), ramp=SPEED)
+    assert one.phase is phase
+
+
+@pytest.mark.parametrize(("ramp", "phase"), [(SPEED / 2.0, Phase.RAMP), (SPEED / 2.001, Phase.CUT)])
+def test_a_ramp_that_takes_two_seconds_tells_what_to_expect(ramp, phase):
+    rows = ((0.02 * k, SPEED - 0.25 * SPEED * max(0.02 * k - 0.02, 0.0)) for k in range(1, 20))
+    one, _ = fed(braked(*rows), ramp=ramp)
+    assert one.phase is phase
+
+
+def test_the_speed_within_the_first_20_ms_is_that_with_which_the_ramp_begins():
+    """What was known before was an axis at rest."""
+    rows = [(0.01 * k, SPEED - 0.25 * SPEED * max(0.01 * k - 0.02, 0.0)) for k in range(1, 40)]
+    assert fed(braked(*rows), speed=0.0, ramp=SPEED / 2.0)[0].phase is Phase.RAMP
+    late = [(0.02, 1.5 * SPEED), (0.045, 1.5 * SPEED), (0.07, 1.5 * SPEED)]
+    assert fed(braked(*late), ramp=SPEED)[0].phase is Phase.CUT
+
+
+def test_a_stop_of_several_axes_is_over_when_each_is():
+    sent = []
+
+    def axis(phase, is_over, word):
+        return SimpleNamespace(phase=phase, is_over=is_over, step=lambda now, sample: (now, sample, word)[2])
+
+    axes = {
+        1: axis(Phase.RAMP, False, QUICK_STOP), 2: axis(Phase.OFF, True, 7), 3: axis(Phase.LOST, True, 7),
+        4: axis(Phase.REST, True, None), 5: axis(Phase.CUT, False, DISABLE_VOLTAGE),
+    }  # fmt: skip
+    several = Stop(axes, lambda number, word: sent.append((number, word)), lambda number: None)
+    several.step(1.0)
+    assert sent == [(1, QUICK_STOP), (5, DISABLE_VOLTAGE)]
+    assert not several.is_over
+    axes[1].is_over = axes[5].is_over = True
+    assert several.is_over

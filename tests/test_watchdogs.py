@@ -12,6 +12,7 @@ import pytest
 
 from drive_env import Limits, SafetyError, cia402
 from drive_env.master.errors import BusError
+from drive_env.master.link import NoWatchdogError
 from drive_env.safety import signals
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
@@ -221,6 +222,85 @@ def test_without_a_silence_no_watchdog_is_set(caplog):
     watchdogs.check()
     assert log == ["end"] and axes.is_armed
     assert "no drive stops by itself when this process dies" in caplog.text
+
+
+def test_a_drive_that_cannot_watch_is_not_moved():
+    watchdogs, _, _ = watchdogs_of(Node(OFF), bounds=bounds_of(None, TURN, 0.0), detection_time=0.0)
+
+    def begin(silence):
+        raise NoWatchdogError("node 1 has no 1016h")
+
+    watchdogs._watch.begin = begin
+    with pytest.raises(SafetyError, match=r"^node 1 has no 1016h$"):
+        watchdogs.set()
+    watchdogs._watch.is_in_force = lambda k: pytest.fail("none was set")
+    watchdogs.check()
+
+
+def test_watchdogs_that_were_given_up_are_not_asked_for():
+    watchdogs, axes, log = watchdogs_of(Node(OFF, is_set=False), bounds=bounds_of(None, TURN, 0.0), detection_time=0.0)
+    watchdogs.set()
+    watchdogs.end()
+    watchdogs.check()
+    assert axes.is_armed and log == [0.5, "end"]
+
+
+@pytest.mark.parametrize(("passes", "told"), [
+    (True, r"time passes by itself on this bus.*open them with pace='real-time'"),
+    (None, r"this drive has no producer heartbeat \(1017h\).*open it with pace='real-time'"), (False, None),
+])  # fmt: skip
+def test_in_lockstep_it_is_proved_once_that_time_waits_and_no_watchdog_is_set(passes, told):
+    watchdogs, _, log = watchdogs_of(Node(OFF))
+    looked = []
+    watchdogs._drives.time_waits = True
+    watchdogs._drives.link.time_passes = lambda: (looked.append(1), passes)[1]
+    for _ in range(2):
+        if told is None:
+            watchdogs.set()
+        else:
+            with pytest.raises(SafetyError, match=told):
+                watchdogs.set()
+    assert len(looked) == (1 if told is None else 2) and log == []
+
+
+def test_what_a_watchdog_depends_on_is_not_written():
+    watchdogs, _, _ = watchdogs_of(Node(OFF))
+    watchdogs._watch.holds = lambda key: key == (0x1016, 1)
+    watchdogs.check_not_held(SimpleNamespace(index=0x1016, sub=2, label="1016h:02"))
+    with pytest.raises(SafetyError, match="1016h:01 belongs to the watchdog by which the drive notices"):
+        watchdogs.check_not_held(SimpleNamespace(index=0x1016, sub=1, label="1016h:01"))
+
+
+def test_a_last_sign_of_life_that_does_not_go_out_is_told(caplog):
+    watchdogs, _, _ = watchdogs_of(Node(OFF))
+
+    def cease():
+        raise BusError("the bus is gone")
+
+    watchdogs._watch.cease = cease
+    watchdogs.cease()
+    assert "the bus is gone" in caplog.text
+
+
+def test_one_axis_of_a_node_that_is_live_keeps_the_watchdog_of_all_of_them():
+    nodes = [Node(OFF) for _ in range(6)]
+    nodes[4].status = [ENABLED]
+    watchdogs, axes, log = watchdogs_of(*nodes)
+    watchdogs._drives.nodes, watchdogs._drives.description.num_axes = (1, 2), 3
+    axes.of_nodes = lambda ks: np.isin(np.arange(6) // 3, ks)
+    watchdogs.give_up()
+    assert [node.given_back for node in nodes] == [True] * 3 + [False] * 3
+    assert axes.lost == {3, 4, 5} and axes.off == [0, 1, 2] and log == ["cease"]
+
+
+@pytest.mark.parametrize("turning", [0, 1])
+def test_a_node_with_an_axis_that_may_turn_is_looked_at(turning):
+    nodes = [Node(OFF, is_set=False, may_turn=k == turning) for k in range(4)]
+    watchdogs, axes, _ = watchdogs_of(*nodes)
+    watchdogs._drives.nodes, watchdogs._drives.description.num_axes = (1, 2), 2
+    axes.of_nodes = lambda ks: np.isin(np.arange(4) // 2, ks)
+    watchdogs.give_up()
+    assert [node.given_back for node in nodes] == [True, True, False, False]
 
 
 # --- axes of nodes ------------------------------------------------------------------------------------------------

@@ -114,8 +114,8 @@ class Description:
 
     def patience(self, entry: Entry) -> float:
         """Return how long an answer about this object may take [s]."""
-        own = self.timeouts.get((entry.index, entry.sub))
-        return own if own is not None else max(self.answer_timeout, self.hints.timeouts.get(entry.index, 0.0))
+        own, usual = self.timeouts.get((entry.index, entry.sub)), self.answer_timeout
+        return own if own is not None else max(usual, self.hints.timeouts.get(entry.index, usual))
 
     def encode(self, entry: Entry, value: int | str) -> bytes:
         """Return the bytes of a value."""

@@ -61,10 +61,10 @@ def integers(data: Bytes, signed: bool) -> Any:
     """Return the integers of little-endian bytes, shape (rows, size), as int64 or narrower."""
     size = data.shape[1]
     if size in (1, 2, 4, 8):
-        return np.ascontiguousarray(data).view(_TYPES[size, signed])[:, 0]
+        return np.ascontiguousarray(data).view(_TYPES[size, signed]).ravel()
     wide = np.zeros((data.shape[0], 8), np.uint8)  # 24, 40, 48, 56 bits
     wide[:, :size] = data
-    column = wide.view("<i8")[:, 0]
+    column = wide.view("<i8").ravel()
     return column - ((column >> (8 * size - 1)) << (8 * size)) if signed else column
 
 

@@ -58,7 +58,7 @@ class Limits:
         for name in ("velocity", "current", "following_error"):
             if not np.all(_values(getattr(self, name), 1.0) > 0):
                 raise ValueError(f"{name} must be above 0, not {getattr(self, name)}; None takes the drive's own limit")
-        if self.stall is not None and not 0.0 < self.stall < math.inf:
+        if self.stall is not None and not (math.isfinite(self.stall) and self.stall > 0.0):
             raise ValueError(f"stall must be above 0 s, not {self.stall}; None is for any")
         if self.silence is not None and not LEAST_SILENCE <= self.silence <= MOST_SILENCE:
             raise ValueError(

@@ -220,7 +220,7 @@ class StopRunner:
                     del stop.axes[axis]  # it moved again
                 else:
                     if not holds:
-                        known.release(now)
+                        known.release()
                     continue
             speed = max(abs(self._axes.speed[axis]), abs(self._axes.velocity[axis]))
             braking = 0.0 if bounds is None else float(bounds.braking[axis])
@@ -275,7 +275,7 @@ class StopRunner:
                 continue
             limit = NO_LIMIT if bounds is None else int(bounds.current[axis])
             if limit >= NO_LIMIT or abs(self._axes.mean_current[axis]) <= WEIGHT_SHARE * limit:
-                one.release(now)
+                one.release()
             elif axis not in self._told_of:
                 self._told_of.add(axis)
                 logger.warning(

@@ -106,11 +106,9 @@ class AxisStop:
         """Return whether the voltage should go, and nobody answers."""
         return self.phase is Phase.CUT and now - self._seen > ANSWER
 
-    def release(self, now: float) -> None:
-        """Hold it no longer."""
+    def release(self) -> None:
+        """Hold it no longer: at its next step, or once it is at rest, its voltage goes."""
         self.holds = False
-        if self.phase is Phase.REST:
-            self._enter(Phase.CUT, now)
 
     def _watch_ramp(self, now: float, sample: Sample, fresh: bool) -> None:
         if not fresh:
@@ -121,10 +119,7 @@ class AxisStop:
         self._first = max(self._first, abs(sample.speed)) if sample.time < self._begun + GRACE else self._first
         if self._way == 0.0 and abs(sample.speed) > self._rest:
             self._way = math.copysign(1.0, sample.speed)
-        begun = cia402.matches(sample.status, cia402.QUICK_STOP_ACTIVE) or not cia402.matches(
-            sample.status, cia402.OPERATION_ENABLED
-        )
-        if not begun:
+        if cia402.matches(sample.status, cia402.OPERATION_ENABLED):  # its ramp has not begun
             if now - self._begun > ANSWER:
                 self.why = "it does not obey the quick stop"
                 self._enter(Phase.CUT, now)
@@ -212,8 +207,3 @@ class Stop:
         for number, axis in self.axes.items():
             if axis.phase not in (Phase.OFF, Phase.LOST) and (word := axis.step(now, self._sample(number))) is not None:
                 self._send(number, word)
-
-    def release(self, now: float) -> None:
-        """Switch off what is held, once it is at rest."""
-        for axis in self.axes.values():
-            axis.release(now)

@@ -91,7 +91,7 @@ class Watch:
         self._told_at = -math.inf  # when a signal told the program to end [s]
         self._asked: str | None = None  # why another thread wants everything stopped
         self.booted: set[int] = set()
-        self._is_restart_told = False
+        self._told_of: set[int] = set()  # those of them that were told of
 
     @property
     def is_supervised(self) -> bool:
@@ -125,8 +125,8 @@ class Watch:
 
     def note_restart(self, node: int) -> None:
         """Take note that a node, by position, has booted though nobody here has reset it."""
-        self._is_restart_told = False
         self.booted.add(node)
+        self._told_of.discard(node)
 
     def tell_to_end(self) -> None:
         """Begin to stop, at the supervisor's next turn; callable from a signal handler."""
@@ -369,8 +369,8 @@ class Watch:
         live = self._stops.judged()
         if not live.any():
             return
-        if self.booted and not self._is_restart_told:
-            self._is_restart_told = True
+        if self.booted - self._told_of:
+            self._told_of = set(self.booted)
             numbers = ", ".join(str(self._drives.nodes[k]) for k in sorted(self.booted))
             self._stops.stop_for(f"node {numbers} has restarted by itself", "check its power, and for another master")
         blind = live & (now - self._axes.seen > BLIND)
