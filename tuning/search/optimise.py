@@ -396,7 +396,7 @@ class _Search:
 
 def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow]:
     """Return the trials that no other is better than in every objective, ordered by the first one."""
-    values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), -1)
+    values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), len(objectives))
     best = [
         k for k, own in enumerate(values) if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))
     ]
