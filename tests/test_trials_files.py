@@ -119,6 +119,7 @@ def test_a_third_objective_counts_for_the_front_and_is_not_drawn():
     ]
     (axes,) = picture(rows, objectives=("speed", "robustness", "current")).axes
     np.testing.assert_allclose(axes.get_lines()[0].get_xydata(), [[10.0, 1.0], [20.0, 2.0]])
+    assert axes.get_ylabel() == "J of the worst phase over that of the moves"
 
 
 def test_ripple_is_no_factor_and_has_a_linear_scale():
