@@ -86,6 +86,8 @@ def test_a_safe_search_goes_not_beyond_what_was_stopped_nor_near_it(caution):
     np.testing.assert_allclose(search._held_back(0, towards), towards / 4.0)  # half would be half a step from it
     search._refuted[0] = [np.zeros(3), *(towards / 2**k for k in range(SAFE_HALVINGS))]
     np.testing.assert_allclose(search._held_back(0, towards), 0.0)
+    search._refuted[0] = [caution * np.full(3, 0.26)]  # an eighth of a step would do: it is not tried
+    np.testing.assert_allclose(search._held_back(0, towards), 0.0)
 
 
 # --- what is kept -----------------------------------------------------------------------------------------------------
