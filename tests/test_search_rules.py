@@ -234,6 +234,16 @@ def test_where_no_safe_start_is_found_it_is_said_why(caution, told):
     assert asked == [1, 1, 1] and search._halted == [True, False] and search.notes == [told, ""]
 
 
+def test_copies_of_a_machine_start_where_the_first_of_them_does():
+    search, points = search_of(shared=True), []
+    search._proposers = [SimpleNamespace(ask=lambda count: None)]
+    search._start = np.array([[-1.0] * 3, [-2.0] * 3])
+    search._run = lambda held: (points.append(held[0][0].tolist()), None)
+    search._tell = lambda k, asked, held, tried, gains: search._proved[k].append(held[0])
+    search._prove()
+    assert points == [[-1.0] * 3]
+
+
 # --- a generation -----------------------------------------------------------------------------------------------------
 class Proposer:
     """A sampler that proposes what a test has for it."""
