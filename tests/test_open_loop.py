@@ -474,8 +474,6 @@ class Swinging:
         self.log, self.at = [], np.zeros(2)
 
     def read(self, name):
-        if name is module.Role.POSITION_SCALE:
-            return np.full(2, 51200)
         old = {cia402.PROFILE_VELOCITY: 11, cia402.PROFILE_ACCELERATION: 22, cia402.PROFILE_DECELERATION: 33}
         return np.full(2, old[name]) if name in old else self.at.copy()
 
@@ -491,9 +489,19 @@ class Swinging:
         return {cia402.POSITION_ACTUAL: rows, cia402.POSITION_DEMAND: 2.0 * rows}
 
 
-@pytest.mark.parametrize(("name", "highest"), [("tmcm3313", None), ("tmcm6212", 0.95 * 7_629_278)])
-def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step_on(name, highest, monkeypatch):
-    """Its profile is as steep as the drive takes, and is what it was afterwards."""
+@pytest.mark.parametrize(
+    ("name", "scale", "speed", "steep"),
+    [
+        ("tmcm3313", 51_200, 256_000, 0.95 * (2**32 - 1)),  # of 256 * 2e7
+        ("tmcm6212", 51_200, 256_000, 0.95 * 7_629_278),
+        ("tmcm3313", 800, 4_000, 4 * 2e7),
+        ("tmcm6212", 3_200_000, 0.95 * 7_999_511, 0.95 * 7_629_278),
+    ],
+)
+def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step_on(
+    name, scale, speed, steep, monkeypatch
+):
+    """Its profile has 1,000 full steps/s and 2e7 full steps/s^2 or what the drive takes, and is what it was then."""
     device = find_device(name)
     drives, swung = Swinging(), []
     monkeypatch.setattr(module, "device_of", lambda drives: device)
@@ -505,28 +513,25 @@ def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step
         drives.at = target.astype(float)
 
     monkeypatch.setattr(module, "start", start)
-    move = Move(np.array([10, -10]), None, None, np.full(2, 51200 / (2 * np.pi)), 1.0)
+    move = Move(np.array([10, -10]), None, None, np.full(2, scale / (2 * np.pi)), 1.0)
     where, held = np.array([True, False]), np.array([0.2, 0.3])
     made = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
     assert made._swing(np.array([1000, 2000]), move, where, held) == "inertia"
     yes = where.tolist()
-    limit = find_device(name).new_dictionary().find(cia402.PROFILE_ACCELERATION).high
-    steep = int(min(256.0 * 2e7, 0.95 * limit))
-    speed = int(min(256.0 * 1e3, 0.95 * device.new_dictionary().find(cia402.PROFILE_VELOCITY).high))
-    assert highest is None or steep == int(highest)
+    quarters = [[1000 + k * scale // 800, 2000 - k * scale // 800] for k in range(4)]
     assert drives.log == [
-        (cia402.PROFILE_VELOCITY, [speed] * 2, yes),
-        (cia402.PROFILE_ACCELERATION, [steep] * 2, yes),
-        (cia402.PROFILE_DECELERATION, [steep] * 2, yes),
-        ("go", [1000, 2000], yes), ("advance", 0.1), ("go", [1064, 1936], yes), ("record", 0.1),
-        ("go", [1128, 1872], yes), ("advance", 0.1), ("go", [1192, 1808], yes), ("record", 0.1),
-        ("go", [1000, 2000], yes), ("advance", 0.1),
+        (cia402.PROFILE_VELOCITY, [int(speed)] * 2, yes),
+        (cia402.PROFILE_ACCELERATION, [int(steep)] * 2, yes),
+        (cia402.PROFILE_DECELERATION, [int(steep)] * 2, yes),
+        ("go", quarters[0], yes), ("advance", 0.1), ("go", quarters[1], yes), ("record", 0.1),
+        ("go", quarters[2], yes), ("advance", 0.1), ("go", quarters[3], yes), ("record", 0.1),
+        ("go", quarters[0], yes), ("advance", 0.1),
         (cia402.PROFILE_VELOCITY, [11, 11], yes),
         (cia402.PROFILE_ACCELERATION, [22, 22], yes),
         (cia402.PROFILE_DECELERATION, [33, 33], yes),
     ]  # fmt: skip
     (demand, position, torque, age, motor), = swung
-    way = np.arange(3)[:, None] * np.array([10.0, 20.0]) * 2.0 * np.pi / 51200
+    way = np.arange(3)[:, None] * np.array([10.0, 20.0]) * 2.0 * np.pi / scale
     np.testing.assert_allclose(position, [way, way])
     np.testing.assert_allclose(demand, [2.0 * way, 2.0 * way])
     assert torque is held and motor is STEPPER_MOTOR and age == 1.0 / device.velocity_rate
