@@ -470,10 +470,12 @@ class Swinging:
 
     num_axes, time_waits = 2, True
 
-    def __init__(self):
-        self.log, self.at = [], np.zeros(2)
+    def __init__(self, scale):
+        self.log, self.at, self.scale = [], np.zeros(2), scale
 
     def read(self, name):
+        if name is module.Role.POSITION_SCALE:
+            return np.full(2, self.scale)
         old = {cia402.PROFILE_VELOCITY: 11, cia402.PROFILE_ACCELERATION: 22, cia402.PROFILE_DECELERATION: 33}
         return np.full(2, old[name]) if name in old else self.at.copy()
 
@@ -503,7 +505,7 @@ def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step
 ):
     """Its profile has 1,000 full steps/s and 2e7 full steps/s^2 or what the drive takes, and is what it was then."""
     device = find_device(name)
-    drives, swung = Swinging(), []
+    drives, swung = Swinging(scale), []
     monkeypatch.setattr(module, "device_of", lambda drives: device)
     monkeypatch.setattr(module, "per_increment", lambda drives, name: 1.0)
     monkeypatch.setattr(module, "inertia_of_swings", lambda *arguments: swung.append(arguments) or "inertia")
