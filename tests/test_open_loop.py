@@ -26,7 +26,7 @@ from drive_env.trials.open_loop import (
     unmeasured,
     with_run_current,
 )
-from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, WATCH, Move
+from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, WATCH, Move, highest_ramp, plan_move
 from drive_env.trials.rotor_swing import FreeSwing
 from drive_env.trials.score import Terms, cost
 
@@ -561,7 +561,7 @@ class Recorded:
 @pytest.fixture
 def identified(monkeypatch):
     """Identify two axes by records; return what is balanced, and what is found with the swing that is given."""
-    calls, swings = [], []
+    calls, swings, starts = [], [], []
 
     def run(swing, reach=(1.0, 1.0), where=(True, True)):
         t = np.arange(TRIAL)[:, None]
@@ -570,8 +570,8 @@ def identified(monkeypatch):
         drives = Recorded([(there, there + 30.0), (back, back - 30.0)])
         monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
         monkeypatch.setattr(module, "read_gains", lambda drives: gains([100, 200], [250, 250]))
-        monkeypatch.setattr(module, "write_profile", lambda drives, move, where: None)
-        monkeypatch.setattr(module, "start", lambda drives, target, where: None)
+        monkeypatch.setattr(module, "write_profile", lambda drives, move, where: starts.append(move))
+        monkeypatch.setattr(module, "start", lambda drives, target, where: starts.append(target.tolist()))
 
         def balance(angle, speed, current, motor, inertia=None):
             calls.append((angle, speed, current, inertia))
@@ -590,7 +590,19 @@ def identified(monkeypatch):
         assert origin.tolist() == [0, 0] and drives.log == [0.02]
         return [value.tolist() for value in found], calls, swings
 
+    run.starts = starts
     return run
+
+
+def test_identification_moves_three_rotors_there_and_back(identified):
+    identified(([1e-6, 1e-6], [0.0, 0.0]), reach=(50.0, -0.5))
+    most = highest_ramp(STEPPER)
+    move = plan_move(STEPPER_MOTOR, np.full(2, 3.0 * STEPPER_MOTOR.inertia), 51200, np.array([50.0, -0.5]), most)
+    planned, there, back = identified.starts
+    assert planned.distance.tolist() == move.distance.tolist() and planned.acceleration.tolist() == (
+        move.acceleration.tolist()
+    )
+    assert (there, back) == (move.distance.tolist(), [0, 0])
 
 
 def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identified):
