@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -395,6 +396,8 @@ def test_what_a_trial_shows_of_the_field_before_its_rotor(trial):
     np.testing.assert_allclose(found.terms.load_angle, [[1.0, 0.5, 0.0, 0.0]] * 3)
     np.testing.assert_allclose(found.error[:, :2], [[0.0256, -0.0128]] * TRIAL)
     np.testing.assert_allclose(found.following[:, 0], 0.0256 * TRIAL * 1e-3)
+    early, _, _ = trial(lag={(0, 4): [256] * 4})
+    np.testing.assert_allclose(early.error[100 : 100 + WATCH], 0.0256)
     later, _, _ = trial(lag={(1, 4): [256] * 4})
     assert not later.error.any()
     np.testing.assert_allclose(later.terms.load_angle[:, 2], [0.0, 1.0, 0.0])
@@ -452,6 +455,12 @@ def test_who_takes_no_part_is_neither_stopped_nor_blamed(trial):
     found, drives, written = trial([True, True, False, False], lag={(0, 1): [0, 0, FAR + 1, 0]}, faults={(0, 2): [3]})
     assert not found.aborted.any() and not found.lost.any() and not found.culprit.any() and drives.log == []
     assert all(where == [True, True, False, False] for _, where in written)
+
+
+def test_a_move_of_nothing_counts_over_an_increment(trial, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "FOUR", FOUR._replace(distance=np.array([0, 1, 2, 0])))
+    found, _, _ = trial(lag={(0, 4): [8] * 4})
+    assert found.error[100].tolist() == [8.0, 8.0, 4.0, 8.0]
 
 
 def test_positions_of_a_trial_go_over_the_counters_end():
