@@ -14,7 +14,14 @@ from drive_env.dictionary.roles import Role
 from drive_env.motors import find_motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting, swing_period
 from drive_env.trials import closed_loop as module
-from drive_env.trials import gain_trial, open_loop, position_pid
+from drive_env.trials import (
+    closed_loop_score,
+    gain_trial,
+    open_loop,
+    open_loop_score,
+    position_pid,
+    position_pid_score,
+)
 from drive_env.trials.closed_loop import (
     ClosedLoopTrial,
     ClosedLoopTrials,
@@ -23,9 +30,11 @@ from drive_env.trials.closed_loop import (
     plan_overload,
     trial_share,
 )
+from drive_env.trials.closed_loop_score import ClosedLoopScore
 from drive_env.trials.gain_trial import Identified, Trials
 from drive_env.trials.method import ClosedStepper, method_of
 from drive_env.trials.open_loop import OpenLoopTrials
+from drive_env.trials.open_loop_score import OpenLoopScore
 from drive_env.trials.position_pid import (
     PidTrials,
     following_scale,
@@ -35,8 +44,9 @@ from drive_env.trials.position_pid import (
     plan_pid,
     steps_of,
 )
+from drive_env.trials.position_pid_score import PidScore
 from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move, plan_move
-from drive_env.trials.score import Terms
+from drive_env.trials.score import VARIANTS, CurrentSwings, Terms
 
 DEVICE, MOTOR = find_device("tmcm3313"), find_motor("qsh4218_51")
 LOOP, RAMP, ALONE = (DEVICE.gains.loop_of_kind(kind) for kind in (LOAD_ANGLE, PID_ON_RAMP, PID_ALONE))
@@ -532,3 +542,195 @@ def test_which_trials_and_which_move_a_loop_has():
     rows = loop.first(np.ones(1))
     assert pid.softness(rows) == load_step_error(DEVICE, MOTOR, RAMP, rows)
     assert open_loop.PROBE == module.PROBE == 0.8 and position_pid.PROBE == 1.5
+
+
+# --- the robust cost, on machines that a test plays -------------------------------------------------------------------
+class Steppers:
+    """Two machines of three runs and one axis, which stand where they were before they are sent off."""
+
+    def __init__(self, *records, closes=True):
+        self.num_axes, self.device, self.motor, self.log, self.records = 6, DEVICE, MOTOR, [], list(records)
+        self.closes, log = closes, self.log
+
+        class Machine:
+            diverged = np.zeros(6, bool)
+
+            def reset(self):
+                log.append("reset")
+
+            def __setattr__(self, name, value):
+                log.append((name, np.round(np.broadcast_to(value, 6), 9).tolist()))
+
+        self.machine = Machine()
+
+    def read(self, name):
+        return np.full(6, 50) if name == cia402.POSITION_ACTUAL else np.full(6, int(self.closes))
+
+    def write(self, name, value):
+        self.log.append((name, value))
+
+    def advance(self, seconds):
+        self.log.append(("wait", seconds))
+
+    def record(self, objects, seconds):
+        rows = round(seconds / 1e-3)
+        self.log.append(("record", rows))
+        known = self.records.pop(0) if self.records else {}
+        found = {name: np.full((rows, 6), 50) + known.get(name, 0) for name in objects}
+        found[cia402.STATUSWORD] = np.full((rows, 6), 0x0637)
+        found[cia402.STATUSWORD][-1] = known.get("status", 0x0637)
+        return found
+
+
+def score_of(kind, *records, **options):
+    made = kind.__new__(kind)
+    made.variants, made.num_machines, made.repeats = VARIANTS[:3], 2, 1
+    made._runs, made._axes, made._drives = 3, (2, 3, 1), Steppers(*records, **options)
+    made._constant, made._load_torque, made._t_0 = np.array([0.01] * 6), -0.03, np.full(6, 0.01)
+    made._factors = np.array([1.0, 0.8, 1.0] * 2)
+    one = np.full(6, 10_000)
+    made._move = Move(one * [1, -1, 1, -1, 1, -1], one, one, np.full(6, SCALE), SCALE, np.full(6, 0.5))
+    return made
+
+
+@pytest.fixture
+def sent(monkeypatch):
+    """What the scores of a stepper write and where they send it."""
+    found = SimpleNamespace(gains=[], targets=[])
+    for place in (closed_loop_score, open_loop_score, position_pid_score):
+        monkeypatch.setattr(place, "write_gains", lambda drives, gains: found.gains.append(gains))
+        monkeypatch.setattr(place, "write_profile", lambda drives, move: drives.log.append("profile"))
+        monkeypatch.setattr(place, "power_up", lambda drives: drives.log.append("on"))
+
+        def start(drives, target):
+            drives.log.append("go")
+            found.targets.append(np.asarray(target).tolist())
+
+        monkeypatch.setattr(place, "start", start)
+    monkeypatch.setattr(closed_loop_score, "ampere_per_count", lambda drives: 1e-3)
+    return found
+
+
+AWAY = np.array([10_000, -10_000] * 3)
+GOAL = (AWAY + 50).tolist()
+CONSTANT, LOADED = ("load_torque", [0.01] * 6), ("load_torque", [-0.02] * 6)
+
+
+def test_a_load_step_is_on_an_open_loop_as_on_a_servo_and_lost_steps_trip(sent):
+    """Its field has nothing to commutate by: the step counter's target is the way from 0."""
+    fell = {cia402.POSITION_DEMAND: np.where(np.arange(6) == 2, 513, 512)}
+    made = score_of(OpenLoopScore, {cia402.POSITION_ACTUAL: AWAY - 50, cia402.POSITION_DEMAND: AWAY - 50},
+                    fell | {"status": np.where(np.arange(6) == 4, 0x0238, 0x0637)})  # fmt: skip
+    made._drives.machine.__dict__["diverged"] = np.array([True, False, False, False, False, False])
+    terms, disturbance, swings = made._run(gains([200, 100]))
+    assert made._drives.log == [
+        CONSTANT, "reset", "profile", (cia402.SENSOR_SELECTION, 0), "on", "go", ("record", 150), LOADED,
+        ("record", 100),
+    ]  # fmt: skip
+    assert sent.gains[0][:, RUN].tolist() == [200, 160, 200, 100, 80, 100]
+    assert sent.targets == [AWAY.tolist()]
+    assert terms.tripped.reshape(-1).tolist() == [True, False, True, False, True, False]
+    np.testing.assert_allclose(terms.settling, 1.0)
+    assert not terms.load_angle.any() and not terms.overshoot.any()
+    np.testing.assert_allclose(terms.effort.reshape(-1), open_loop.effort(DEVICE, MOTOR, sent.gains[0]))
+    np.testing.assert_allclose(disturbance.reshape(-1), np.abs(AWAY - 50) / SCALE * 0.1)
+    assert np.isnan(swings.moving).all() and np.isnan(swings.resting).all() and terms.noise.shape == (2, 3, 1)
+
+
+def test_a_load_step_is_on_a_pid_as_on_a_servo_with_more_p_in_its_variant(sent):
+    made = score_of(PidScore, {cia402.POSITION_ACTUAL: AWAY}, {cia402.POSITION_ACTUAL: AWAY + [0, 0, 100, 0, 0, 0]})
+    made._loop, made._factors = RAMP, np.array([1.0, 1.5, 1.0] * 2)
+    rows = gains([200, 100])
+    rows[:, P] = 1000
+    terms, disturbance, swings = made._run(rows)
+    assert made._drives.log == [
+        CONSTANT, "reset", "profile", (cia402.SENSOR_SELECTION, 0), (cia402.FOLLOWING_WINDOW, 0), "on",
+        (Role.LOOP_MODE, 2), ("wait", 0.01), "go", ("record", 150), LOADED, ("record", 100),
+    ]  # fmt: skip
+    assert sent.gains[0][:, P].tolist() == [1000, 1500, 1000] * 2 and sent.targets == [GOAL]
+    np.testing.assert_allclose(terms.settling, 1.0)
+    assert not terms.noise.any() and not terms.overshoot.any() and not terms.tripped.any()
+    np.testing.assert_allclose(
+        disturbance.reshape(-1), [made._move.least_error] * 2 + [100 / SCALE * 0.1] + [made._move.least_error] * 3
+    )
+    assert np.isnan(swings.moving).all() and np.isnan(swings.resting).all()
+    for loop, t_0 in ((RAMP, swing_period(MOTOR)), (ALONE, 0.032)):
+        made._loop = loop
+        assert made._settling_scale(np.zeros(6)).tolist() == [pytest.approx(t_0)] * 6
+    assert PidScore._tries_current(True) is False
+
+
+@pytest.mark.parametrize("what", ["fault", "physics"])
+def test_a_pid_that_is_in_fault_or_left_physics_trips(what, sent):
+    made = score_of(PidScore, {}, {"status": np.where(np.arange(6) == 4, 0x0238, 0x0637)} if what == "fault" else {})
+    made._loop = RAMP
+    if what == "physics":
+        made._drives.machine.__dict__["diverged"] = np.arange(6) == 4
+    terms, *_ = made._run(gains([200, 100]))
+    assert terms.tripped.reshape(-1).tolist() == [k == 4 for k in range(6)]
+
+
+def test_a_closed_loop_is_pushed_away_by_four_full_steps_and_comes_back(sent):
+    """By 1.3 times what the trial's run current holds, for as long as that takes: 0.3 of it accelerate the load."""
+    made = score_of(ClosedLoopScore, {cia402.POSITION_ACTUAL: AWAY, cia402.TORQUE_ACTUAL: -50})
+    held = float(held_in_trial(DEVICE, MOTOR, np.array([0.5]))[0])
+    lasts = np.array([3, 7, 1, 30, 30, 12])
+    # The plan asks for four times the torque that there is: J = 4 held / acceleration; a t^2 / 2 = 4 full steps.
+    wanted = np.array([3.0, 7.0, 0.1, 30.4, 99.0, 12.0]) * 1e-3
+    inertia = wanted**2 * 0.3 * held / (2.0 * 4.0 * full_step(MOTOR))
+    ramp = np.rint(4.0 * held / inertia * SCALE).astype(np.int64)
+    made._move = made._move._replace(acceleration=ramp)
+    torque, times = made._pushes()
+    assert times.tolist() == lasts.tolist()
+    expected = -0.03 / (0.3 * MOTOR.rated_torque) * 1.3 * held
+    np.testing.assert_allclose(torque, expected)
+    terms, disturbance, swings = made._run(gains([200, 100]))
+    loads = [entry[1] for entry in made._drives.log if entry[0] == "load_torque"]
+    assert loads[0] == loads[-1] == [0.01] * 6 and len(loads) == 32
+    for k in range(30):
+        np.testing.assert_allclose(loads[1 + k], 0.01 + np.where(k < lasts, expected, 0.0), atol=1e-9)
+    records = [entry[1] for entry in made._drives.log if entry[0] == "record"]
+    assert records == [150, *[1] * 30, 70]
+    begin = made._drives.log[:9]
+    assert begin == [
+        CONSTANT, "reset", "profile", (cia402.SENSOR_SELECTION, 0), (cia402.FOLLOWING_WINDOW, 0), "on",
+        (Role.LOOP_MODE, 1), ("wait", 0.6), "go",
+    ]  # fmt: skip
+    assert sent.gains[0][:, RUN].tolist() == [100, 80, 100, 50, 40, 50] and sent.targets == [GOAL]
+    np.testing.assert_allclose(terms.settling, 1.0)
+    assert not terms.noise.any() and not terms.overshoot.any() and not terms.tripped.any()
+    np.testing.assert_allclose(disturbance.reshape(-1), 10_000 / SCALE * 0.1)
+    assert not swings.moving.any() and swings.moving.shape == (2, 3, 1)
+    assert made._settling_scale(np.zeros(6)).tolist() == [swing_period(MOTOR)] * 6
+
+
+@pytest.mark.parametrize("what", ["open", "fault", "physics"])
+def test_a_closed_loop_that_stays_open_or_is_in_fault_or_left_physics_trips(what, sent):
+    at = np.arange(6) == 4
+    last = {"status": np.where(at, 0x0238, 0x0637)} if what == "fault" else {}
+    made = score_of(ClosedLoopScore, *[{}] * 31, last, closes=what != "open")
+    if what == "physics":
+        made._drives.machine.__dict__["diverged"] = at
+    terms, *_ = made._run(gains([200, 100]))
+    assert terms.tripped.reshape(-1).tolist() == ([True] * 6 if what == "open" else at.tolist())
+
+
+def test_a_closed_loops_moves_come_with_their_share_of_the_run_current():
+    made = score_of(ClosedLoopScore)
+    move = Move(*(np.array([1, 2]) * k for k in (1, 10, 100, 1000.0)), 7.0, np.array([0.7, 0.9]))
+    made.set_moves(move, np.array([False, True]))
+    assert made._move.share.tolist() == [0.5] * 3 + [0.9] * 3 and made._move.distance.tolist()[3:] == [2] * 3
+    made.set_moves(move)
+    assert made._move.share.tolist() == [0.7] * 3 + [0.9] * 3
+    made.set_moves(move._replace(share=1.0))
+    assert made._move.share.tolist() == [1.0] * 6
+
+
+def test_an_open_loops_score_has_the_terms_of_its_own_cost():
+    made = score_of(OpenLoopScore)
+    made._reference = np.array([[2.0], [1.0]])
+    one = np.ones((2, 3, 1))
+    terms = open_loop.OpenLoopTerms(one, one, 0 * one, 0 * one, one > 2, 0 * one, one)
+    found = made._scores(terms, 32.0 * one, CurrentSwings(one, one))
+    np.testing.assert_allclose(found.j, [[16.0**0.4] * 3, [4.0] * 3])
+    assert made._settling_scale(np.zeros(6)).tolist() == [swing_period(MOTOR)] * 6

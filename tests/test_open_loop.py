@@ -333,12 +333,12 @@ class Played:
     def record(self, objects, seconds):
         rows, place = round(seconds / 1e-3), (self.phase, self.window)
         self.window += 1
-        status = np.full(4, 0x0637)
-        status[self.faults.get(place, [])] = 0x0238
+        status = np.full((rows, 4), 0x0637)
+        status[-1, self.faults.get(place, [])] = 0x0238
         encoder = np.tile(self.target + np.asarray(self.over.get(place, 0)), (rows, 1))
         field = encoder + 7 + np.asarray(self.lag.get(place, 0))
         return {
-            cia402.POSITION_ACTUAL: encoder, cia402.POSITION_DEMAND: field, cia402.STATUSWORD: np.tile(status, (rows, 1)),
+            cia402.POSITION_ACTUAL: encoder, cia402.POSITION_DEMAND: field, cia402.STATUSWORD: status,
         }  # fmt: skip
 
 
