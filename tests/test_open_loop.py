@@ -92,6 +92,13 @@ def test_the_band_in_which_an_axis_has_settled(distance, counts, full_step, widt
     assert found[0] == pytest.approx(1.5)
 
 
+def test_a_move_of_nothing_has_overshot_by_increments():
+    still = MOVE._replace(distance=np.array([0]))
+    position = np.where(np.arange(TRIAL) == 30, 3.0, 0.0)[:, None]
+    found = open_loop_terms(position, 0 * position, still, 0.01, np.array([0]), np.array([1]), FULL_STEP)
+    assert found[2] == pytest.approx(3.0)
+
+
 def test_vibration_is_of_the_profile_and_the_load_angle_of_the_move():
     lag = np.where(MS < PROFILE, np.where(MS % 2, 12.8, -12.8), 0.0)
     assert terms_of(lag=lag)[1] == pytest.approx(0.1)  # full steps from millisecond to millisecond
@@ -161,7 +168,7 @@ def test_what_6077h_is_in_open_loop():
 class Counters:
     """Drives whose step counter and encoder are what a test says."""
 
-    time_waits = True
+    time_waits, scale = True, 51200
 
     def __init__(self, demand, encoder):
         self.num_axes, self.device = len(demand), STEPPER
@@ -173,7 +180,7 @@ class Counters:
             self.encoder = self.encoder + (100 if self.rolling > 0 else 0)
             self.rolling -= 1
         return {cia402.POSITION_DEMAND: self.demand, cia402.POSITION_ACTUAL: self.encoder}.get(
-            name, np.full(self.num_axes, 51200)
+            name, np.full(self.num_axes, self.scale)
         )
 
     def advance(self, seconds):
@@ -189,6 +196,16 @@ def test_whole_teeth_are_made_up_for_and_what_a_load_turns_the_rotor_by_is_not()
     assert trials.shift().tolist() == [10 + 0, -5 + 0]  # 510 and 495: less than half a tooth more
     drives.demand = np.array([1000 + 1024 + 300, -2048 - 300])
     assert trials.shift().tolist() == [10 + 1024, -5 - 2048]
+
+
+def test_a_tooth_need_not_be_a_whole_number_of_increments():
+    """Of 51,230 a turn it is 1,024.6: a hundred of them are 102,460."""
+    drives = Counters([0], [0])
+    drives.scale = 51_230
+    trials = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    assert trials.shift().tolist() == [0]
+    drives.demand = np.array([102_460])
+    assert trials.shift().tolist() == [102_460]
 
 
 @pytest.mark.parametrize(("rolling", "looks"), [(0, 1), (6, 4), (10**6, LONGEST_ROLL)])
@@ -259,6 +276,8 @@ def test_an_encoder_must_show_a_quarter_of_the_move(way, moved):
     with pytest.raises(RuntimeError, match="axis 1: the encoder showed 2499 of 10000 increments of a move at"):
         trials._check_moved(position, move, both)
     trials._check_moved(position, move, np.array([True, False]))
+    with pytest.raises(RuntimeError, match="axis 0: the encoder showed 0 of 10000"):
+        trials._check_moved(0 * position, move, both)
 
 
 @pytest.mark.parametrize(("window", "loop"), [((0, 0), (0, 0)), ((500, 0), (1, 0)), ((500, 500), (1, 1))])
