@@ -312,7 +312,7 @@ def _candidates(
 ) -> Floats:
     if not len(tried):
         # Stratified: every law's range is covered evenly.
-        strata = np.stack([rng.permutation(count) for _ in range(width)], axis=-1)
+        strata = np.stack([rng.permutation(count) for _ in range(width)], axis=1)
         return (strata + rng.random((count, width))) / count
     best = np.argsort(distances, kind="stable")[: max(2 * width, round(accept * count), 4)]
     # Twice the population's covariance, as in Beaumont et al. 2009 (adaptive approximate Bayesian computation).
