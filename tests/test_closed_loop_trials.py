@@ -105,7 +105,7 @@ def test_the_share_of_the_run_current_lies_between_three_tenths_and_all_of_it():
     assert trial_share(DEVICE, MOTOR, found(1e-12, coulomb=1e3)).tolist() == [1.0]  # more than iron carries
 
 
-@pytest.mark.parametrize(("rotors", "sign"), [(3.0, 1), (20.0, -1), (100.0, 1)])
+@pytest.mark.parametrize(("rotors", "sign"), [(3.0, 1), (4.0, 1), (20.0, -1), (100.0, 1), (40_000.0, 1)])
 def test_the_ramp_asks_for_four_times_the_torque_and_takes_60_ms(rotors, sign):
     J = rotors * MOTOR.inertia
     move = plan_overload(DEVICE, MOTOR, found(J), 51200.0, np.array([sign * 1e3]))
@@ -113,7 +113,7 @@ def test_the_ramp_asks_for_four_times_the_torque_and_takes_60_ms(rotors, sign):
     acceleration = 4.0 * given
     speed = min(1.5 * MOTOR.rated_speed, np.sqrt(2.0 * 3.0 * full_step(MOTOR) * given / 0.75), 0.03 * acceleration)
     assert move.acceleration[0] == np.ceil(acceleration * SCALE)
-    assert move.velocity[0] == pytest.approx(speed * SCALE, abs=2)
+    assert move.velocity[0] == np.ceil(speed * SCALE) + 1  # rounded up: the profile ends in time
     assert move.distance[0] == pytest.approx(sign * speed * (0.06 - speed / acceleration) * SCALE, abs=1)
     assert move.increments[0] == pytest.approx(SCALE) and move.counts == MOTOR.encoder_counts / (2.0 * np.pi)
     assert move.share == trial_share(DEVICE, MOTOR, found(J))
