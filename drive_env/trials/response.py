@@ -308,7 +308,7 @@ def _reversals(x: Floats, swing: Floats) -> NDArray[np.int64]:
         count += turned & (direction != 0)
         direction = np.where(turned, turn, direction)
         high, low = np.where(turned, row, high), np.where(turned, row, low)
-    return count
+    return np.asarray(count)
 
 
 def _strongest_line(t: Floats, x: Floats) -> Floats:
