@@ -12,9 +12,8 @@ from drive_env.devices import find_device
 from drive_env.motors import MOTORS, find_motor
 from drive_env.trials import gain_trial
 from drive_env.trials.gain_trial import (
+    PHASE_TITLES,
     PHASES,
-    PROBE,
-    RECOVERY,
     Trial,
     Trials,
     clear,
@@ -22,7 +21,7 @@ from drive_env.trials.gain_trial import (
     momentum_balance,
     softness,
 )
-from drive_env.trials.oscillation import OSCILLATION, shakes
+from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
     CYCLE,
     PROFILE,
@@ -42,6 +41,7 @@ from drive_env.trials.score import Terms, cost
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 ENABLED, FAULT = 0x0637, 0x0238
+PROBE, RECOVERY, OSCILLATION = 1.5, 5, 0.4  # of velocity P; attempts; of the rated current
 NAMES = DEVICE.gains.names
 POSITION, DEMAND, CURRENT, STATUS = (
     cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD
@@ -51,6 +51,13 @@ SAFE = np.array([[900, 200, 300, 40, 20]] * 4)
 
 
 # --- moves ---
+def test_a_trial_takes_250_ms_and_its_move_60_whatever_it_turns():
+    """It has settled by 150 ms, when the load comes; the ripple is that of its last 45 ms; watched every 25 ms."""
+    assert (CYCLE, PROFILE, QUIET, SETTLED, TRIAL, WATCH) == (0.001, 60, 105, 150, 250, 25)
+    assert PHASES == ("move", "reversal", "probe")
+    assert PHASE_TITLES == ("move", "reversal", "move with 1.5 times velocity P")
+
+
 def test_the_least_error_of_a_load_step_is_half_a_count_all_the_time():
     """From 150 ms, when the load comes, to the end of the trial at 250 ms; 65,536 counts are a turn."""
     move = plan_move(MOTOR, np.array([1e-5]), np.array([65536]), np.array([10.0]))

@@ -14,7 +14,7 @@ from drive_env.motors import find_motor
 from drive_env.phase_current import amplitude, holding_torque, swing_period
 from drive_env.trials import open_loop as module
 from drive_env.trials.gain_trial import Identified, Trials
-from drive_env.trials.method import FIRST_HZ, SAFE_RULE, Cascade, OpenLoop, check_tried, method_of
+from drive_env.trials.method import FIRST_HZ, SAFE_RULE, Cascade, OpenLoop, check_tried, method_of, new_score
 from drive_env.trials.open_loop import (
     LONGEST_ROLL,
     OpenLoopTerms,
@@ -828,3 +828,56 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
     with pytest.raises(ValueError, match="none has no gains of a velocity or position loop and no phase currents"):
         check_tried(none, ())
     check_tried(none, ("anything",))
+
+
+def test_the_times_of_a_cascade_are_four_times_its_small_time_constants():
+    """1/(2 pi 1000 Hz) + 1.5 of 40 us + 1.4/(2 pi 400 Hz) + 200 us."""
+    small = 1.0 / (2.0 * np.pi * 1000.0) + 60e-6 + 1.4 / (2.0 * np.pi * 400.0) + 200e-6
+    assert method_of(SERVO, SERVO_MOTOR).t_0() == pytest.approx(4.0 * small, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["tmcm1636", "tmcm6212"])
+def test_a_move_is_planned_for_what_was_identified_within_what_the_drive_takes(name):
+    device = find_device(name)
+    motor = find_motor(device.default_motor)
+    light = Identified(np.array([1.01 * motor.inertia, 40.0 * motor.inertia]), *np.zeros((3, 2)))
+    reach = np.array([100.0, -1.0])
+    found = method_of(device, motor).plan(light, 51_200, reach)
+    expected = plan_move(motor, light.inertia, 51_200, reach, highest_ramp(device))
+    assert found.distance.tolist() == expected.distance.tolist()
+    assert found.acceleration.tolist() == expected.acceleration.tolist()
+
+
+@pytest.mark.parametrize(
+    ("device", "gains", "kind"),
+    [
+        ("tmcm1636", (), "RobustScore"), ("tmcm6212", (), "OpenLoopScore"), ("tmcm3313", ("run_current",), "OpenLoopScore"),
+        ("tmcm3313", ("correction_velocity_p",), "ClosedLoopScore"), ("tmcm3313", ("pid_p",), "PidScore"),
+    ],
+)  # fmt: skip
+def test_which_score_gains_of_a_device_have(device, gains, kind, monkeypatch):
+    made = []
+
+    def noted(name):
+        return lambda *arguments, **options: made.append((name, arguments, options)) or name
+
+    for place, name in (
+        ("method", "RobustScore"), ("open_loop_score", "OpenLoopScore"), ("closed_loop_score", "ClosedLoopScore"),
+        ("position_pid_score", "PidScore"),
+    ):  # fmt: skip
+        monkeypatch.setattr(f"drive_env.trials.{place}.{name}", noted(name))
+    assert new_score(device, "load", "motor", 3, gains=gains, repeats=2) == kind
+    ((name, arguments, options),) = made
+    assert name == kind and arguments == (device, "load", "motor", 3) and options["repeats"] == 2
+    assert ("loop" in options) == (kind == "PidScore") and (kind != "PidScore" or options["loop"].mode == 2)
+
+
+def test_gains_of_no_loop_close_none():
+    known = STEPPER
+    assert type(method_of(known, STEPPER_MOTOR, ("run_current",))) is OpenLoop
+    with pytest.raises(ValueError, match="run_current: trials of correction_velocity_p close the loop at the motor's rat"):
+        check_tried(known, ("correction_velocity_p", "run_current"))
+    with pytest.raises(ValueError, match=r"shows what the phase currents do, run_current, standby_current, and with its lo"):
+        check_tried(known, ("coolstep_up",))
+    with pytest.raises(ValueError, match=r"phase currents do, run_current, standby_current; drive-tune auto finds"):
+        check_tried(find_device("tmcm6212"), ("coolstep_up",))

@@ -23,7 +23,6 @@ from tuning.rules.lags import velocity_lag
 from tuning.rules.optima import take_current
 from tuning.rules.proposal import Workbench
 from tuning.rules.relay import (
-    HELD,
     evaluate,
     finish,
     fundamental,
@@ -35,6 +34,7 @@ from tuning.rules.relay import (
 )
 from tuning.target import emulated
 
+HELD = 0.5e-3  # s: a current that is held for a cycle acted half a cycle earlier on the mean
 STILL = {"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0}
 
 
