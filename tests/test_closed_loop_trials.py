@@ -734,3 +734,17 @@ def test_an_open_loops_score_has_the_terms_of_its_own_cost():
     found = made._scores(terms, 32.0 * one, CurrentSwings(one, one))
     np.testing.assert_allclose(found.j, [[16.0**0.4] * 3, [4.0] * 3])
     assert made._settling_scale(np.zeros(6)).tolist() == [swing_period(MOTOR)] * 6
+
+
+@pytest.mark.parametrize("kind", [OpenLoopScore, PidScore, ClosedLoopScore])
+@pytest.mark.parametrize("beyond", [300, -300])
+def test_an_overshoot_of_a_score_lies_the_way_of_its_move(kind, beyond, sent):
+    """At 70 ms, by 3 % of it; what stays short of the target is none."""
+    at = 0 if kind is OpenLoopScore else 50  # an open loop's target is the step counter's
+    spike = np.sign(AWAY) * beyond * (np.arange(150)[:, None] == 70)
+    free = {cia402.POSITION_ACTUAL: AWAY + spike + at - 50, cia402.POSITION_DEMAND: AWAY + spike + at - 50}
+    made = score_of(kind, free)
+    made._loop = RAMP
+    terms, *_ = made._run(gains([200, 100]))
+    np.testing.assert_allclose(terms.overshoot, 0.03 if beyond > 0 else 0.0)
+    np.testing.assert_allclose(terms.settling, 1.1)  # a millisecond out of the band, of a t_0 of 10

@@ -153,6 +153,48 @@ def test_an_axis_that_did_not_move_has_its_rotors_inertia_and_no_friction_below_
     assert momentum_balance(angle, speed, huge, MOTOR).inertia == 300.0 * MOTOR.inertia
 
 
+class Moving:
+    """Two axes that stand at 1,000 and -500; what they answer in each record is a parabola, and their current."""
+
+    num_axes, device, time_waits = 2, DEVICE, True
+
+    def __init__(self):
+        self.targets, self.profile = [], None
+
+    def read(self, name):
+        return np.array([1000, -500]) if name == POSITION else np.array([65_536, 32_768])
+
+    def record(self, objects, seconds):
+        t = np.arange(round(seconds / CYCLE))[:, None]
+        sign = 1 if len(self.targets) == 1 else -1
+        way = t**2 * [1.0, -2.0]
+        rows = {POSITION: [1000, -500] + (way if sign == 1 else way[-1] - way), cia402.VELOCITY_ACTUAL: sign * 2.0 * t,
+                CURRENT: sign * t * [1.0, 3.0]}  # fmt: skip
+        return {name: rows[name] for name in objects}
+
+
+@pytest.mark.parametrize(("scale", "ratio"), [(1.0, 1.0), (2.0, 0.5)])
+def test_identification_moves_three_rotors_there_and_back_from_where_the_axes_stand(scale, ratio, monkeypatch):
+    drives, balanced = Moving(), []
+    monkeypatch.setattr(gain_trial, "device_of", lambda drives: DEVICE)
+    monkeypatch.setattr(gain_trial, "ampere_per_count", lambda drives: 1e-3)
+    monkeypatch.setattr(gain_trial, "per_increment", lambda drives, name: scale)
+    monkeypatch.setattr(gain_trial, "write_profile", lambda drives, move, where: setattr(drives, "profile", move))
+    monkeypatch.setattr(gain_trial, "start", lambda drives, target, where: drives.targets.append(target.tolist()))
+    monkeypatch.setattr(gain_trial, "momentum_balance", lambda *arguments: balanced.append(arguments) or "found")
+    reach, where = np.array([50.0, -0.5]), np.array([True, True])
+    assert Trials(drives, MOTOR, 1, 0.004).identify(reach, where)[0] == "found"
+    move = plan_move(MOTOR, np.full(2, 3.0 * MOTOR.inertia), np.array([65_536, 32_768]), reach)
+    assert drives.profile.distance.tolist() == move.distance.tolist()
+    assert drives.targets == [(np.array([1000, -500]) + move.distance).tolist(), [1000, -500]]
+    ((angle, speed, current, motor),) = balanced
+    turn = 2.0 * np.pi
+    np.testing.assert_allclose(angle[100], [1e4 / 65_536 * turn, -2e4 / 32_768 * turn])
+    np.testing.assert_allclose(speed[100], ratio * 200.0 * turn / np.array([65_536, 32_768]))
+    np.testing.assert_allclose(current[[100, TRIAL + 100]], [[0.1, 0.3], [-0.1, -0.3]])
+    assert motor is MOTOR and len(angle) == 2 * TRIAL and angle[-1].tolist() == [0.0, 0.0]
+
+
 # --- trials -----------------------------------------------------------------------------------------------------------
 class Played:
     """Drives in pp that play what a test has for them: `faults` and `shaking` are (phase, window) -> axes."""

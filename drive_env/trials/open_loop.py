@@ -216,7 +216,7 @@ class OpenLoopTrials(Trials):
         if self.sensor is None:
             self.sensor, self.window = now, drives.read(cia402.FOLLOWING_WINDOW)
             self._open_loop()
-            if np.any(self.window != NO_WINDOW):
+            if np.any(self.window):
                 drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
         blind = where & (now != ENCODER)
         if blind.any():
