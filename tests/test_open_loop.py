@@ -567,6 +567,9 @@ def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step
     assert torque is held and motor is STEPPER_MOTOR and age == 1.0 / device.velocity_rate
 
 
+ORIGIN = np.array([1000, -500])
+
+
 class Recorded:
     """Drives whose encoder and step counter are two records."""
 
@@ -576,7 +579,7 @@ class Recorded:
         self.records, self.log = list(records), []
 
     def read(self, name):
-        return np.full(2, 51200 if name is module.Role.POSITION_SCALE else 0)
+        return np.full(2, 51200) if name is module.Role.POSITION_SCALE else ORIGIN
 
     def advance(self, seconds):
         self.log.append(seconds)
@@ -595,7 +598,7 @@ def identified(monkeypatch):
         t = np.arange(TRIAL)[:, None]
         there = np.minimum(t, 100) ** 2 * [1.0, 0.5]
         back = there[-1] - there
-        drives = Recorded([(there, there + 30.0), (back, back - 30.0)])
+        drives = Recorded([(ORIGIN + there, ORIGIN + there + 30.0), (ORIGIN + back, ORIGIN + back - 30.0)])
         monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
         monkeypatch.setattr(module, "read_gains", lambda drives: gains([100, 200], [250, 250]))
         monkeypatch.setattr(module, "write_profile", lambda drives, move, where: starts.append(move))
@@ -615,7 +618,7 @@ def identified(monkeypatch):
         monkeypatch.setattr(module, "momentum_balance", balance)
         monkeypatch.setattr(OpenLoopTrials, "_swing", swing_of)
         found, origin = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01).identify(np.array(reach), np.array(where))
-        assert origin.tolist() == [0, 0] and drives.log == [0.02]
+        assert origin.tolist() == ORIGIN.tolist() and drives.log == [0.02]
         return [value.tolist() for value in found], calls, swings
 
     run.starts = starts
@@ -630,7 +633,7 @@ def test_identification_moves_three_rotors_there_and_back(identified):
     assert planned.distance.tolist() == move.distance.tolist() and planned.acceleration.tolist() == (
         move.acceleration.tolist()
     )
-    assert (there, back) == (move.distance.tolist(), [0, 0])
+    assert (there, back) == ((ORIGIN + move.distance).tolist(), ORIGIN.tolist())
 
 
 def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identified):
