@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,16 +15,20 @@ from drive_env.devices import find_device
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
 from drive_env.motors import MOTORS, find_motor
+from tuning.identify.estimate import Estimate, Identification, refused
 from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
 from tuning.response.margins import Margins, margins
+from tuning.rules import side_by_side
 from tuning.rules.internal_model import imc_first_order, simc_first_order, simc_integrating
 from tuning.rules.lags import current_lag, slow_enough, velocity_lag, velocity_noise
 from tuning.rules.margin_targets import TARGETS, _greatest
 from tuning.rules.optima import modulus_optimum, symmetrical_optimum
 from tuning.rules.pole_placement import place_first_order
 from tuning.rules.proposal import Workbench
+from tuning.rules.relay import Swing, gains_from_swing
 from tuning.rules.rules_by_name import MEANINGS, RULES, propose
+from tuning.rules.side_by_side import velocity_margins
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
@@ -450,3 +455,72 @@ def test_a_cascade_that_counts_limit_says_to_what_and_from_what():
         f"velocity loop limited to {hz:.0f} Hz" in note and f"alone would allow {alone / (2.0 * math.pi):.0f} Hz" in note
         for note in proposal.notes
     )
+
+
+@pytest.mark.parametrize(
+    ("rule", "share"), [("modulus_optimum", 1 / 2), ("symmetrical_optimum", 1 / 2), ("imc", 1 / 3), ("simc", 1 / 2),
+                        ("cascade", 1 / 3), ("relay", math.pi / 2 / 3.2)],
+)  # fmt: skip
+@pytest.mark.parametrize("slope", [0.7, 1.9])  # rad/(A s^2), of a load that is as heavy as a car
+def test_what_a_rule_asks_for_is_over_what_an_ampere_accelerates_by(rule, share, slope):
+    axis = plant(inertia=MOTOR.torque_constant / slope, counts=10**8)
+    proposal = propose(rule, DEVICE, MOTOR, axis)
+    small = small_of(axis, gains_in_si(DEVICE, axis.supply, proposal.gains))
+    bench = Workbench(DEVICE, axis)
+    assert proposal.wanted["velocity_p"] / bench.per_si["velocity", "P"] == pytest.approx(share / (slope * small), rel=1e-3)
+
+
+# --- side by side -----------------------------------------------------------------------------------------------------
+def test_the_margins_of_a_proposal_are_those_of_its_velocity_loop():
+    """From 0.5 Hz to just below half the loop's rate."""
+    gains = propose("simc", DEVICE, MOTOR, plant()).gains
+    found = velocity_margins(DEVICE, plant(), gains)
+    assert found == pytest.approx(margins(F, velocity_open_loop(DEVICE, plant(), gains, F)), rel=1e-3)
+    assert len(found) == 7
+
+
+def test_axes_without_an_inertia_have_a_reason_in_place_of_a_model(monkeypatch):
+    said = []
+
+    def identify(target, progress):
+        progress("inertia", 0.5)
+        known, reason = Estimate(2e-5, 2e-5, 2e-5, ""), refused("", "the travel is too short")
+        return [Identification({"inertia": one}, 1.0) for one in (known, reason)]
+
+    monkeypatch.setattr("tuning.identify.identification.identify", identify)
+    target = SimpleNamespace(drives=SimpleNamespace(safety=None), device=DEVICE, motor=MOTOR, supply=np.array([30.0, 24.0]))
+    monkeypatch.setattr(side_by_side, "swinging_allowed", lambda drives: nullcontext())
+    one, other = side_by_side.identified_plants(target, said.append)
+    assert (one.supply, one.inertia) == (30.0, 2e-5) and said == [0.5]
+    assert other == "the axis has no identified inertia: the travel is too short"
+    assert list(side_by_side.proposals(target, one, ["simc", "imc"])) == ["simc", "imc"]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_relay_experiments_have_the_rules_current_loops_and_drives_their_own_gains_afterwards(fails, monkeypatch):
+    written, axis = [], plant()
+    slope = axis.torque_constant / axis.inertia
+    reasons = ("", "the travel is too short", "")
+    swing = Swing(*(np.full(3, 1.0),) * 2, np.array([slope, slope, 4.0 * slope]), np.full(3, 1e-3), reasons)
+
+    def experiment(target):
+        if fails:
+            raise OSError("the cable is out")
+        return swing
+
+    monkeypatch.setattr("tuning.rules.relay.relay_experiment", experiment)
+    monkeypatch.setattr("tuning.search.trial_bench.read_gains", lambda target: "before")
+    monkeypatch.setattr(
+        side_by_side, "write_gains", lambda drives, gains: written.append(gains if isinstance(gains, str) else gains.tolist())
+    )
+    target = SimpleNamespace(drives=None, device=DEVICE, motor=MOTOR)
+    rule = list(propose("relay", DEVICE, MOTOR, axis).gains)
+    if fails:
+        with pytest.raises(OSError, match="cable"):
+            side_by_side.swung_proposals(target, [axis] * 3)
+        assert written == [[rule] * 3, "before"]
+        return
+    one, short, other = side_by_side.swung_proposals(target, [axis] * 3)
+    assert written == [[rule] * 3, "before"] and short == "the travel is too short"
+    assert one == gains_from_swing(DEVICE, axis, slope, swing.ultimate(0))
+    assert "it swings at its load's resonance" in other
