@@ -324,6 +324,40 @@ def test_the_error_of_the_first_phase_and_what_it_adds_up_to(trials):
     np.testing.assert_allclose(found.following[1:], 0.5 * CYCLE)
 
 
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("beyond", [1, -1])
+def test_what_is_beyond_a_target_lies_the_way_of_the_move_and_of_its_reversal(trials, direction, beyond):
+    """By 5 % of the move from 75 to 100 ms; the current alternates by 100 mA all the time."""
+    drives = Played()
+    record = drives.record
+
+    def past(objects, seconds):
+        rows = record(objects, seconds)
+        way = np.sign(MOVE.distance) * direction * (-1 if drives.phase == 1 else 1)
+        if drives.window == 4:
+            rows[POSITION] = rows[POSITION] + np.rint(0.05 * beyond * way * np.abs(MOVE.distance)).astype(int)
+        rows[CURRENT] = np.tile([[100], [0]], (13, 4))[: len(rows[CURRENT])]
+        return rows
+
+    drives.record = past
+    found = run(trials, drives, direction=direction)
+    np.testing.assert_allclose(found.terms.overshoot, 0.05 if beyond > 0 else 0.0, rtol=1e-3)
+    np.testing.assert_allclose(found.terms.settling, 1.0 + WATCH * 1e-3 / 0.004)  # a t_0 of 4 ms
+    # A look begins as the one before it ended: 24 of 25 changes.
+    np.testing.assert_allclose(found.terms.noise, 0.1 / MOTOR.rated_current, rtol=0.05)
+
+
+def test_a_position_beyond_the_counters_end_is_where_it_goes_on(trials, monkeypatch):
+    went = []
+    monkeypatch.setattr(gain_trial, "start", lambda drives, target, where: went.append((target.tolist(), where)))
+    monkeypatch.setattr(gain_trial, "power_up", lambda drives, where: went.append(where))
+    made = trials(Played())
+    made.go(np.array([2**31 + 3, -(2**31) - 3, 5, 2**31 - 1]), "here")
+    made.power_up("there")
+    assert went == [([-(2**31) + 3, 2**31 - 3, 5, 2**31 - 1], "here"), "there"]
+    assert made.leave() is None and made.look is None
+
+
 def test_whoever_looks_is_called_after_every_cycle(trials):
     drives, looks = Played(), []
     made = trials(drives)
