@@ -299,7 +299,9 @@ def test_what_an_axis_can_be(fields, message):
 def test_what_an_axis_is_unless_it_is_known_better():
     plant = Plant(1.0, 1e-3, 24.0, 0.1, 1e-5)
     assert (plant.viscous, plant.anti_resonance, plant.resonance, plant.damping) == (0.0, math.inf, math.inf, 0.02)
-    assert (plant.delay, plant.velocity_filter, plant.counts) == (200e-6, 400.0, 4096) and math.isnan(plant.emf_constant)
+    assert (plant.delay, plant.velocity_filter, plant.counts) == (200e-6, 400.0, 4096) and math.isnan(
+        plant.emf_constant
+    )
     assert ELASTIC.rotor_inertia == pytest.approx(1.5e-5 * (80.0 / 140.0) ** 2)
     assert (RIGID.R, RIGID.L, RIGID.torque_constant) == (MOTOR.R_s, MOTOR.L_q, MOTOR.torque_constant)
     assert RIGID.emf_constant == MOTOR.n_p * MOTOR.psi_m
@@ -340,4 +342,6 @@ def test_what_is_handed_out_to_every_caller_cannot_be_changed():
 def test_the_exponential_of_a_diagonal_is_that_of_its_entries(size):
     assert exponential(np.diag([size, -size])) == pytest.approx(np.diag([math.exp(size), math.exp(-size)]), rel=1e-13)
     turn = exponential(np.array([[0.0, -size], [size, 0.0]]))
-    assert turn == pytest.approx(np.array([[math.cos(size), -math.sin(size)], [math.sin(size), math.cos(size)]]), abs=1e-12)
+    assert turn == pytest.approx(
+        np.array([[math.cos(size), -math.sin(size)], [math.sin(size), math.cos(size)]]), abs=1e-12
+    )

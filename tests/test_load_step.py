@@ -98,9 +98,7 @@ def played(monkeypatch):
         monkeypatch.setattr("mechanics.shaft.one", lambda load: SimpleNamespace(
             plant=SimpleNamespace(disturbance=np.array([[1.0, 9.0]]))
         ))  # fmt: skip
-        monkeypatch.setattr(
-            "mechanics.shaft.way", lambda packed: SimpleNamespace(joints=np.array([[0.2], [-0.5]]))
-        )
+        monkeypatch.setattr("mechanics.shaft.way", lambda packed: SimpleNamespace(joints=np.array([[0.2], [-0.5]])))
         for name in ("enable", "disable"):
             monkeypatch.setattr(
                 module.motion, name,

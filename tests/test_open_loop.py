@@ -560,7 +560,7 @@ def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step
         (cia402.PROFILE_ACCELERATION, [22, 22], yes),
         (cia402.PROFILE_DECELERATION, [33, 33], yes),
     ]  # fmt: skip
-    (demand, position, torque, age, motor), = swung
+    ((demand, position, torque, age, motor),) = swung
     way = np.arange(3)[:, None] * np.array([10.0, 20.0]) * 2.0 * np.pi / scale
     np.testing.assert_allclose(position, [way, way])
     np.testing.assert_allclose(demand, [2.0 * way, 2.0 * way])
@@ -647,9 +647,7 @@ def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identifi
     held = holding_torque(STEPPER_MOTOR, amplitude(STEPPER, np.array([100, 200])))
     age = 1.0 / STEPPER.velocity_rate
     for row, sign, rates in ((40, 1, (80e3, 78e3)), (TRIAL + 40, -1, (-80e3, -78e3))):
-        torque = [
-            held * np.sin(50 * to_rad * (sign * 30.0 - rate * np.array([1.0, 0.5]) * age)) for rate in rates
-        ]
+        torque = [held * np.sin(50 * to_rad * (sign * 30.0 - rate * np.array([1.0, 0.5]) * age)) for rate in rates]
         np.testing.assert_allclose(current[row], 0.5 * (torque[0] + torque[1]) / STEPPER_MOTOR.torque_constant)
 
 
@@ -878,9 +876,13 @@ def test_which_score_gains_of_a_device_have(device, gains, kind, monkeypatch):
 def test_gains_of_no_loop_close_none():
     known = STEPPER
     assert type(method_of(known, STEPPER_MOTOR, ("run_current",))) is OpenLoop
-    with pytest.raises(ValueError, match="run_current: trials of correction_velocity_p close the loop at the motor's rat"):
+    with pytest.raises(
+        ValueError, match="run_current: trials of correction_velocity_p close the loop at the motor's rat"
+    ):
         check_tried(known, ("correction_velocity_p", "run_current"))
-    with pytest.raises(ValueError, match=r"shows what the phase currents do, run_current, standby_current, and with its lo"):
+    with pytest.raises(
+        ValueError, match=r"shows what the phase currents do, run_current, standby_current, and with its lo"
+    ):
         check_tried(known, ("coolstep_up",))
     with pytest.raises(ValueError, match=r"phase currents do, run_current, standby_current; drive-tune auto finds"):
         check_tried(find_device("tmcm6212"), ("coolstep_up",))

@@ -196,9 +196,7 @@ def test_a_phase_ahead_of_an_integrators_is_that_of_no_rigid_axis():
     swing = evaluated(100.0, lag=-0.2e-3)
     assert math.isnan(swing.slope[0]) and math.isnan(swing.lag[0])
     assert swing.frequency[0] == pytest.approx(100.0, rel=1e-3) and swing.amplitude[0] == pytest.approx(8.0, rel=1e-2)
-    assert swing.reason == (
-        "the phase at 100 Hz leads an integrator's: the oscillation is not that of a rigid axis",
-    )
+    assert swing.reason == ("the phase at 100 Hz leads an integrator's: the oscillation is not that of a rigid axis",)
     assert evaluated(100.0, lag=0.2e-3).lag[0] == pytest.approx(0.2e-3, rel=0.05)
 
 
@@ -321,9 +319,7 @@ def experiment(monkeypatch):
     enabled = []
     monkeypatch.setattr(module, "ampere_per_count", lambda drives: 1e-3)
     monkeypatch.setattr(module, "to_counts", lambda drives, torque: np.rint(torque * 1e3).astype(np.int64))
-    monkeypatch.setattr(
-        module.motion, "enable", lambda drives, mode, where: enabled.append((mode, where.tolist()))
-    )
+    monkeypatch.setattr(module.motion, "enable", lambda drives, mode, where: enabled.append((mode, where.tolist())))
     monkeypatch.setattr(module.motion, "disable", lambda drives, where: enabled.append(("off", where.tolist())))
     monkeypatch.setattr(module, "evaluate", lambda *arguments: arguments)
 

@@ -334,7 +334,10 @@ def test_an_axis_without_viscous_friction_has_no_lag_to_cancel_and_this_is_said(
     _, with_friction, _ = proposed(rule, plant(**VISCOUS))
     proposal, si, _ = proposed(rule, plant())
     assert si.velocity_p == pytest.approx(with_friction.velocity_p, rel=1e-3)
-    assert Gains(*proposal.gains).velocity_i == 0 and Gains(*propose(rule, DEVICE, MOTOR, plant(**VISCOUS)).gains).velocity_i
+    assert (
+        Gains(*proposal.gains).velocity_i == 0
+        and Gains(*propose(rule, DEVICE, MOTOR, plant(**VISCOUS)).gains).velocity_i
+    )
     assert [note for note in proposal.notes if "no integral part: a constant load leaves an error" in note]
 
 
@@ -452,7 +455,8 @@ def test_a_cascade_that_counts_limit_says_to_what_and_from_what():
     hz = quiet * coarse.torque_constant / coarse.inertia / (2.0 * math.pi)
     _, fine, alone = proposed("cascade", plant())
     assert any(
-        f"velocity loop limited to {hz:.0f} Hz" in note and f"alone would allow {alone / (2.0 * math.pi):.0f} Hz" in note
+        f"velocity loop limited to {hz:.0f} Hz" in note
+        and f"alone would allow {alone / (2.0 * math.pi):.0f} Hz" in note
         for note in proposal.notes
     )
 
@@ -467,7 +471,9 @@ def test_what_a_rule_asks_for_is_over_what_an_ampere_accelerates_by(rule, share,
     proposal = propose(rule, DEVICE, MOTOR, axis)
     small = small_of(axis, gains_in_si(DEVICE, axis.supply, proposal.gains))
     bench = Workbench(DEVICE, axis)
-    assert proposal.wanted["velocity_p"] / bench.per_si["velocity", "P"] == pytest.approx(share / (slope * small), rel=1e-3)
+    assert proposal.wanted["velocity_p"] / bench.per_si["velocity", "P"] == pytest.approx(
+        share / (slope * small), rel=1e-3
+    )
 
 
 # --- side by side -----------------------------------------------------------------------------------------------------
@@ -488,7 +494,9 @@ def test_axes_without_an_inertia_have_a_reason_in_place_of_a_model(monkeypatch):
         return [Identification({"inertia": one}, 1.0) for one in (known, reason)]
 
     monkeypatch.setattr("tuning.identify.identification.identify", identify)
-    target = SimpleNamespace(drives=SimpleNamespace(safety=None), device=DEVICE, motor=MOTOR, supply=np.array([30.0, 24.0]))
+    target = SimpleNamespace(
+        drives=SimpleNamespace(safety=None), device=DEVICE, motor=MOTOR, supply=np.array([30.0, 24.0])
+    )
     monkeypatch.setattr(side_by_side, "swinging_allowed", lambda drives: nullcontext())
     one, other = side_by_side.identified_plants(target, said.append)
     assert (one.supply, one.inertia) == (30.0, 2e-5) and said == [0.5]
@@ -511,7 +519,9 @@ def test_relay_experiments_have_the_rules_current_loops_and_drives_their_own_gai
     monkeypatch.setattr("tuning.rules.relay.relay_experiment", experiment)
     monkeypatch.setattr("tuning.search.trial_bench.read_gains", lambda target: "before")
     monkeypatch.setattr(
-        side_by_side, "write_gains", lambda drives, gains: written.append(gains if isinstance(gains, str) else gains.tolist())
+        side_by_side,
+        "write_gains",
+        lambda drives, gains: written.append(gains if isinstance(gains, str) else gains.tolist()),
     )
     target = SimpleNamespace(drives=None, device=DEVICE, motor=MOTOR)
     rule = list(propose("relay", DEVICE, MOTOR, axis).gains)

@@ -149,7 +149,9 @@ def test_a_gaussian_process_gets_to_the_bottom():
         ("gp", 1, "GPSampler", {"n_startup_trials": 6}),
     ],
 )
-def test_what_a_sampler_is_told_and_that_each_point_has_a_seed_of_its_own(sampler, generation, kind, options, monkeypatch):
+def test_what_a_sampler_is_told_and_that_each_point_has_a_seed_of_its_own(
+    sampler, generation, kind, options, monkeypatch
+):
     made = []
 
     def noted(name):

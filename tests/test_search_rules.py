@@ -348,7 +348,9 @@ def test_settings_that_cannot_be_are_refused(settings, message):
         Settings(**settings)
 
 
-@pytest.mark.parametrize(("aborted", "fragile", "accepted"), [(0, 0, True), (1, 0, False), (0, 1, False), (1, 1, False)])
+@pytest.mark.parametrize(
+    ("aborted", "fragile", "accepted"), [(0, 0, True), (1, 0, False), (0, 1, False), (1, 1, False)]
+)
 def test_gains_could_be_kept_that_were_neither_stopped_nor_fragile(aborted, fragile, accepted):
     assert row(1.0, aborted=bool(aborted))._replace(fragile=bool(fragile)).accepted is accepted
 
@@ -520,9 +522,7 @@ def test_a_search_identifies_tries_generation_by_generation_and_leaves_the_best(
 
 
 def test_a_search_of_copies_of_one_machine_and_of_the_gains_that_were_named(played):
-    found = optimise(
-        played, Settings(sampler="random", trials=5, gains=("velocity_p",)), shared=True, anew=True
-    )
+    found = optimise(played, Settings(sampler="random", trials=5, gains=("velocity_p",)), shared=True, anew=True)
     (bench,) = PlayedBench.made
     assert (bench.anew, bench.gains) == (True, ("velocity_p",))
     assert bench.ran == [[True, True], [True, True], [True, False]]

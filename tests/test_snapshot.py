@@ -656,7 +656,9 @@ def test_what_was_stored_is_stored_again_where_it_is_brought_back(transaction, m
     assert len(stored) == 3
 
 
-@pytest.mark.parametrize(("error", "reason"), [(ValueError("too far"), "too far"), (KeyboardInterrupt(), "KeyboardInt")])
+@pytest.mark.parametrize(
+    ("error", "reason"), [(ValueError("too far"), "too far"), (KeyboardInterrupt(), "KeyboardInt")]
+)
 def test_what_still_turns_is_braked_after_an_error_alone(transaction, error, reason):
     for given, stops in ((error, 1), (None, 0)):
         made, drives = transaction()

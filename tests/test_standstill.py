@@ -164,9 +164,7 @@ def measured(monkeypatch):
         monkeypatch.setattr(module, "stop_causes", lambda drives: ["one", "overcurrent (2310h)"])
         motor = SimpleNamespace(kind="pmsm", n_p=4)
         device = SimpleNamespace(stage=stage, current_rate=25_000.0)
-        target = SimpleNamespace(
-            drives=windings, num_axes=2, motor=motor, device=device, supply=np.full(2, SUPPLY)
-        )
+        target = SimpleNamespace(drives=windings, num_axes=2, motor=motor, device=device, supply=np.full(2, SUPPLY))
         working = SimpleNamespace(target=target, current=np.full(2, current), angle=lambda position: position)
         return standstill_resistances(working), log
 

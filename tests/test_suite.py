@@ -202,7 +202,9 @@ def test_unknown_suites_are_refused_with_those_that_ship():
 
 # --- without a machine: what a file says, what is drawn, and in which order -------------------------------------------
 PLAIN = 'device = "tmcm1636"\n'
-GROUP = '[[group]]\nload = "inertia"\nmotor = "qbl4208"\nsupply = [24, 20]\n[group.parameters]\n"load.inertia" = [1, 2]\n'
+GROUP = (
+    '[[group]]\nload = "inertia"\nmotor = "qbl4208"\nsupply = [24, 20]\n[group.parameters]\n"load.inertia" = [1, 2]\n'
+)
 
 
 @pytest.fixture

@@ -415,9 +415,7 @@ def test_the_way_to_the_ends_of_a_load_is_counted_from_where_the_rotor_stands():
     np.testing.assert_allclose(target.high, [end, end - 3.0, end + 3.0, 0.0, 2.0 * end + 1.0])
     assert (target.axes_per_machine, target.linked, target.machine) == (1, False, "belt")
     assert (target.supply.tolist(), target.speed, target.current) == ([24.0] * 5, MOTOR.rated_speed, 3.5)
-    near = of_machines(
-        SimpleNamespace(num_axes=5), made, travel=(-2.0, 1e6), supply=20.0, speed=3.0, current=1.0
-    )
+    near = of_machines(SimpleNamespace(num_axes=5), made, travel=(-2.0, 1e6), supply=20.0, speed=3.0, current=1.0)
     np.testing.assert_allclose(near.low, [-2.0, -2.0, -2.0, -2.0, 0.0])
     np.testing.assert_allclose(near.high, target.high)
     assert (near.supply.tolist(), near.speed, near.current) == ([20.0] * 5, 3.0, 1.0)
