@@ -638,7 +638,9 @@ def test_a_load_step_is_on_an_open_loop_as_on_a_servo_and_lost_steps_trip(sent):
 
 
 def test_a_load_step_is_on_a_pid_as_on_a_servo_with_more_p_in_its_variant(sent):
-    made = score_of(PidScore, {cia402.POSITION_ACTUAL: AWAY}, {cia402.POSITION_ACTUAL: AWAY + [0, 0, 100, 0, 0, 0]})
+    made = score_of(
+        PidScore, {cia402.POSITION_ACTUAL: AWAY}, {cia402.POSITION_ACTUAL: AWAY + np.where(np.arange(6) == 2, 100, 0)}
+    )
     made._loop, made._factors = RAMP, np.array([1.0, 1.5, 1.0] * 2)
     rows = gains([200, 100])
     rows[:, P] = 1000

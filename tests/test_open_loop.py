@@ -852,7 +852,8 @@ def test_a_move_is_planned_for_what_was_identified_within_what_the_drive_takes(n
 @pytest.mark.parametrize(
     ("device", "gains", "kind"),
     [
-        ("tmcm1636", (), "RobustScore"), ("tmcm6212", (), "OpenLoopScore"), ("tmcm3313", ("run_current",), "OpenLoopScore"),
+        ("tmcm1636", (), "RobustScore"), ("tmcm6212", (), "OpenLoopScore"),
+        ("tmcm3313", ("run_current",), "OpenLoopScore"),
         ("tmcm3313", ("correction_velocity_p",), "ClosedLoopScore"), ("tmcm3313", ("pid_p",), "PidScore"),
     ],
 )  # fmt: skip

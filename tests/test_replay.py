@@ -461,7 +461,7 @@ class Player:
         ((target, rows),) = play.items()
         self.log.append((list(names), round(seconds, 6), target, round(period, 6)))
         self.rows = rows
-        return {name: 2 * rows for name in names}
+        return dict.fromkeys(names, 2 * rows)
 
 
 def logged(every=1, **objects):
@@ -563,7 +563,7 @@ def test_columns_of_one_object_are_its_axes_wherever_they_stand(tmp_path):
         (b"t [s],6064h:00 P\n0,\"" + b"1" * 200_000, r"log\.csv is not CSV: .*; give the one that drive-env scope"),
         (b"\n", r"the first line must begin with 't \[s\]', as drive-env scope writes it"),
         (b"t [s]\n" + b"0\n" * 12, r"the first line must begin with 't \[s\]'"),
-        (b"t [s],6064h:00 P\n" + b"0.1\n" * 12, "every line needs a time and 1 whole numbers|at least 10 lines of 2 val"),
+        (b"t [s],6064h:00 P\n" + b"0.1\n" * 12, "every line needs a time and 1 whole numbers|at least 10 lines of 2 v"),
         (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1\n" * 12, r"needs at least 10 lines of 3 values each"),
         (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1,x\n" * 12, r"every line needs a time and 2 whole numbers: invalid"),
     ],
@@ -642,7 +642,8 @@ def test_a_fit_needs_sixteen_machines_and_a_parameter(count, parameters):
 
 def test_what_is_drawn_from_a_range_can_be_fitted():
     laws = Distributions({
-        "a": Law("uniform", True, 0.5, 1.5), "b": Law("choice", False, 0.0, 1.0), "c": Law("loguniform", False, 1.0, 2.0),
+        "a": Law("uniform", True, 0.5, 1.5), "b": Law("choice", False, 0.0, 1.0),
+        "c": Law("loguniform", False, 1.0, 2.0),
         "supply.voltage": Law("uniform", True, 0.9, 1.1),
     })  # fmt: skip
     names = module.fittable(laws)

@@ -90,7 +90,7 @@ STEP = 0.4  # of the field, electrical [rad], made evenly in 4 ms
 
 
 def swing(inertia, friction, start, age=0.0, held=None, motor=MOTOR, drag=None):
-    """Return field and encoder [rad, electrical] of a swing in steps of 2 us, from where friction had left the rotor."""
+    """Return field and encoder [rad, electrical] of a swing in steps of 2 us, from where friction had left it."""
     dt, held = 2e-6, motor.rated_torque if held is None else held
     x, v, field, rows, seen = start * friction, 0.0, 0.0, [0.0], [0.0]
     drag = motor.viscous if drag is None else drag

@@ -449,11 +449,11 @@ def test_a_loop_is_slowed_above_half_the_anti_resonance(wanted_hz, slowed):
 def test_a_cascade_that_counts_limit_says_to_what_and_from_what():
     """A tenth of the rated current is what the noise of counts may cause."""
     coarse = plant(counts=200)
-    proposal, si, crossover = proposed("cascade", coarse)
+    proposal, si, _ = proposed("cascade", coarse)
     quiet = 0.1 * MOTOR.rated_current / velocity_noise(DEVICE, coarse)
     assert si.velocity_p == pytest.approx(quiet, rel=0.01)
     hz = quiet * coarse.torque_constant / coarse.inertia / (2.0 * math.pi)
-    _, fine, alone = proposed("cascade", plant())
+    _, _, alone = proposed("cascade", plant())
     assert any(
         f"velocity loop limited to {hz:.0f} Hz" in note
         and f"alone would allow {alone / (2.0 * math.pi):.0f} Hz" in note

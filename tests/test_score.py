@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -379,7 +379,7 @@ class Machines:
 
         class Machine:
             supply, diverged = np.full(12, 24.0), np.zeros(6, bool)
-            parameters = {"stage.velocity_filter": np.array([100.0, 200.0, 400.0] * 2)}
+            parameters = MappingProxyType({"stage.velocity_filter": np.array([100.0, 200.0, 400.0] * 2)})
 
             def reset(self):
                 log.append("reset")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -468,7 +469,7 @@ def test_a_search_is_continued_from_its_log_only_where_that_repeats_it(anew, jou
 class PlayedBench:
     """A bench of two machines of one axis, where a velocity P of 1.5 times the rule's costs least."""
 
-    made = []
+    made: ClassVar[list] = []
 
     def __init__(self, target, *, anew, gains):
         self.made.append(self)

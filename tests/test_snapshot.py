@@ -650,7 +650,7 @@ def test_what_was_stored_is_stored_again_where_it_is_brought_back(transaction, m
     made, _ = transaction(bus={"channel": "x"})
     assert made.store()
     assert stored[2:] == [None] and made._stored.tolist() == YES
-    made, drives = transaction()
+    made, _ = transaction()
     assert not made.store() and len(stored) == 3 and not made._stored.any()
     made.__exit__(None, None, None)
     assert len(stored) == 3
@@ -721,7 +721,7 @@ def test_who_fails_says_where_the_file_is(committed, left, error, said, monkeypa
             return False
 
     monkeypatch.setattr(module, "Transaction", Made)
-    with pytest.raises(ValueError, match="no|see"), put_back(None, file, "drive-agent"):
+    with pytest.raises(ValueError, match=r"no|see"), put_back(None, file, "drive-agent"):
         raise ValueError(error.format(file))
     assert capsys.readouterr().err == ("" if said is None else f"drive-agent: {said.format(file)}\n")
 

@@ -326,7 +326,7 @@ def test_a_machine_that_its_motor_cannot_move_is_drawn_again_fifty_times(sound, 
     )  # fmt: skip
     assert len(drawn) == tries and drawn[0][1:] == (24.0, 3.0)
     assert drawn[0][0] == np.random.default_rng((5, 7)).integers(10**9)
-    with pytest.raises(ExperimentError, match="here: load 'anvil' has no distributions; there are .*inertia"):
+    with pytest.raises(ExperimentError, match=r"here: load 'anvil' has no distributions; there are .*inertia"):
         _draw("here", "tmcm1636", "anvil", "qbl4208", 5, 7)
 
 

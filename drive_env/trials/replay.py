@@ -254,8 +254,8 @@ def fit(
 
     A population Monte Carlo search without likelihood: every machine of `drives` is a candidate. The first round draws
     from the distributions given, the later ones from the best of all so far, as many as `accept` of a round, spread by
-    their own covariance. The accepted machines are those within `slack` times the best distance. Their range is not a confidence
-    interval: it is the set of machines that this log cannot tell from the best one by more than that.
+    their own covariance. The accepted machines are those within `slack` times the best distance. Their range is not a
+    confidence interval: it is the set of machines that this log cannot tell from the best one by more than that.
 
     Args:
         drives: Emulated drives, at least 16 machines; the more the better.
