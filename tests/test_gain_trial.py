@@ -432,6 +432,7 @@ def test_a_move_is_as_long_as_torque_speed_and_travel_allow(inertia, reach, angl
     # A triangle of 60 ms: the speed's peak is twice the mean.
     assert move.acceleration == np.ceil(4.0 * abs(int(move.distance[0])) / 0.06**2)
     assert move.velocity == np.ceil(2.0 * abs(int(move.distance[0])) / 0.06) + 1
+    assert move.share == 1.0  # all of the run current
     assert move.increments == scale and move.counts == MOTOR.encoder_counts / (2.0 * np.pi)
     assert PROFILE * CYCLE == 0.06
 
