@@ -36,3 +36,15 @@ def test_the_draws_are_those_of_the_figures_that_are_published():
     assert bootstrap_interval(mean, values) == (8.571428571428571, 31.714285714285715)
     low, high = bootstrap_interval(lambda x: np.median(x, axis=1), values)
     assert (low, high) == (4.0, 36.0)
+
+
+def test_an_interval_is_of_2000_draws_from_their_40th_to_their_1960th_part():
+    """2.5 and 97.5 % of the values, in order."""
+    shapes = []
+
+    def statistic(anew):
+        shapes.append(anew.shape)
+        return np.arange(2001.0)
+
+    assert bootstrap_interval(statistic, np.arange(7.0)) == (50.0, 1950.0)
+    assert shapes == [(2000, 7)]

@@ -10,13 +10,12 @@ import pytest
 from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.trials.oscillation import OSCILLATION
-from drive_env.trials.positioning import WATCH
 from tuning.auto.fallback_gains import FallbackGains
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 RATED = 4.0  # A
+OSCILLATION, WATCH = 0.4, 25  # of the rated current, cycles
 CALM = np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]])
 
 

@@ -12,9 +12,8 @@ from drive_env.devices import find_device
 from drive_env.motors import MOTORS, find_motor
 from drive_env.trials import gain_trial
 from drive_env.trials.gain_trial import (
+    PHASE_TITLES,
     PHASES,
-    PROBE,
-    RECOVERY,
     Trial,
     Trials,
     clear,
@@ -22,7 +21,7 @@ from drive_env.trials.gain_trial import (
     momentum_balance,
     softness,
 )
-from drive_env.trials.oscillation import OSCILLATION, shakes
+from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
     CYCLE,
     PROFILE,
@@ -42,6 +41,7 @@ from drive_env.trials.score import Terms, cost
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 ENABLED, FAULT = 0x0637, 0x0238
+PROBE, RECOVERY, OSCILLATION = 1.5, 5, 0.4  # of velocity P; attempts; of the rated current
 NAMES = DEVICE.gains.names
 POSITION, DEMAND, CURRENT, STATUS = (
     cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD
@@ -51,6 +51,13 @@ SAFE = np.array([[900, 200, 300, 40, 20]] * 4)
 
 
 # --- moves ---
+def test_a_trial_takes_250_ms_and_its_move_60_whatever_it_turns():
+    """It has settled by 150 ms, when the load comes; the ripple is that of its last 45 ms; watched every 25 ms."""
+    assert (CYCLE, PROFILE, QUIET, SETTLED, TRIAL, WATCH) == (0.001, 60, 105, 150, 250, 25)
+    assert PHASES == ("move", "reversal", "probe")
+    assert PHASE_TITLES == ("move", "reversal", "move with 1.5 times velocity P")
+
+
 def test_the_least_error_of_a_load_step_is_half_a_count_all_the_time():
     """From 150 ms, when the load comes, to the end of the trial at 250 ms; 65,536 counts are a turn."""
     move = plan_move(MOTOR, np.array([1e-5]), np.array([65536]), np.array([10.0]))
@@ -144,6 +151,48 @@ def test_an_axis_that_did_not_move_has_its_rotors_inertia_and_no_friction_below_
     assert (found.coulomb, found.viscous) == (0.0, 0.0)
     huge = np.diff(speed, axis=0, prepend=0.0) / CYCLE * 1e3 * MOTOR.inertia / MOTOR.torque_constant
     assert momentum_balance(angle, speed, huge, MOTOR).inertia == 300.0 * MOTOR.inertia
+
+
+class Moving:
+    """Two axes that stand at 1,000 and -500; what they answer in each record is a parabola, and their current."""
+
+    num_axes, device, time_waits = 2, DEVICE, True
+
+    def __init__(self):
+        self.targets, self.profile = [], None
+
+    def read(self, name):
+        return np.array([1000, -500]) if name == POSITION else np.array([65_536, 32_768])
+
+    def record(self, objects, seconds):
+        t = np.arange(round(seconds / CYCLE))[:, None]
+        sign = 1 if len(self.targets) == 1 else -1
+        way = t**2 * [1.0, -2.0]
+        rows = {POSITION: [1000, -500] + (way if sign == 1 else way[-1] - way), cia402.VELOCITY_ACTUAL: sign * 2.0 * t,
+                CURRENT: sign * t * [1.0, 3.0]}  # fmt: skip
+        return {name: rows[name] for name in objects}
+
+
+@pytest.mark.parametrize(("scale", "ratio"), [(1.0, 1.0), (2.0, 0.5)])
+def test_identification_moves_three_rotors_there_and_back_from_where_the_axes_stand(scale, ratio, monkeypatch):
+    drives, balanced = Moving(), []
+    monkeypatch.setattr(gain_trial, "device_of", lambda drives: DEVICE)
+    monkeypatch.setattr(gain_trial, "ampere_per_count", lambda drives: 1e-3)
+    monkeypatch.setattr(gain_trial, "per_increment", lambda drives, name: scale)
+    monkeypatch.setattr(gain_trial, "write_profile", lambda drives, move, where: setattr(drives, "profile", move))
+    monkeypatch.setattr(gain_trial, "start", lambda drives, target, where: drives.targets.append(target.tolist()))
+    monkeypatch.setattr(gain_trial, "momentum_balance", lambda *arguments: balanced.append(arguments) or "found")
+    reach, where = np.array([50.0, -0.5]), np.array([True, True])
+    assert Trials(drives, MOTOR, 1, 0.004).identify(reach, where)[0] == "found"
+    move = plan_move(MOTOR, np.full(2, 3.0 * MOTOR.inertia), np.array([65_536, 32_768]), reach)
+    assert drives.profile.distance.tolist() == move.distance.tolist()
+    assert drives.targets == [(np.array([1000, -500]) + move.distance).tolist(), [1000, -500]]
+    ((angle, speed, current, motor),) = balanced
+    turn = 2.0 * np.pi
+    np.testing.assert_allclose(angle[100], [1e4 / 65_536 * turn, -2e4 / 32_768 * turn])
+    np.testing.assert_allclose(speed[100], ratio * 200.0 * turn / np.array([65_536, 32_768]))
+    np.testing.assert_allclose(current[[100, TRIAL + 100]], [[0.1, 0.3], [-0.1, -0.3]])
+    assert motor is MOTOR and len(angle) == 2 * TRIAL and angle[-1].tolist() == [0.0, 0.0]
 
 
 # --- trials -----------------------------------------------------------------------------------------------------------
@@ -275,6 +324,40 @@ def test_the_error_of_the_first_phase_and_what_it_adds_up_to(trials):
     np.testing.assert_allclose(found.following[1:], 0.5 * CYCLE)
 
 
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("beyond", [1, -1])
+def test_what_is_beyond_a_target_lies_the_way_of_the_move_and_of_its_reversal(trials, direction, beyond):
+    """By 5 % of the move from 75 to 100 ms; the current alternates by 100 mA all the time."""
+    drives = Played()
+    record = drives.record
+
+    def past(objects, seconds):
+        rows = record(objects, seconds)
+        way = np.sign(MOVE.distance) * direction * (-1 if drives.phase == 1 else 1)
+        if drives.window == 4:
+            rows[POSITION] = rows[POSITION] + np.rint(0.05 * beyond * way * np.abs(MOVE.distance)).astype(int)
+        rows[CURRENT] = np.tile([[100], [0]], (13, 4))[: len(rows[CURRENT])]
+        return rows
+
+    drives.record = past
+    found = run(trials, drives, direction=direction)
+    np.testing.assert_allclose(found.terms.overshoot, 0.05 if beyond > 0 else 0.0, rtol=1e-3)
+    np.testing.assert_allclose(found.terms.settling, 1.0 + WATCH * 1e-3 / 0.004)  # a t_0 of 4 ms
+    # A look begins as the one before it ended: 24 of 25 changes.
+    np.testing.assert_allclose(found.terms.noise, 0.1 / MOTOR.rated_current, rtol=0.05)
+
+
+def test_a_position_beyond_the_counters_end_is_where_it_goes_on(trials, monkeypatch):
+    went = []
+    monkeypatch.setattr(gain_trial, "start", lambda drives, target, where: went.append((target.tolist(), where)))
+    monkeypatch.setattr(gain_trial, "power_up", lambda drives, where: went.append(where))
+    made = trials(Played())
+    made.go(np.array([2**31 + 3, -(2**31) - 3, 5, 2**31 - 1]), "here")
+    made.power_up("there")
+    assert went == [([-(2**31) + 3, 2**31 - 3, 5, 2**31 - 1], "here"), "there"]
+    assert made.leave() is None and made.look is None
+
+
 def test_whoever_looks_is_called_after_every_cycle(trials):
     drives, looks = Played(), []
     made = trials(drives)
@@ -349,6 +432,7 @@ def test_a_move_is_as_long_as_torque_speed_and_travel_allow(inertia, reach, angl
     # A triangle of 60 ms: the speed's peak is twice the mean.
     assert move.acceleration == np.ceil(4.0 * abs(int(move.distance[0])) / 0.06**2)
     assert move.velocity == np.ceil(2.0 * abs(int(move.distance[0])) / 0.06) + 1
+    assert move.share == 1.0  # all of the run current
     assert move.increments == scale and move.counts == MOTOR.encoder_counts / (2.0 * np.pi)
     assert PROFILE * CYCLE == 0.06
 

@@ -10,16 +10,20 @@ from scipy.linalg import expm
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.emulator.loop_trace import trace_loops
-from drive_env.gains import Gains, gains_from_bandwidths, write_gains
+from drive_env.gains import Gains, gains_from_bandwidths, gains_in_si, write_gains
 from drive_env.motors import find_motor
 from tuning.identify.estimate import Estimate, Identification, refused
 from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import (
+    Controllers,
     Plant,
+    controllers,
     current_open_loop,
     exponential,
     mean_velocity,
+    outer_loop,
     position_open_loop,
+    velocity_filter_response,
     velocity_open_loop,
     velocity_plant,
 )
@@ -225,3 +229,119 @@ def test_a_plant_that_cannot_be_is_refused(fields, message):
 def test_frequencies_lie_below_half_the_loops_rate(f):
     with pytest.raises(ValueError, match="below 2500 Hz, half the loop's rate"):
         velocity_open_loop(DEVICE, RIGID, GAINS, f)
+
+
+# --- by hand ----------------------------------------------------------------------------------------------------------
+def test_a_position_loop_around_a_known_velocity_loop_is_the_models_where_that_is():
+    f = np.array([1.0, 20.0, 150.0, 900.0])
+    later = dataclasses.replace(ELASTIC, delay=ELASTIC.delay + 3e-4)
+    for plant in (RIGID, ELASTIC, later):
+        velocity = velocity_open_loop(DEVICE, plant, GAINS, f)
+        np.testing.assert_allclose(
+            outer_loop(DEVICE, plant, GAINS, f, velocity), position_open_loop(DEVICE, plant, GAINS, f), rtol=1e-9
+        )
+    slow = outer_loop(DEVICE, RIGID, GAINS, f[:1], np.array([1e9 + 0j]))  # as fast as can be: an integrator of its gain
+    assert np.abs(slow[0]) == pytest.approx(5.0, rel=1e-2)
+
+
+def test_regulators_are_an_integrator_at_low_and_their_p_at_high_frequencies():
+    """P (1 + I / (1 - 1/z)): at z = -1 it is P (1 + I / 2), near z = 1 it is P I / (j w)."""
+    made = Controllers(2.0, 0.1, 3.0, 0.2, 4.0)
+    z = np.array([-1.0 + 0j, np.exp(1e-4j)])
+    np.testing.assert_allclose(made.current(z), [2.0 * 1.05, 2.0 * 0.1 / 1e-4j], rtol=2e-3)
+    np.testing.assert_allclose(made.velocity(z), [3.0 * 1.1, 3.0 * 0.2 / 1e-4j], rtol=2e-3)
+
+
+def test_raw_gains_are_regulators_of_the_cascade():
+    found = controllers(DEVICE, GAINS)
+    si = gains_in_si(DEVICE, 24.0, GAINS)
+    assert found.velocity_p == pytest.approx(si.velocity_p) and found.position == pytest.approx(TWO_PI * 5.0, rel=0.01)
+    # The sample time over the integration time is the share of P e that is added in each.
+    assert found.velocity_i == pytest.approx(1.0 / DEVICE.velocity_rate / si.velocity_integration)
+
+
+@pytest.mark.parametrize("corner", [150.0, 400.0])
+def test_the_velocity_filter_is_of_second_order_with_the_delay_that_an_axis_has_besides(corner):
+    plant = dataclasses.replace(RIGID, velocity_filter=corner, delay=RIGID.delay + 5e-4)
+    f = np.array([1e-6, corner, 2499.999])
+    found = velocity_filter_response(DEVICE, plant, f)
+    assert found[0] == pytest.approx(1.0) and abs(found[1]) == pytest.approx(math.sqrt(0.5), rel=0.02)
+    assert abs(found[2]) < 1e-6
+    alone = velocity_filter_response(DEVICE, dataclasses.replace(plant, delay=RIGID.delay), f)
+    np.testing.assert_allclose(found[1] / alone[1], np.exp(-1j * TWO_PI * corner * 5e-4))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, None),
+        ({"R": math.inf}, "R must be above 0 and finite, not inf"),
+        ({"L": 0.0}, "L must be above 0 and finite, not 0"),
+        ({"supply": -1.0}, "supply must be above 0 and finite, not -1"),
+        ({"torque_constant": math.nan}, "torque_constant must be above 0 and finite, not nan"),
+        ({"velocity_filter": 0.0}, "velocity_filter must be above 0"),
+        ({"anti_resonance": 80.0, "resonance": 80.0}, "the anti-resonance, 80 Hz, must lie above 0 and below the res"),
+        ({"anti_resonance": 0.0, "resonance": 80.0}, "the anti-resonance, 0 Hz, must lie above 0"),
+        ({"anti_resonance": -1.0, "resonance": 80.0}, "must lie above 0"),
+        ({"anti_resonance": 80.0}, None),
+        ({"resonance": 80.0}, None),
+    ],
+)
+def test_what_an_axis_can_be(fields, message):
+    if message is None:
+        plant = dataclasses.replace(RIGID, **fields)
+        assert not plant.is_elastic and plant.rotor_inertia == RIGID.inertia
+        return
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(RIGID, **fields)
+
+
+def test_what_an_axis_is_unless_it_is_known_better():
+    plant = Plant(1.0, 1e-3, 24.0, 0.1, 1e-5)
+    assert (plant.viscous, plant.anti_resonance, plant.resonance, plant.damping) == (0.0, math.inf, math.inf, 0.02)
+    assert (plant.delay, plant.velocity_filter, plant.counts) == (200e-6, 400.0, 4096) and math.isnan(
+        plant.emf_constant
+    )
+    assert ELASTIC.rotor_inertia == pytest.approx(1.5e-5 * (80.0 / 140.0) ** 2)
+    assert (RIGID.R, RIGID.L, RIGID.torque_constant) == (MOTOR.R_s, MOTOR.L_q, MOTOR.torque_constant)
+    assert RIGID.emf_constant == MOTOR.n_p * MOTOR.psi_m
+    # Without one it is that of a PMSM: two thirds of the torque constant.
+    f = np.array([3.0, 50.0])
+    own = dataclasses.replace(RIGID, emf_constant=RIGID.torque_constant / 1.5)
+    none = dataclasses.replace(RIGID, emf_constant=math.nan)
+    np.testing.assert_allclose(mean_velocity(DEVICE, none, GAINS, f), mean_velocity(DEVICE, own, GAINS, f))
+
+
+def test_what_was_identified_counts():
+    found = estimates(inertia=2e-5, inductance=3e-4, loop_delay=3e-4, velocity_filter=250.0, damping=0.07, viscous=-1.0,
+                      anti_resonance=70.0)  # fmt: skip
+    plant = Plant.from_identification(DEVICE, MOTOR, 30.0, found)
+    assert (plant.supply, plant.L, plant.delay, plant.velocity_filter, plant.damping) == (30.0, 3e-4, 3e-4, 250.0, 0.07)
+    assert plant.viscous == 0.0 and not plant.is_elastic and plant.anti_resonance == math.inf  # half a pair is none
+    with pytest.raises(ValueError, match="the axis has no identified inertia: it was not measured"):
+        Plant.from_identification(DEVICE, MOTOR, 24.0, estimates(resistance=0.4))
+
+
+@pytest.mark.parametrize("loop", [current_open_loop, velocity_open_loop, position_open_loop, velocity_plant])
+def test_a_response_has_frequencies_up_to_half_its_loops_rate(loop):
+    rate = DEVICE.current_rate if loop is current_open_loop else DEVICE.velocity_rate
+    assert np.isfinite(loop(DEVICE, RIGID, GAINS, [1e-3, 0.499 * rate])).all()
+    assert loop(DEVICE, RIGID, GAINS, []).shape == (0,)
+    for f in ([0.5 * rate], [-1.0], [0.0]):
+        with pytest.raises(ValueError, match=f"above 0 and below {0.5 * rate:g} Hz"):
+            loop(DEVICE, RIGID, GAINS, f)
+
+
+def test_what_is_handed_out_to_every_caller_cannot_be_changed():
+    found = mean_velocity(DEVICE, RIGID, GAINS, np.array([10.0]))
+    with pytest.raises(ValueError, match="read-only"):
+        found[0] = 0.0
+
+
+@pytest.mark.parametrize("size", [0.0, 0.49, 0.5, 0.51, 1.0, 2.0, 31.0])
+def test_the_exponential_of_a_diagonal_is_that_of_its_entries(size):
+    assert exponential(np.diag([size, -size])) == pytest.approx(np.diag([math.exp(size), math.exp(-size)]), rel=1e-13)
+    turn = exponential(np.array([[0.0, -size], [size, 0.0]]))
+    assert turn == pytest.approx(
+        np.array([[math.cos(size), -math.sin(size)], [math.sin(size), math.cos(size)]]), abs=1e-12
+    )

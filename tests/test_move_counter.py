@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuning.move_counter import REST, MoveCounter
+from tuning.move_counter import MoveCounter
+
+REST = 20  # cycles of standstill that end a move
 
 FAST, STRONG = 1_000_000.0, 5000.0  # pps, mA: what axes may be moved with; 0.2 % and 2 % of it is none yet
 POSITION, SPEED, SPEED_OFFSET, TORQUE, WORD = (0x607A, 0), (0x60FF, 0), (0x60B1, 0), (0x6071, 0), (0x6040, 0)

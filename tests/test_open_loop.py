@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from drive_env.motors import find_motor
 from drive_env.phase_current import amplitude, holding_torque, swing_period
 from drive_env.trials import open_loop as module
 from drive_env.trials.gain_trial import Identified, Trials
-from drive_env.trials.method import FIRST_HZ, SAFE_RULE, Cascade, OpenLoop, check_tried, method_of
+from drive_env.trials.method import FIRST_HZ, SAFE_RULE, Cascade, OpenLoop, check_tried, method_of, new_score
 from drive_env.trials.open_loop import (
     LONGEST_ROLL,
     OpenLoopTerms,
@@ -26,7 +27,8 @@ from drive_env.trials.open_loop import (
     unmeasured,
     with_run_current,
 )
-from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move
+from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, WATCH, Move, highest_ramp, plan_move
+from drive_env.trials.rotor_swing import FreeSwing
 from drive_env.trials.score import Terms, cost
 
 STEPPER, STEPPER_MOTOR = find_device("tmcm3313"), find_motor("qsh4218_51")
@@ -88,6 +90,13 @@ def test_the_band_in_which_an_axis_has_settled(distance, counts, full_step, widt
     position = np.full((TRIAL, 1), distance - 0.5 * width)
     found = open_loop_terms(position, np.zeros((TRIAL, 1)), move, 0.09, np.array([distance]), np.array([1]), full_step)
     assert found[0] == pytest.approx(1.5)
+
+
+def test_a_move_of_nothing_has_overshot_by_increments():
+    still = MOVE._replace(distance=np.array([0]))
+    position = np.where(np.arange(TRIAL) == 30, 3.0, 0.0)[:, None]
+    found = open_loop_terms(position, 0 * position, still, 0.01, np.array([0]), np.array([1]), FULL_STEP)
+    assert found[2] == pytest.approx(3.0)
 
 
 def test_vibration_is_of_the_profile_and_the_load_angle_of_the_move():
@@ -159,7 +168,7 @@ def test_what_6077h_is_in_open_loop():
 class Counters:
     """Drives whose step counter and encoder are what a test says."""
 
-    time_waits = True
+    time_waits, scale = True, 51200
 
     def __init__(self, demand, encoder):
         self.num_axes, self.device = len(demand), STEPPER
@@ -171,7 +180,7 @@ class Counters:
             self.encoder = self.encoder + (100 if self.rolling > 0 else 0)
             self.rolling -= 1
         return {cia402.POSITION_DEMAND: self.demand, cia402.POSITION_ACTUAL: self.encoder}.get(
-            name, np.full(self.num_axes, 51200)
+            name, np.full(self.num_axes, self.scale)
         )
 
     def advance(self, seconds):
@@ -187,6 +196,16 @@ def test_whole_teeth_are_made_up_for_and_what_a_load_turns_the_rotor_by_is_not()
     assert trials.shift().tolist() == [10 + 0, -5 + 0]  # 510 and 495: less than half a tooth more
     drives.demand = np.array([1000 + 1024 + 300, -2048 - 300])
     assert trials.shift().tolist() == [10 + 1024, -5 - 2048]
+
+
+def test_a_tooth_need_not_be_a_whole_number_of_increments():
+    """Of 51,230 a turn it is 1,024.6: a hundred of them are 102,460."""
+    drives = Counters([0], [0])
+    drives.scale = 51_230
+    trials = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    assert trials.shift().tolist() == [0]
+    drives.demand = np.array([102_460])
+    assert trials.shift().tolist() == [102_460]
 
 
 @pytest.mark.parametrize(("rolling", "looks"), [(0, 1), (6, 4), (10**6, LONGEST_ROLL)])
@@ -257,6 +276,8 @@ def test_an_encoder_must_show_a_quarter_of_the_move(way, moved):
     with pytest.raises(RuntimeError, match="axis 1: the encoder showed 2499 of 10000 increments of a move at"):
         trials._check_moved(position, move, both)
     trials._check_moved(position, move, np.array([True, False]))
+    with pytest.raises(RuntimeError, match="axis 0: the encoder showed 0 of 10000"):
+        trials._check_moved(0 * position, move, both)
 
 
 @pytest.mark.parametrize(("window", "loop"), [((0, 0), (0, 0)), ((500, 0), (1, 0)), ((500, 500), (1, 1))])
@@ -295,6 +316,417 @@ def test_sensor_window_and_loop_are_what_they_were_afterwards(window, loop, monk
     log.clear()
     trials.leave()
     assert not log
+
+
+# --- a trial, on drives whose field and rotor are what a test says ----------------------------------------------------
+NEAR, FAR = 500, 512  # increments; two full steps are 512
+TRIED, KEPT = gains([200] * 4, [100] * 4), gains([150] * 4, [90] * 4)
+FOUR = Move(
+    np.array([10_000, -10_000, 10_000, 10_000]), np.ones(4, int), np.ones(4, int), np.full(4, 51200 / (2 * np.pi)),
+    51200 / (2 * np.pi),
+)  # fmt: skip
+
+
+class Played:
+    """Drives that stand at the target of their phase, ahead of or behind it as a test says.
+
+    `lag` and `over`: (phase, window) -> increments of each axis, of the field before the rotor, and of the rotor beyond
+    its target. `faults`: (phase, window) -> axes.
+    """
+
+    num_axes, device, time_waits = 4, STEPPER, True
+
+    def __init__(self, lag=None, over=None, faults=None):
+        self.lag, self.over, self.faults = lag or {}, over or {}, faults or {}
+        self.phase, self.window, self.target = -1, 0, np.zeros(4)
+        self.log, self.targets = [], []
+
+    def read(self, name):
+        if name is module.Role.POSITION_SCALE:
+            return np.full(4, 51200)
+        return np.full(4, 7) if name == cia402.POSITION_DEMAND else np.zeros(4)  # the counter has 7 more
+
+    def write(self, name, value, *, where):
+        self.log.append((self.phase, self.window, name, value, where.tolist()))
+
+    def record(self, objects, seconds):
+        rows, place = round(seconds / 1e-3), (self.phase, self.window)
+        self.window += 1
+        status = np.full((rows, 4), 0x0637)
+        status[-1, self.faults.get(place, [])] = 0x0238
+        encoder = np.tile(self.target + np.asarray(self.over.get(place, 0)), (rows, 1))
+        field = encoder + 7 + np.asarray(self.lag.get(place, 0))
+        return {
+            cia402.POSITION_ACTUAL: encoder, cia402.POSITION_DEMAND: field, cia402.STATUSWORD: status,
+        }  # fmt: skip
+
+
+@pytest.fixture
+def trial(monkeypatch):
+    """Run a trial of two machines of two axes; return it, the drives, and the gains as they were written."""
+    monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
+    monkeypatch.setattr(module, "write_profile", lambda drives, move, where: None)
+
+    def run(where=None, direction=1, tried=TRIED, **played):
+        drives, written = Played(**played), []
+        monkeypatch.setattr(
+            module, "write_gains", lambda drives, gains, where: written.append((gains.tolist(), where.tolist()))
+        )
+
+        def start(drives, target, where):
+            drives.phase, drives.window, drives.target = drives.phase + 1, 0, target - 7
+            drives.targets.append(target.tolist())
+
+        monkeypatch.setattr(module, "start", start)
+        monkeypatch.setattr(module, "clear", lambda drives, down: drives.log.append(("clear", down.tolist())))
+        made = OpenLoopTrials(drives, STEPPER_MOTOR, 2, 0.01)
+        monkeypatch.setattr(made, "_come_to_rest", lambda step: (
+            drives.log.append(("rest", drives.phase, step.tolist())), setattr(made, "_fell", False),
+        ))  # fmt: skip
+        origin, part = np.full(4, 100), np.ones(4, bool) if where is None else np.array(where)
+        found = made.run(tried, KEPT, FOUR, origin, np.full(4, direction), part)
+        return found, drives, written
+
+    return run
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_trial_moves_there_back_and_there_again_with_less_current(trial, direction):
+    """Targets of the step counter are those of the encoder and the 7 that it has more."""
+    found, drives, written = trial(direction=direction)
+    away = (100 + direction * FOUR.distance).tolist()
+    assert drives.targets == [[7 + t for t in away], [107] * 4, [7 + t for t in away]]
+    probe = with_run_current(STEPPER, TRIED, 0.8)
+    assert probe[0, RUN] == 160
+    assert [gains for gains, _ in written] == [TRIED.tolist(), TRIED.tolist(), probe.tolist()]
+    assert not found.aborted.any() and not found.lost.any() and not found.culprit.any() and drives.log == []
+    expected = [effort(STEPPER, STEPPER_MOTOR, used) for used in (TRIED, TRIED, probe)]
+    np.testing.assert_allclose(found.terms.effort, expected)
+    for values, value in ((found.terms.settling, 1.0), (found.terms.disturbance, 1.0), (found.terms.noise, 0.0)):
+        np.testing.assert_allclose(values, np.full((3, 4), value))
+    np.testing.assert_allclose(found.following, 0.5e-3)  # half of the move for one cycle is the least
+    assert found.error.shape == (TRIAL, 4) and not found.error.any() and not found.terms.tripped.any()
+
+
+def test_what_a_trial_shows_of_the_field_before_its_rotor(trial):
+    """Axis 1 goes backwards; a lag of 256 increments is a full step, and of a move of 10,000 0.0256."""
+    everywhere = {(phase, k): [256, -128, 0, 0] for phase in range(3) for k in range(10)}
+    found, _, _ = trial(lag=everywhere)
+    np.testing.assert_allclose(found.terms.load_angle, [[1.0, 0.5, 0.0, 0.0]] * 3)
+    np.testing.assert_allclose(found.error[:, :2], [[0.0256, -0.0128]] * TRIAL)
+    np.testing.assert_allclose(found.following[:, 0], 0.0256 * TRIAL * 1e-3)
+    early, _, _ = trial(lag={(0, 4): [256] * 4})
+    np.testing.assert_allclose(early.error[100 : 100 + WATCH], 0.0256)
+    later, _, _ = trial(lag={(1, 4): [256] * 4})
+    assert not later.error.any()
+    np.testing.assert_allclose(later.terms.load_angle[:, 2], [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(later.following[:, 0], [0.5e-3, 0.0256 * WATCH * 1e-3, 0.5e-3])
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_what_is_beyond_a_target_lies_the_way_of_the_move_and_of_its_reversal(trial, direction):
+    way = direction * np.sign(FOUR.distance)
+    beyond, _, _ = trial(direction=direction, over={(0, 3): 500 * way, (1, 3): -300 * way, (2, 3): 200 * way})
+    np.testing.assert_allclose(beyond.terms.overshoot, np.tile([[0.05], [0.03], [0.02]], 4))
+    short, _, _ = trial(direction=direction, over={(0, 3): -500 * way, (1, 3): 300 * way, (2, 3): -200 * way})
+    assert not short.terms.overshoot.any()
+    settled = [1.0 + 1.0 * WATCH * 1e-3 / 0.01] * 4  # 5, 3 and 2 % are out of the band of 1 %
+    np.testing.assert_allclose(beyond.terms.settling, [settled] * 3)
+
+
+def test_an_axis_that_loses_steps_stops_its_machine_which_gets_its_currents_back(trial):
+    """Two full steps between field and rotor are none yet; the rotor is waited for before the next phase."""
+    found, drives, written = trial(lag={(0, 4): [FAR, FAR, FAR + 1, NEAR]})
+    assert found.culprit.tolist() == [False, False, True, False]
+    assert found.aborted.tolist() == [[False, False, True, True]] * 3
+    assert found.lost.tolist() == [[False, False, True, False], [False] * 4, [False] * 4]
+    assert written[1] == (KEPT.tolist(), [False, False, True, True])
+    mixed = [*TRIED[:2].tolist(), *KEPT[2:].tolist()]
+    assert [gains for gains, where in written[2:]] == [mixed, [*with_run_current(STEPPER, TRIED, 0.8)[:2].tolist(),
+                                                               *KEPT[2:].tolist()]]  # fmt: skip
+    halted = (0, 5, cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, [False, False, True, True])
+    assert drives.log == [halted, ("rest", 0, [pytest.approx(256.0)] * 4)]
+    np.testing.assert_allclose(found.terms.effort[1, 2:], effort(STEPPER, STEPPER_MOTOR, KEPT)[2:])
+
+
+def test_an_axis_that_goes_on_losing_steps_is_halted_again_and_blamed_once(trial):
+    found, drives, _ = trial(lag={(0, 4): [FAR + 1] * 4, (0, 6): [-FAR - 1, 0, 0, 0], (2, 9): [0, FAR + 1, 0, 0]})
+    assert found.culprit.all() and found.aborted.all()
+    assert found.lost.tolist() == [[True] * 4, [False] * 4, [False, True, False, False]]
+    halts = [(entry[0], entry[1], entry[4]) for entry in drives.log if entry[0] != "rest"]
+    assert halts == [
+        (0, 5, [True] * 4), (0, 7, [True, False, False, False]), (2, 10, [False, True, False, False])
+    ]  # fmt: skip
+    assert [entry[1] for entry in drives.log if entry[0] == "rest"] == [0]  # not again when it has come to rest
+
+
+def test_an_axis_in_fault_is_cleared_and_has_lost_no_steps(trial):
+    found, drives, written = trial(faults={(1, 2): [0]})
+    assert found.culprit.tolist() == [True, False, False, False] and not found.lost.any()
+    assert found.aborted.tolist() == [[False] * 4, [True, True, False, False], [True, True, False, False]]
+    assert written[2] == (KEPT.tolist(), [True, True, False, False])
+    # Its neighbour is stopped with it; what is in fault takes no halt.
+    halted = (1, 3, cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, [False, True, False, False])
+    assert drives.log == [halted, ("clear", [True, False, False, False])]
+
+
+def test_who_takes_no_part_is_neither_stopped_nor_blamed(trial):
+    found, drives, written = trial([True, True, False, False], lag={(0, 1): [0, 0, FAR + 1, 0]}, faults={(0, 2): [3]})
+    assert not found.aborted.any() and not found.lost.any() and not found.culprit.any() and drives.log == []
+    assert all(where == [True, True, False, False] for _, where in written)
+
+
+def test_a_move_of_nothing_counts_over_an_increment(trial, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "FOUR", FOUR._replace(distance=np.array([0, 1, 2, 0])))
+    found, _, _ = trial(lag={(0, 4): [8] * 4})
+    assert found.error[100].tolist() == [8.0, 8.0, 4.0, 8.0]
+
+
+def test_positions_of_a_trial_go_over_the_counters_end():
+    drives = Counters([2**31 - 5], [2**31 - 10])
+    trials = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    started = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "start", lambda drives, target, where: started.append((target.tolist(), where)))
+        trials.go(np.array([2**31 - 3]), "here")
+    assert started == [([-(2**31) + 2], "here")]
+
+
+# --- the free swing ---------------------------------------------------------------------------------------------------
+class Swinging:
+    """A drive of two axes that answers to where it is sent; what a profile of it had before is 11, 22 and 33."""
+
+    num_axes, time_waits = 2, True
+
+    def __init__(self, scale):
+        self.log, self.at, self.scale = [], np.zeros(2), scale
+
+    def read(self, name):
+        if name is module.Role.POSITION_SCALE:
+            return np.full(2, self.scale)
+        old = {cia402.PROFILE_VELOCITY: 11, cia402.PROFILE_ACCELERATION: 22, cia402.PROFILE_DECELERATION: 33}
+        return np.full(2, old[name]) if name in old else self.at.copy()
+
+    def write(self, name, value, *, where):
+        self.log.append((name, value.tolist(), where.tolist()))
+
+    def advance(self, seconds):
+        self.log.append(("advance", seconds))
+
+    def record(self, objects, seconds):
+        self.log.append(("record", seconds))
+        rows = np.arange(3)[:, None] * [10.0, 20.0] + self.at
+        return {cia402.POSITION_ACTUAL: rows, cia402.POSITION_DEMAND: 2.0 * rows}
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "speed", "steep"),
+    [
+        ("tmcm3313", 51_200, 256_000, 0.95 * (2**32 - 1)),  # of 256 * 2e7
+        ("tmcm6212", 51_200, 256_000, 0.95 * 7_629_278),
+        ("tmcm3313", 800, 4_000, 4 * 2e7),
+        ("tmcm6212", 3_200_000, 0.95 * 7_999_511, 0.95 * 7_629_278),
+    ],
+)
+def test_a_rotor_swings_after_a_quarter_of_a_full_step_here_and_half_a_full_step_on(
+    name, scale, speed, steep, monkeypatch
+):
+    """Its profile has 1,000 full steps/s and 2e7 full steps/s^2 or what the drive takes, and is what it was then."""
+    device = find_device(name)
+    drives, swung = Swinging(scale), []
+    monkeypatch.setattr(module, "device_of", lambda drives: device)
+    monkeypatch.setattr(module, "per_increment", lambda drives, name: 1.0)
+    monkeypatch.setattr(module, "inertia_of_swings", lambda *arguments: swung.append(arguments) or "inertia")
+
+    def start(drives, target, where):
+        drives.log.append(("go", target.tolist(), where.tolist()))
+        drives.at = target.astype(float)
+
+    monkeypatch.setattr(module, "start", start)
+    move = Move(np.array([10, -10]), None, None, np.full(2, scale / (2 * np.pi)), 1.0)
+    where, held = np.array([True, False]), np.array([0.2, 0.3])
+    made = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    assert made._swing(np.array([1000, 2000]), move, where, held) == "inertia"
+    yes = where.tolist()
+    quarters = [[1000 + k * scale // 800, 2000 - k * scale // 800] for k in range(4)]
+    assert drives.log == [
+        (cia402.PROFILE_VELOCITY, [int(speed)] * 2, yes),
+        (cia402.PROFILE_ACCELERATION, [int(steep)] * 2, yes),
+        (cia402.PROFILE_DECELERATION, [int(steep)] * 2, yes),
+        ("go", quarters[0], yes), ("advance", 0.1), ("go", quarters[1], yes), ("record", 0.1),
+        ("go", quarters[2], yes), ("advance", 0.1), ("go", quarters[3], yes), ("record", 0.1),
+        ("go", quarters[0], yes), ("advance", 0.1),
+        (cia402.PROFILE_VELOCITY, [11, 11], yes),
+        (cia402.PROFILE_ACCELERATION, [22, 22], yes),
+        (cia402.PROFILE_DECELERATION, [33, 33], yes),
+    ]  # fmt: skip
+    ((demand, position, torque, age, motor),) = swung
+    way = np.arange(3)[:, None] * np.array([10.0, 20.0]) * 2.0 * np.pi / scale
+    np.testing.assert_allclose(position, [way, way])
+    np.testing.assert_allclose(demand, [2.0 * way, 2.0 * way])
+    assert torque is held and motor is STEPPER_MOTOR and age == 1.0 / device.velocity_rate
+
+
+ORIGIN = np.array([1000, -500])
+
+
+class Recorded:
+    """Drives whose encoder and step counter are two records."""
+
+    num_axes, time_waits = 2, True
+
+    def __init__(self, records):
+        self.records, self.log = list(records), []
+
+    def read(self, name):
+        return np.full(2, 51200) if name is module.Role.POSITION_SCALE else ORIGIN
+
+    def advance(self, seconds):
+        self.log.append(seconds)
+
+    def record(self, objects, seconds):
+        position, demand = self.records.pop(0)
+        return {cia402.POSITION_ACTUAL: position, cia402.POSITION_DEMAND: demand}
+
+
+@pytest.fixture
+def identified(monkeypatch):
+    """Identify two axes by records; return what is balanced, and what is found with the swing that is given."""
+    calls, swings, starts = [], [], []
+
+    def run(swing, reach=(1.0, 1.0), where=(True, True)):
+        t = np.arange(TRIAL)[:, None]
+        there = np.minimum(t, 100) ** 2 * [1.0, 0.5]
+        back = there[-1] - there
+        drives = Recorded([(ORIGIN + there, ORIGIN + there + 30.0), (ORIGIN + back, ORIGIN + back - 30.0)])
+        monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
+        monkeypatch.setattr(module, "read_gains", lambda drives: gains([100, 200], [250, 250]))
+        monkeypatch.setattr(module, "write_profile", lambda drives, move, where: starts.append(move))
+        monkeypatch.setattr(module, "start", lambda drives, target, where: starts.append(target.tolist()))
+
+        def balance(angle, speed, current, motor, inertia=None):
+            calls.append((angle, speed, current, inertia))
+            one = np.ones(2)
+            if inertia is not None:
+                return Identified(inertia, 5.0 * one, 6.0 * one, 7.0 * one)
+            return Identified(1e-4 * one, 1.0 * one, 2.0 * one, 3.0 * one)
+
+        def swing_of(self, origin, move, where, held):
+            swings.append((where.tolist(), move, held))
+            return FreeSwing(np.array(swing[0]), np.array(swing[1]))
+
+        monkeypatch.setattr(module, "momentum_balance", balance)
+        monkeypatch.setattr(OpenLoopTrials, "_swing", swing_of)
+        found, origin = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01).identify(np.array(reach), np.array(where))
+        assert origin.tolist() == ORIGIN.tolist() and drives.log == [0.02]
+        return [value.tolist() for value in found], calls, swings
+
+    run.starts = starts
+    return run
+
+
+def test_identification_moves_three_rotors_there_and_back(identified):
+    identified(([1e-6, 1e-6], [0.0, 0.0]), reach=(50.0, -0.5))
+    most = highest_ramp(STEPPER)
+    move = plan_move(STEPPER_MOTOR, np.full(2, 3.0 * STEPPER_MOTOR.inertia), 51200, np.array([50.0, -0.5]), most)
+    planned, there, back = identified.starts
+    assert planned.distance.tolist() == move.distance.tolist() and planned.acceleration.tolist() == (
+        move.acceleration.tolist()
+    )
+    assert (there, back) == ((ORIGIN + move.distance).tolist(), ORIGIN.tolist())
+
+
+def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identified):
+    """Half a period after what the encoder says, the lag is 30 increments less the way of a period of 0.2 ms."""
+    _, calls, _ = identified(([1e-6, 1e-6], [0.0, 0.0]))
+    angle, speed, current, inertia = calls[0]
+    to_rad = 2.0 * np.pi / 51200
+    np.testing.assert_allclose(angle[40], [1600 * to_rad, 800 * to_rad])
+    np.testing.assert_allclose(speed[40], [80e3 * to_rad, 40e3 * to_rad])
+    assert inertia is None and angle.shape == (2 * TRIAL, 2)
+    held = holding_torque(STEPPER_MOTOR, amplitude(STEPPER, np.array([100, 200])))
+    age = 1.0 / STEPPER.velocity_rate
+    for row, sign, rates in ((40, 1, (80e3, 78e3)), (TRIAL + 40, -1, (-80e3, -78e3))):
+        torque = [held * np.sin(50 * to_rad * (sign * 30.0 - rate * np.array([1.0, 0.5]) * age)) for rate in rates]
+        np.testing.assert_allclose(current[row], 0.5 * (torque[0] + torque[1]) / STEPPER_MOTOR.torque_constant)
+
+
+FULL = 2.0 * np.pi / 200.0  # rad, a full step
+
+
+@pytest.mark.parametrize(
+    ("reach", "swung"), [((1.49 * FULL, -1.51 * FULL), [False, True]), ((1.4 * FULL, -1.4 * FULL), None)]
+)
+def test_an_axis_without_room_of_one_and_a_half_full_steps_does_not_swing(identified, reach, swung):
+    found, calls, swings = identified(([1e-6, 2e-6], [0.9, 0.9]), reach=reach)
+    assert [where for where, *_ in swings] == ([] if swung is None else [swung])
+    # The move to the ends of such a way is so short that even a light rotor takes little of the torque.
+    assert found[0] == [1e-4, 1e-4 if swung is None else 2e-6] and len(calls) == (1 if swung is None else 2)
+
+
+def test_an_axis_that_takes_no_part_does_not_swing(identified):
+    found, _, swings = identified(([1e-6, 2e-6], [0.9, 0.9]), where=(True, False))
+    assert [where for where, *_ in swings] == [[True, False]]
+    assert found == [[1e-6, 1e-4], [5.0, 1.0], [6.0, 2.0], [7.0, 3.0]]
+
+
+@pytest.mark.parametrize(
+    ("share", "explained", "trusted"),
+    [(0.29, 0.86, True), (0.31, 0.86, False), (0.29, 0.85, False), (0.29, 0.2, False)],
+)
+def test_the_swing_of_a_light_load_is_trusted_where_it_explains_what_was_seen(identified, share, explained, trusted):
+    """Light is what takes less than 0.3 of the holding torque in the ramp: a heavier one's ramp says more."""
+    _, _, swings = identified(([1e-6, 1e-6], [0.0, 0.0]))
+    _, move, held = swings[0]
+    inertia = share * held * move.increments / move.acceleration
+    found, calls, _ = identified((inertia.tolist(), [explained] * 2))
+    np.testing.assert_allclose(found[0], inertia if trusted else [1e-4] * 2)
+    assert found[1] == ([5.0] * 2 if trusted else [1.0] * 2)
+    if trusted:
+        np.testing.assert_allclose(calls[-1][3], inertia)
+
+
+# --- before and after a trial -----------------------------------------------------------------------------------------
+def test_an_axis_that_is_on_is_switched_off_before_its_sensor_is_another(monkeypatch):
+    """606Ah takes no value while an axis is enabled; one by its encoder already is left alone."""
+    log = []
+    monkeypatch.setattr(module, "device_of", lambda drives: SimpleNamespace(roles={}))
+    monkeypatch.setattr(Trials, "recover", lambda self, where: log.append(("recover", where.tolist())))
+    monkeypatch.setattr(module.motion, "disable", lambda drives, where: log.append(("off", where.tolist())))
+    values = {cia402.SENSOR_SELECTION: np.array([1, 1, 0, 1]), cia402.FOLLOWING_WINDOW: np.zeros(4, int),
+              cia402.STATUSWORD: np.array([0x0637, 0x0240, 0x0637, 0x0637])}  # fmt: skip
+    drives = SimpleNamespace(
+        num_axes=4, read=lambda name: values[name],
+        write=lambda name, value, where=None: log.append((name, value, where.tolist())),
+    )  # fmt: skip
+    trials = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    trials.recover(np.array([True, True, True, False]))
+    assert log == [
+        ("off", [True, False, False, False]),
+        (cia402.SENSOR_SELECTION, 0, [True, True, False, False]),
+        ("recover", [True, True, True, False]),
+    ]
+    log.clear()
+    values[cia402.STATUSWORD][:] = 0x0240
+    trials.recover(np.array([True, False, False, False]))
+    assert log[0] == (cia402.SENSOR_SELECTION, 0, [True, False, False, False]) and len(log) == 2
+    monkeypatch.setattr(Trials, "power_up", lambda self, where: log.append(("on", where.tolist())))
+    log.clear()
+    trials.power_up(np.array([True, False, False, True]))
+    assert log == [(cia402.SENSOR_SELECTION, 0, [True, False, False, True]), ("on", [True, False, False, True])]
+
+
+@pytest.mark.parametrize(("way", "waits"), [(63, 1), (64, LONGEST_ROLL), (-64, LONGEST_ROLL)])
+def test_a_rotor_that_moves_by_less_than_a_quarter_of_a_full_step_in_20_ms_is_at_rest(way, waits):
+    waited, at = [], [0]
+
+    def read(name):
+        at[0] += way if waited else 0
+        return np.array([0, len(waited) * way])
+
+    drives = SimpleNamespace(read=read, num_axes=2, advance=waited.append)
+    OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)._come_to_rest(np.full(2, 256.0))
+    assert waited == [0.02] * waits
 
 
 # --- methods ----------------------------------------------------------------------------------------------------------
@@ -397,3 +829,61 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
     with pytest.raises(ValueError, match="none has no gains of a velocity or position loop and no phase currents"):
         check_tried(none, ())
     check_tried(none, ("anything",))
+
+
+def test_the_times_of_a_cascade_are_four_times_its_small_time_constants():
+    """1/(2 pi 1000 Hz) + 1.5 of 40 us + 1.4/(2 pi 400 Hz) + 200 us."""
+    small = 1.0 / (2.0 * np.pi * 1000.0) + 60e-6 + 1.4 / (2.0 * np.pi * 400.0) + 200e-6
+    assert method_of(SERVO, SERVO_MOTOR).t_0() == pytest.approx(4.0 * small, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["tmcm1636", "tmcm6212"])
+def test_a_move_is_planned_for_what_was_identified_within_what_the_drive_takes(name):
+    device = find_device(name)
+    motor = find_motor(device.default_motor)
+    light = Identified(np.array([1.01 * motor.inertia, 40.0 * motor.inertia]), *np.zeros((3, 2)))
+    reach = np.array([100.0, -1.0])
+    found = method_of(device, motor).plan(light, 51_200, reach)
+    expected = plan_move(motor, light.inertia, 51_200, reach, highest_ramp(device))
+    assert found.distance.tolist() == expected.distance.tolist()
+    assert found.acceleration.tolist() == expected.acceleration.tolist()
+
+
+@pytest.mark.parametrize(
+    ("device", "gains", "kind"),
+    [
+        ("tmcm1636", (), "RobustScore"), ("tmcm6212", (), "OpenLoopScore"),
+        ("tmcm3313", ("run_current",), "OpenLoopScore"),
+        ("tmcm3313", ("correction_velocity_p",), "ClosedLoopScore"), ("tmcm3313", ("pid_p",), "PidScore"),
+    ],
+)  # fmt: skip
+def test_which_score_gains_of_a_device_have(device, gains, kind, monkeypatch):
+    made = []
+
+    def noted(name):
+        return lambda *arguments, **options: made.append((name, arguments, options)) or name
+
+    for place, name in (
+        ("method", "RobustScore"), ("open_loop_score", "OpenLoopScore"), ("closed_loop_score", "ClosedLoopScore"),
+        ("position_pid_score", "PidScore"),
+    ):  # fmt: skip
+        monkeypatch.setattr(f"drive_env.trials.{place}.{name}", noted(name))
+    assert new_score(device, "load", "motor", 3, gains=gains, repeats=2) == kind
+    ((name, arguments, options),) = made
+    assert name == kind and arguments == (device, "load", "motor", 3) and options["repeats"] == 2
+    assert ("loop" in options) == (kind == "PidScore") and (kind != "PidScore" or options["loop"].mode == 2)
+
+
+def test_gains_of_no_loop_close_none():
+    known = STEPPER
+    assert type(method_of(known, STEPPER_MOTOR, ("run_current",))) is OpenLoop
+    with pytest.raises(
+        ValueError, match="run_current: trials of correction_velocity_p close the loop at the motor's rat"
+    ):
+        check_tried(known, ("correction_velocity_p", "run_current"))
+    with pytest.raises(
+        ValueError, match=r"shows what the phase currents do, run_current, standby_current, and with its lo"
+    ):
+        check_tried(known, ("coolstep_up",))
+    with pytest.raises(ValueError, match=r"phase currents do, run_current, standby_current; drive-tune auto finds"):
+        check_tried(find_device("tmcm6212"), ("coolstep_up",))

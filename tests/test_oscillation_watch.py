@@ -122,3 +122,68 @@ def test_an_axis_that_swings_is_identified_with_softer_gains():
     resonance = math.sqrt(SWINGING["load.stiffness"] / parallel) / (2.0 * math.pi)
     assert found.value("resonance") == pytest.approx(resonance, rel=0.02)
     assert found.value("inertia") == pytest.approx(J, rel=0.05)
+
+
+class OneAxis:
+    """Axes whose current is what a test says [mA], one row after the other."""
+
+    device, observers = find_device("tmcm1636"), ()
+
+    def __init__(self, num_axes=1):
+        self.num_axes, self.log = num_axes, []
+
+    def write(self, name, value, *, where):
+        self.log.append((name, np.asarray(value).tolist(), where.tolist()))
+
+
+@pytest.mark.parametrize(
+    ("limit", "noise", "change", "off"),
+    [
+        (2.0, 0.0, 0.79, False),  # two fifths of what is asked for
+        (2.0, 0.0, 0.81, True),
+        (2.0, 0.3, 0.89, False),  # three times the noise, where that is more
+        (2.0, 0.3, 0.91, True),
+        (2.0, 0.2, 0.81, True),
+    ],
+)
+def test_an_oscillation_is_more_than_two_fifths_of_the_limit_and_three_times_the_noise(limit, noise, change, off):
+    own = OneAxis(2)
+    watch = OscillationWatch(np.array([True, True]), np.array([limit, 99.0]), noise)
+    wave = 0.5 * change * 1e3 * (-1.0) ** np.arange(25)[:, None] * [1.0, 1.0]
+    watch.passed(own, 0.025, {CURRENT: wave}, (), None)
+    assert watch.swung.tolist() == [off, False]
+    assert own.log == ([(0x6040, 0, [True, False])] if off else [])
+    watch.passed(own, 0.025, {CURRENT: wave}, (), None)
+    assert len(own.log) == int(off)  # once
+
+
+@pytest.mark.parametrize(("rms", "off"), [(0.99, False), (1.01, True)])
+def test_what_is_shaken_on_purpose_may_have_so_much_about_its_mean(rms, off):
+    own = OneAxis(2)
+    watch = OscillationWatch(np.array([True, True]), np.array([0.1, 0.1]))
+    wave = 1e3 * (50.0 + rms * (-1.0) ** np.arange(26))[:, None] * [1.0, 0.0]
+    with watch.shaken(np.array([1.0, 1.0])):
+        watch.passed(own, 0.025, {CURRENT: wave[:24]}, (), None)
+        assert watch.patience() == 1
+        watch.passed(own, 0.025, {CURRENT: wave[24:]}, (), None)
+        assert watch.patience() == 25
+    assert watch.swung.tolist() == [off, False]
+
+
+def test_an_axis_that_is_softened_has_a_fourth_of_its_velocity_gains_and_is_watched_anew(monkeypatch):
+    own, enabled, written = OneAxis(2), [], []
+    monkeypatch.setattr("tuning.oscillation_watch.device_of", lambda drives: OneAxis.device)
+    monkeypatch.setattr(
+        "tuning.oscillation_watch.write_gains", lambda drives, gains, where: written.append((gains, where.tolist()))
+    )
+    monkeypatch.setattr(
+        "tuning.oscillation_watch.motion.enable", lambda drives, mode, where: enabled.append((mode, where.tolist()))
+    )
+    watch = OscillationWatch(np.array([True, True]), np.array([1.0, 1.0]))
+    watch.swung[:] = True
+    gains = np.array([[1000, 200, 800, 96, 50]] * 2)
+    first = np.array([True, False])
+    softer = watch.soften(own, first, gains, "csp")
+    assert softer[1].tolist() == gains[1].tolist() and softer[0, [0, 1, 2, 4]].tolist() == [1000, 200, 200, 50]
+    assert watch.swung.tolist() == [False, True] and enabled == [("csp", [True, False])]
+    assert own.log == [(0x60FF, 0, [True, False])] and written[0][1] == [True, False] and written[0][0] is softer

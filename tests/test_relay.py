@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from drive_env import cia402
+from drive_env.devices import find_device
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import gains_in_si, write_gains
+from drive_env.motors import find_motor
 from drive_env.trials.positioning import CYCLE
 from tuning.identify.true_plant import true_plant
+from tuning.response.linear_model import Plant
 from tuning.response.margins import margins
+from tuning.rules import relay as module
 from tuning.rules.lags import velocity_lag
 from tuning.rules.optima import take_current
 from tuning.rules.proposal import Workbench
 from tuning.rules.relay import (
-    HELD,
     evaluate,
+    finish,
     fundamental,
     gains_from_swing,
     line,
@@ -27,6 +34,7 @@ from tuning.rules.relay import (
 )
 from tuning.target import emulated
 
+HELD = 0.5e-3  # s: a current that is held for a cycle acted half a cycle earlier on the mean
 STILL = {"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0}
 
 
@@ -138,3 +146,265 @@ def test_known_friction_is_taken_out_of_the_swing(coulomb):
     swing = evaluate(speed, current, np.array([coulomb]), yes, yes, 2.0 * math.pi / 4096)
     assert swing.slope[0] == pytest.approx(slope, rel=0.01)
     assert swing.lag[0] == pytest.approx(lag, rel=0.03)
+
+
+@pytest.mark.parametrize(("periods", "seen"), [(6.3, True), (5.7, False)])
+def test_six_swings_are_worth_evaluating(periods, seen):
+    """Of the 200 ms that are left when the first 100 have died away."""
+    swing = evaluated(periods / 0.2)
+    assert np.isfinite(swing.slope[0]) == seen
+    assert swing.reason == (
+        "" if seen else "the axis did not swing 6 times: friction is too high, or the inertia too large",
+    )
+
+
+@pytest.mark.parametrize(("counts", "seen"), [(0.51, True), (0.49, False)])
+def test_a_swing_of_half_a_count_is_more_than_noise(counts, seen):
+    swing = evaluated(100.0, amplitude=counts * 2.0 * math.pi / 4096 * 2.0 * math.pi * 100.0)
+    assert np.isfinite(swing.slope[0]) == seen
+    assert swing.reason == (
+        "" if seen else "the axis swung by less than 0.5 counts: friction is too high, or the inertia too large",
+    )
+
+
+def evaluated(frequency, amplitude=8.0, lag=1.1e-3, first=0.0, slope=2000.0, asked=True, inside=True):
+    """What is said of an ideal swing of 300 ms, whose first 100 ms are something else."""
+    w = 2.0 * math.pi * frequency
+    t = np.arange(300) * CYCLE
+    amps = amplitude / (slope * np.exp(-1j * w * (lag - HELD)) / (1j * w))
+    speed, current = ((x * np.exp(1j * w * t)).real[:, None] for x in (amplitude, amps))
+    speed[:100] += first
+    current[:100] -= first
+    yes = np.array([asked]), np.array([inside])
+    return evaluate(speed, current, np.zeros(1), *yes, 2.0 * math.pi / 4096)
+
+
+def test_what_swings_in_is_left_out_of_the_first_100_ms_and_no_more():
+    swing = evaluated(100.0, first=1e4)
+    assert swing.frequency[0] == pytest.approx(100.0, rel=1e-3)
+    assert (swing.amplitude[0], swing.slope[0]) == (pytest.approx(8.0, rel=0.01), pytest.approx(2000.0, rel=0.01))
+    assert swing.lag[0] == pytest.approx(1.1e-3, rel=0.02) and swing.reason == ("",)
+    late = np.zeros((300, 1))
+    late[100] = 1e4  # and this is looked at
+    cycles = np.arange(300)[:, None] * CYCLE
+    speed = np.cos(2.0 * math.pi * 100.0 * cycles) + late
+    yes = np.array([True])
+    assert evaluate(speed, speed, np.zeros(1), yes, yes, 1e-6).amplitude[0] != pytest.approx(1.0, rel=0.5)
+
+
+def test_a_phase_ahead_of_an_integrators_is_that_of_no_rigid_axis():
+    swing = evaluated(100.0, lag=-0.2e-3)
+    assert math.isnan(swing.slope[0]) and math.isnan(swing.lag[0])
+    assert swing.frequency[0] == pytest.approx(100.0, rel=1e-3) and swing.amplitude[0] == pytest.approx(8.0, rel=1e-2)
+    assert swing.reason == ("the phase at 100 Hz leads an integrator's: the oscillation is not that of a rigid axis",)
+    assert evaluated(100.0, lag=0.2e-3).lag[0] == pytest.approx(0.2e-3, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("asked", "inside", "reason"),
+    [
+        (False, False, "not asked for"),
+        (False, True, "not asked for"),
+        (True, False, "the travel is too short: the relay drove the axis to its end"),
+    ],
+)
+def test_an_axis_that_took_no_part_has_no_figures(asked, inside, reason):
+    swing = evaluated(100.0, asked=asked, inside=inside)
+    assert swing.reason == (reason,)
+    assert np.isnan([swing.frequency, swing.amplitude, swing.slope, swing.lag]).all()
+
+
+def test_axes_are_evaluated_each_by_itself():
+    """The first rests, the second took no part, the third swings, the last came to its end."""
+    w = 2.0 * math.pi * 100.0
+    wave = 8.0 * np.cos(w * np.arange(300) * CYCLE)
+    speed = np.stack([0.0 * wave, wave, wave, wave], axis=1)
+    current = np.stack([wave, wave, 4.0 * np.cos(w * (np.arange(300) * CYCLE + HELD)), wave], axis=1)
+    axes, inside = np.array([True, False, True, True]), np.array([True, True, True, False])
+    swing = evaluate(speed, current, np.zeros(4), axes, inside, 1e-3)
+    assert [reason.split(":")[0] for reason in swing.reason] == [
+        "the axis did not swing 6 times", "not asked for",
+        "the phase at 100 Hz leads an integrator's", "the travel is too short",
+    ]  # fmt: skip
+    assert np.isnan(swing.frequency).tolist() == [True, True, False, True]
+
+
+def test_the_strongest_line_may_be_the_first_or_the_last_of_the_spectrum():
+    alternating = (-1.0) ** np.arange(200)
+    assert fundamental(alternating) == pytest.approx(0.5 / CYCLE, rel=0.01)
+    t = np.arange(400) * CYCLE
+    assert fundamental(np.cos(2.0 * math.pi * 40.0 * t)) == pytest.approx(40.0, abs=0.01)
+
+
+# --- gains from it ----------------------------------------------------------------------------------------------------
+DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
+PLANT = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1.5e-5)
+
+
+def test_an_ultimate_point_is_where_the_lag_turns_by_90_degrees():
+    assert ultimate_of_integrator(2000.0, 1e-3) == (pytest.approx(math.pi / 4.0), pytest.approx(4e-3))
+
+
+def test_a_rule_takes_its_shares_of_the_ultimate_point_and_of_what_was_reached():
+    """The integer that was reached, here 0.9 of the gain that was asked for, is what the position loop follows."""
+    asked = []
+
+    def p(loop, gain):
+        asked.append((loop, "p", gain))
+        return 0.9 * gain
+
+    bench = SimpleNamespace(p=p, time=lambda loop, time: asked.append((loop, "time", time)), proposal=lambda: "done")
+    assert finish(bench, module.Ultimate(0.32, 5e-3), 2000.0) == "done"
+    assert asked == [
+        ("velocity", "p", pytest.approx(0.1)),
+        ("velocity", "time", pytest.approx(11e-3)),
+        ("position", "p", pytest.approx(0.25 * 0.09 * 2000.0)),
+    ]
+
+
+def test_a_load_that_twists_is_held_to_the_crossover_that_the_rule_will_have(monkeypatch):
+    """Of an integrator with a dead time the crossover turns by pi/2 over 3.2: so much of the lag counts."""
+    asked = []
+    monkeypatch.setattr(module, "velocity_lag", lambda device, plant, current: 1e-3)
+    monkeypatch.setattr(module, "slow_enough", lambda bench, plant, lag, turn: asked.append((lag, turn)) or 2e-3)
+    monkeypatch.setattr(module, "finish", lambda bench, ultimate, slope: (ultimate, slope))
+    ultimate, slope = relay_rule(DEVICE, MOTOR, PLANT)
+    assert asked == [(1e-3, pytest.approx(math.pi / 6.4))]
+    assert slope == pytest.approx(PLANT.torque_constant / 1.5e-5)
+    assert ultimate == (pytest.approx(math.pi / 4e-3 / slope), pytest.approx(8e-3))
+
+
+@pytest.mark.parametrize(("factor", "taken"), [(1.49, True), (1.51, False), (1.0 / 1.49, True), (1.0 / 1.51, False)])
+def test_a_swing_of_another_inertia_than_the_axiss_is_refused(factor, taken):
+    slope = factor * PLANT.torque_constant / PLANT.inertia
+    point = ultimate_of_integrator(slope, 1e-3)
+    if taken:
+        si = gains_in_si(DEVICE, 24.0, gains_from_swing(DEVICE, PLANT, slope, point).gains)
+        assert si.velocity_p == pytest.approx(point.gain / 3.2, rel=0.01)
+        return
+    with pytest.raises(ValueError, match=rf"swung like {1.5e-5 / factor:.2g} kg\*m\^2, and its inertia is 1.5e-05: it"):
+        gains_from_swing(DEVICE, PLANT, slope, point)
+
+
+# --- the experiment, on drives that are an integrator -----------------------------------------------------------------
+class Axes:
+    """Drives whose axes turn as a test says: `moves(k)` is the speed [counts] and way [inc] of each in cycle k."""
+
+    def __init__(self, moves, limit=3500, num_axes=1):
+        self._moves, self._limit, self._n = moves, limit, num_axes
+        self.played, self.log, self.cycles = [], [], 0
+
+    def read(self, name):
+        return np.full(self._n, self._limit if name is Role.CURRENT_LIMIT else 5000)
+
+    def write(self, name, value, where=None):
+        self.log.append((name, value, where.tolist()))
+
+    def record(self, objects, duration, play):
+        rows = play[cia402.TARGET_TORQUE]
+        assert len(rows) == round(duration / CYCLE)
+        self.played.append(rows.tolist())
+        speed, way = (np.broadcast_to(np.asarray(x, float), self._n) for x in self._moves(self.cycles))
+        self.cycles += 1
+        return {
+            cia402.VELOCITY_ACTUAL: speed[None],
+            cia402.POSITION_ACTUAL: 5000 + way[None],
+            cia402.TORQUE_ACTUAL: 2.0 * rows[:1],
+        }
+
+
+@pytest.fixture
+def experiment(monkeypatch):
+    """Run the experiment on such axes: a turn is 1,000 increments, a count of speed 0.5 rad/s, of current 1 mA."""
+    enabled = []
+    monkeypatch.setattr(module, "ampere_per_count", lambda drives: 1e-3)
+    monkeypatch.setattr(module, "to_counts", lambda drives, torque: np.rint(torque * 1e3).astype(np.int64))
+    monkeypatch.setattr(module.motion, "enable", lambda drives, mode, where: enabled.append((mode, where.tolist())))
+    monkeypatch.setattr(module.motion, "disable", lambda drives, where: enabled.append(("off", where.tolist())))
+    monkeypatch.setattr(module, "evaluate", lambda *arguments: arguments)
+
+    def run(moves, *, limit=3500, current=10.0, rated=3.5, ways=((-math.inf, math.inf),), **options):
+        n = len(ways)
+        drives = Axes(moves, limit, n)
+        target = SimpleNamespace(
+            drives=drives, num_axes=n, current=current, low=np.array([low for low, _ in ways]) * 2.0 * math.pi,
+            high=np.array([high for _, high in ways]) * 2.0 * math.pi,
+            motor=SimpleNamespace(rated_current=rated, encoder_counts=4096),
+            increments=lambda: np.full(n, 1000.0 / (2.0 * math.pi)), speed_counts=lambda: np.full(n, 2.0),
+        )  # fmt: skip
+        return drives, relay_experiment(target, **options), enabled
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("given", "height"),
+    [
+        ({}, 1400),  # 0.4 of the rated current
+        ({"coulomb": np.array([0.7])}, 1400),
+        ({"coulomb": np.array([0.75])}, 1500),  # twice the friction
+        ({"coulomb": np.array([np.nan])}, 1400),
+        ({"coulomb": np.array([0.9])}, 1575),  # 0.45 of the drive's limit
+        ({"limit": 2000}, 900),
+        ({"current": 0.6}, 600),  # and what may excite
+        ({"limit": 0}, 0),
+    ],
+)
+def test_how_high_the_relay_is(experiment, given, height):
+    drives, _, _ = experiment(lambda k: (1, 0), **given)
+    assert drives.played[0] == [[height]] and drives.played[1] == [[-height]]
+
+
+def test_the_relay_brakes_what_turns_for_300_ms_and_leaves_the_axis_off(experiment):
+    speeds = [3, -3, 0, -1, 1]
+    drives, (speed, current, dry, axes, inside, count), enabled = experiment(lambda k: (speeds[k % 5], 0))
+    assert drives.log == [(cia402.TARGET_TORQUE, 0, [True])]
+    assert enabled == [("cst", [True]), ("off", [True])]
+    assert len(drives.played) == 301 and drives.played[-1] == [[0]] * 5  # and 5 ms without any
+    assert [row[0][0] for row in drives.played[:6]] == [1400, -1400, 1400, -1400, 1400, -1400]
+    assert speed.shape == (300, 1) and speed[:3, 0].tolist() == [1.5, -1.5, 0.0]
+    assert current[:2, 0].tolist() == pytest.approx([2.8, -2.8])
+    assert (dry.tolist(), axes.tolist(), inside.tolist()) == ([0.0], [True], [True])
+    assert count == pytest.approx(2.0 * math.pi / 4096)
+
+
+@pytest.mark.parametrize(("way", "stays"), [(799, True), (800, False), (-399, True), (-400, False)])
+def test_at_four_fifths_of_its_way_an_axis_is_let_go_for_good(experiment, way, stays):
+    """Of a way of one turn forwards, half a turn back."""
+    drives, (*_, inside, _), _ = experiment(lambda k: (1, way if k == 9 else 0), ways=((-0.5, 1.0),))
+    assert inside.tolist() == [stays]
+    torques = np.array([rows[0][0] for rows in drives.played[:-1]])
+    assert np.all(torques[1:10] == -1400) and np.all((torques[10:] != 0) == stays)
+
+
+def test_a_constant_load_is_held_by_a_bias_against_the_way(experiment):
+    """A fiftieth of the height a cycle and 0.05 of a turn times 0.76; never more than half the height."""
+    drives, _, _ = experiment(lambda k: (-1 if k % 2 else 1, 50))
+    torques = np.array([rows[0][0] for rows in drives.played[:-1]])
+    step = 0.02 * 1400 * math.tanh(1.0)
+    assert torques[1] == round(-1400 - step) and torques[2] == round(1400 - 2 * step)
+    assert sorted(torques[-2:].tolist()) == [-2100, 700]
+    back, _, _ = experiment(lambda k: (-1 if k % 2 else 1, -50))
+    assert back.played[1] == [[round(-1400 + step)]]
+    assert sorted(rows[0][0] for rows in back.played[298:300]) == [-700, 2100]
+
+
+def test_only_axes_that_are_asked_for_swing(experiment):
+    where = np.array([False, True])
+    drives, (*_, axes, inside, _), enabled = experiment(
+        lambda k: (1, 0), ways=((-math.inf, math.inf),) * 2, where=where
+    )
+    assert {rows[0][0] for rows in drives.played} == {0} and drives.played[0] == [[0, 1400]]
+    assert axes.tolist() == inside.tolist() == [False, True]
+    assert drives.log[0][2] == [False, True] and enabled[0] == ("cst", [False, True])
+
+
+def test_an_axis_whose_drive_is_lost_is_switched_off(experiment, monkeypatch):
+    def lost(k):
+        raise OSError("the cable is out")
+
+    off = []
+    monkeypatch.setattr(module.motion, "disable", lambda drives, where: off.append(where.tolist()))
+    with pytest.raises(OSError, match="cable"):
+        experiment(lost)
+    assert off == [[True]]

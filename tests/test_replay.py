@@ -73,6 +73,13 @@ def test_a_response_that_is_late_is_told_by_how_much(late):
     assert report.nrmse[0] == pytest.approx(0.0, abs=1e-9) if late == 0 else report.nrmse[0] > 0.05
 
 
+def test_a_shift_counts_in_the_time_between_two_samples():
+    """Of samples 4 ms apart a row is 4 ms."""
+    t = np.arange(100) * 4e-3
+    want, have = (np.rint(1000.0 * np.sin(20.0 * (t - late))).astype(int)[:, None] for late in (0.0, 8e-3))
+    assert compare(Log(t, {VELOCITY: want}), {VELOCITY: have})[VELOCITY].shift[0] == pytest.approx(8e-3, abs=4e-4)
+
+
 def test_every_machine_is_told_of_apart_and_of_axes_the_worst(log):
     drives = machines(3)
     drives.machine.set_all({name: np.array([1e-5, value, 1e-4]) for name, value in TRUTH.items() if "inertia" in name})
@@ -431,3 +438,236 @@ def test_from_four_fifths_of_its_range_on_a_parameter_is_not_determined(narrowed
     laws = Distributions({"a": Law("uniform", False, 0.0, 1.0)})
     found = module.LogFit(laws, {}, np.ones(1), 1.0, {"a": narrowed})
     assert found.is_seen("a") == (narrowed < 0.8)
+
+
+# --- what is played, on drives that a test plays ----------------------------------------------------------------------
+class Player:
+    """Two machines of two axes that stand at 1,000 and 2,000, and answer with what they are told twice over."""
+
+    num_machines, num_axes, load = 2, 4, SimpleNamespace(name="gantry")
+
+    def __init__(self):
+        self.log = []
+        self.machine = SimpleNamespace(reset=lambda: self.log.append("reset"))
+
+    def read(self, name):
+        assert name == POSITION
+        return np.array([1000, 2000, 1000, 2000])
+
+    def write(self, name, value):
+        self.log.append((name, np.asarray(value).tolist()))
+
+    def record(self, names, seconds, *, play, period):
+        ((target, rows),) = play.items()
+        self.log.append((list(names), round(seconds, 6), target, round(period, 6)))
+        self.rows = rows
+        return dict.fromkeys(names, 2 * rows)
+
+
+def logged(every=1, **objects):
+    names = {"demand": DEMAND, "target": TARGET, "speed": SPEED, "torque": TORQUE, "velocity": VELOCITY,
+             "position": POSITION, "current": CURRENT}  # fmt: skip
+    return Log(np.arange(12) * every * 1e-3, {names[name]: np.asarray(values) for name, values in objects.items()})
+
+
+@pytest.fixture
+def player(monkeypatch):
+    drives = Player()
+    monkeypatch.setattr(module.motion, "enable", lambda drives, mode: drives.log.append(mode))
+    return drives
+
+
+STEPS = np.arange(12)[:, None] * [10, -20] + [5000, 7000]
+REST = np.zeros((12, 2), int)
+
+
+@pytest.mark.parametrize("command", ["demand", "target"])
+def test_positions_are_played_from_where_the_machines_stand_and_told_where_the_log_was(player, command):
+    """What a drive demanded in a cycle it was told a cycle earlier; what it was told is played as it is."""
+    log = logged(position=STEPS + 3, velocity=REST, current=REST, **{command: STEPS})
+    found = replay(player, log, {"2043h:01": 7})
+    own = STEPS - [4000, 5000]
+    played = np.concatenate([own[1:], own[-1:]]) if command == "demand" else own
+    assert player.log == [
+        "reset", ("2043h:01", 7), (TARGET, [1000, 2000, 1000, 2000]), "csp",
+        ([POSITION, VELOCITY, CURRENT], 0.012, TARGET, 0.001),
+    ]  # fmt: skip
+    np.testing.assert_array_equal(player.rows, np.tile(played, (1, 2)))
+    np.testing.assert_array_equal(found[POSITION], np.tile(2 * played + [4000, 5000], (1, 2)))
+    np.testing.assert_array_equal(found[VELOCITY], np.tile(2 * played, (1, 2)))
+    assert list(found) == [POSITION, VELOCITY, CURRENT]
+
+
+def test_positions_of_every_third_cycle_are_played_on_a_line_between_them(player):
+    log = logged(3, target=STEPS, position=STEPS)
+    replay(player, log)
+    assert player.rows.shape == (36, 4) and player.log[-1] == ([POSITION], 0.036, TARGET, 0.003)
+    np.testing.assert_array_equal(player.rows[:7, 0], [1000, 1003, 1007, 1010, 1013, 1017, 1020])
+    np.testing.assert_array_equal(player.rows[-4:, 1], [1787, 1780, 1780, 1780])
+
+
+@pytest.mark.parametrize(("command", "mode", "name"), [("speed", "csv", SPEED), ("torque", "cst", TORQUE)])
+def test_speeds_and_currents_are_played_as_they_were_and_stay_until_the_next(player, command, mode, name):
+    log = logged(2, velocity=REST, position=STEPS, **{command: STEPS})
+    found = replay(player, log)
+    assert player.log == ["reset", mode, ([POSITION, VELOCITY], 0.024, name, 0.002)]
+    np.testing.assert_array_equal(player.rows, np.tile(np.repeat(STEPS, 2, axis=0), (1, 2)))
+    np.testing.assert_array_equal(found[POSITION], 2 * player.rows)
+
+
+def test_a_log_of_other_axes_is_refused_before_anything_is_reset(player):
+    with pytest.raises(ValueError, match="the log is of 1 axes, a machine of load 'gantry' has 2"):
+        replay(player, logged(torque=STEPS[:, :1]))
+    assert player.log == []
+
+
+# --- the columns of a file --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("title", "key"),
+    [
+        ("6064h:00 Position actual value [inc] (node 1)", (0x6064, 0)),
+        ("60Ffh:0A Something", (0x60FF, 0x0A)),
+        ("2041h:03 Actual Current [mA]", (0x2041, 3)),
+        ("6064h:00 P (node 2 axis 1)", (0x6064, 0)),
+        ("6064h Position", None),
+        ("x6064h:00 P", None),
+        ("6064h:00", None),
+        ("6064h:00 P (a", None),
+    ],
+)
+def test_a_column_is_known_by_its_object(tmp_path, title, key):
+    path = tmp_path / "log.csv"
+    lines = [f"t [s],{title}", *(f"{k}e-3,{k * 7}" for k in range(10))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if key is None:
+        with pytest.raises(ValueError, match="names no object; it must begin as '6064h:00 '"):
+            read_log(path)
+        return
+    log = read_log(path)
+    assert list(log.objects) == [key] and log.objects[key][:, 0].tolist() == [7 * k for k in range(10)]
+    assert log.num_axes == 1 and log.objects[key].dtype == np.int64
+
+
+def test_columns_of_one_object_are_its_axes_wherever_they_stand(tmp_path):
+    path = tmp_path / "log.csv"
+    head = "t [s],6064h:00 P (node 1),606Ch:00 V (node 1),6064h:00 P (node 2),606Ch:00 V (node 2)"
+    path.write_text("\n".join([head, *(f"{k}e-3,{k},{-k},{k + 50},{-k - 50}" for k in range(10))]), encoding="utf-8")
+    log = read_log(path)
+    assert log.objects[POSITION][4].tolist() == [4, 54] and log.objects[VELOCITY][4].tolist() == [-4, -54]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"\xff\xfe", r"log\.csv is not a text file; give the CSV that drive-env scope writes"),
+        (b"t [s],6064h:00 P\n0,\"" + b"1" * 200_000, r"log\.csv is not CSV: .*; give the one that drive-env scope"),
+        (b"\n", r"the first line must begin with 't \[s\]', as drive-env scope writes it"),
+        (b"t [s]\n" + b"0\n" * 12, r"the first line must begin with 't \[s\]'"),
+        (b"t [s],6064h:00 P\n" + b"0.1\n" * 12, "every line needs a time and 1 whole numbers|at least 10 lines of 2 v"),
+        (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1\n" * 12, r"needs at least 10 lines of 3 values each"),
+        (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1,x\n" * 12, r"every line needs a time and 2 whole numbers: invalid"),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_read_is_told_why(tmp_path, content, message):
+    path = tmp_path / "log.csv"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        read_log(path)
+
+
+# --- the course of a fit ----------------------------------------------------------------------------------------------
+def fitted(monkeypatch, *, distances, possible=None, count=16, **options):
+    """Fit two parameters where the distances of each round, and which machines there can be, are known."""
+    rounds, log = iter(distances), []
+    monkeypatch.setattr(module, "_distances", lambda drives, log, settings: np.asarray(next(rounds), float))
+
+    def give(drives, values):
+        log.append({name: value.copy() for name, value in values.items()})
+        return np.ones(count, bool) if possible is None else np.asarray(possible)
+
+    monkeypatch.setattr(module, "_give", give)
+    machine = SimpleNamespace(
+        parameters={"load.inertia": np.full(count, 2e-5), "motor.R_s": np.full(count, 0.5), "other": np.ones(count)},
+        set_all=lambda values: log.append({name: value.tolist() for name, value in values.items()}),
+        reset=lambda: log.append("reset"),
+    )
+    drives = SimpleNamespace(num_machines=count, machine=machine)
+    found = fit(drives, None, "two_mass", ["load.inertia", "motor.R_s"], **options)
+    return found, log
+
+
+def test_machines_are_accepted_within_a_fifth_of_the_best_of_all_rounds(monkeypatch):
+    base = np.full(16, 9.0)
+    base[3] = 5.0  # the nominal machine's own noise differs: the least counts
+    first, second = np.full(16, 7.0), np.full(16, 7.0)
+    first[[2, 5]], second[[1, 4]] = (1.0, 1.2), (1.1, 1.201)
+    found, log = fitted(monkeypatch, distances=[base, first, second], rounds=2)
+    assert found.nominal == 5.0 and found.distance.tolist() == [1.0, 1.1, 1.2]
+    assert found.accepted["load.inertia"].tolist() == [log[0]["load.inertia"][2], log[1]["load.inertia"][1],
+                                                       log[0]["load.inertia"][5]]  # fmt: skip
+    assert log[2:] == [{"load.inertia": [2e-5] * 16, "motor.R_s": [0.5] * 16}, "reset"]
+    wider, _ = fitted(monkeypatch, distances=[base, first, second], rounds=2, slack=1.25)
+    assert len(wider.distance) == 4
+
+
+def test_what_cannot_be_is_infinitely_far(monkeypatch):
+    distances = np.arange(16.0) + 1.0
+    found, _ = fitted(
+        monkeypatch, distances=[distances, distances], possible=[False, *[True] * 15], rounds=1, slack=1.0
+    )
+    assert found.distance.tolist() == [2.0]
+
+
+def test_machines_are_as_they_were_after_a_fit_that_fails(monkeypatch):
+    drawn = []
+
+    def failing(drives, log, settings):
+        raise OSError("no")
+
+    monkeypatch.setattr(module, "_distances", failing)
+    machine = SimpleNamespace(
+        parameters={"load.inertia": np.full(16, 2e-5)}, set_all=drawn.append, reset=lambda: drawn.append("reset")
+    )
+    with pytest.raises(OSError, match="no"):
+        fit(SimpleNamespace(num_machines=16, machine=machine), None, "two_mass", ["load.inertia"])
+    assert [list(drawn[0]), drawn[1]] == [["load.inertia"], "reset"]
+
+
+@pytest.mark.parametrize(("count", "parameters"), [(15, ["load.inertia"]), (16, [])])
+def test_a_fit_needs_sixteen_machines_and_a_parameter(count, parameters):
+    machine = SimpleNamespace(parameters={"load.inertia": np.ones(count)})
+    with pytest.raises(ValueError, match=f"at least 16 machines and one parameter, not {count} and {len(parameters)}"):
+        fit(SimpleNamespace(num_machines=count, machine=machine), None, "two_mass", parameters)
+
+
+def test_what_is_drawn_from_a_range_can_be_fitted():
+    laws = Distributions({
+        "a": Law("uniform", True, 0.5, 1.5), "b": Law("choice", False, 0.0, 1.0),
+        "c": Law("loguniform", False, 1.0, 2.0),
+        "supply.voltage": Law("uniform", True, 0.9, 1.1),
+    })  # fmt: skip
+    names = module.fittable(laws)
+    assert "a" in names and "c" in names and "b" not in names
+    assert ("supply.voltage" in names) == ("supply.voltage" not in module.BESIDE)
+
+
+@pytest.mark.parametrize(
+    ("accept", "count", "width", "best"), [(0.1, 100, 1, 10), (0.25, 100, 1, 25), (0.01, 100, 1, 4), (0.01, 100, 3, 6)]
+)
+def test_the_next_round_is_drawn_around_the_best_share(accept, count, width, best):
+    chosen = []
+
+    class Chance:
+        def choice(self, indices, size):
+            chosen.append((sorted(indices.tolist()), size))
+            return np.zeros(size, int)
+
+        def multivariate_normal(self, mean, spread, size):
+            chosen.append((mean.tolist(), spread))
+            return np.zeros((size, width))
+
+    tried = np.random.default_rng(0).random((3 * count, width))  # three rounds
+    _candidates(Chance(), tried, np.arange(3 * count)[::-1].astype(float), count, width, accept)
+    assert chosen[0] == (list(range(3 * count - best, 3 * count)), count) and chosen[1][0] == [0.0] * width
+    expected = 2.0 * np.atleast_2d(np.cov(tried[-best:], rowvar=False)) + 1e-10 * np.eye(width)
+    np.testing.assert_allclose(chosen[1][1], expected, rtol=1e-12)

@@ -134,6 +134,14 @@ def test_rounded_times_cost_no_sample():
     assert m.overshoot == 1
 
 
+def test_rounding_is_a_billionth_of_the_whole_record_also_of_two_samples():
+    m = step_metrics([0.0, 1.0], [0.0, 1.0], 1.0, t_step=-1e-13, t_end=1.0 + 1e-13)
+    assert m.iae == pytest.approx(0.5)
+    for times in ({"t_step": -2e-9}, {"t_step": 0.0, "t_end": 1.0 + 2e-9}):
+        with pytest.raises(ValueError, match="lies outside"):
+            step_metrics([0.0, 1.0], [0.0, 1.0], 1.0, **times)
+
+
 def test_t_end_cuts_the_record():
     y = first_order(T) + np.where(T > 0.2005, 1.0, 0.0)  # a load step at 0.2 s
     cut = T < 0.2005
@@ -478,6 +486,7 @@ FRACTION = "must lie in (0, 1); give a fraction, 0.02 for 2 %"
     ("call", "text"),
     [
         (lambda: step_metrics([0, 1, 1], [0, 1, 1], 1, t_step=0), "t is not strictly increasing: t[1]=1 s, t[2]=1 s;"),
+        (lambda: step_metrics([0, 0, 1], [0, 1, 1], 1, t_step=0), "t is not strictly increasing: t[0]=0 s, t[1]=0 s;"),
         (lambda: step_metrics([0, 2, 1], [0, 1, 1], 1, t_step=0), "t[2]=1 s; sort the record and drop repeated"),
         (
             lambda: step_metrics(T, Y[:-1], 1, t_step=0),
@@ -494,6 +503,10 @@ FRACTION = "must lie in (0, 1); give a fraction, 0.02 for 2 %"
             "reference of shape (2,) does not fit a signal of shape (301,);",
         ),
         (lambda: step_metrics(T, Y, [1, 2], t_step=0), "give one number or an array of shape ()"),
+        (
+            lambda: step_metrics(T, np.tile(Y[:, None], 3), [1, 2], t_step=0),
+            "reference of shape (2,) does not fit a signal of shape (301, 3); give one number or an array of shape (3,",
+        ),
         (lambda: step_metrics(T, Y, 1, t_step=0, initial=[0]), "initial of shape (1,) does not fit"),
         (lambda: step_metrics(T, Y, 0, t_step=0), NO_STEP),
         (lambda: step_metrics(T, Y, 0, t_step=0), "or give initial="),
@@ -503,7 +516,10 @@ FRACTION = "must lie in (0, 1); give a fraction, 0.02 for 2 %"
         (lambda: disturbance_metrics(T, Y, 1, t_load=0.4), f"t_load=0.4 s {IN_RECORD} t_load within it"),
         (lambda: step_metrics(T, Y, 1, t_step=0, t_end=1), "t_end=1 s lies outside t_step=0 s to 0.3 s; choose t_end"),
         (lambda: step_metrics(T, Y, 1, t_step=0.1, t_end=0.1), "t_end=0.1 s lies outside t_step=0.1 s to 0.3 s"),
-        (lambda: step_metrics(T, Y, 1, t_step=0.1001, t_end=0.1009), "empty window: t_step=0.1001 s to t_end=0.1009 s"),
+        (
+            lambda: step_metrics(T, Y, 1, t_step=0.1001, t_end=0.1009),
+            "empty window: t_step=0.1001 s to t_end=0.1009 s holds 0 samples of at least 2",
+        ),
         (lambda: step_metrics(T, Y, 1, t_step=0.1, t_end=0.1005), "holds 1 samples of at least 2; widen it or sample"),
         (lambda: step_metrics(T, Y, 1, t_step=0, band=0), f"band=0 {FRACTION}"),
         (lambda: step_metrics(T, Y, 1, t_step=0, band=1), f"band=1 {FRACTION}"),
@@ -514,6 +530,7 @@ FRACTION = "must lie in (0, 1); give a fraction, 0.02 for 2 %"
         (lambda: current_metrics(Y, i_max=0), "i_max=0 A must be positive; give the current limit as a magnitude"),
         (lambda: current_metrics(Y, i_max=np.nan), "i_max=nan A must be positive"),
         (lambda: current_metrics([], i_max=1), "i has shape (0,); give at least one sample as (n,) or (n, num_axes)"),
+        (lambda: oscillation(T, Y, amplitude=-1), "amplitude=-1 must be positive; give what still counts as steady"),
         (lambda: oscillation(T, Y, amplitude=0), "amplitude=0 must be positive; give what still counts as steady"),
         (lambda: oscillation(T, Y, amplitude=[1.0]), "amplitude of shape (1,) does not fit a signal of shape (301,)"),
     ],
@@ -526,4 +543,4 @@ def test_errors_say_what_to_do(call, text):
 
 def test_one_axis_without_a_step_is_named_by_number():
     with pytest.raises(ValueError, match="step height is zero on 1 of 3 axes"):
-        step_metrics(T, np.zeros((T.size, 3)), [1.0, 0.0, 2.0], t_step=0.0)
+        step_metrics(T, np.zeros((T.size, 3)), [1.0, 0.0, -2.0], t_step=0.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,16 +15,20 @@ from drive_env.devices import find_device
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
 from drive_env.motors import MOTORS, find_motor
+from tuning.identify.estimate import Estimate, Identification, refused
 from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
-from tuning.response.margins import margins
+from tuning.response.margins import Margins, margins
+from tuning.rules import side_by_side
 from tuning.rules.internal_model import imc_first_order, simc_first_order, simc_integrating
-from tuning.rules.lags import current_lag, velocity_lag, velocity_noise
-from tuning.rules.margin_targets import TARGETS
+from tuning.rules.lags import current_lag, slow_enough, velocity_lag, velocity_noise
+from tuning.rules.margin_targets import TARGETS, _greatest
 from tuning.rules.optima import modulus_optimum, symmetrical_optimum
 from tuning.rules.pole_placement import place_first_order
 from tuning.rules.proposal import Workbench
+from tuning.rules.relay import Swing, gains_from_swing
 from tuning.rules.rules_by_name import MEANINGS, RULES, propose
+from tuning.rules.side_by_side import velocity_margins
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
@@ -282,3 +288,249 @@ def test_the_cascade_rule_counts_the_encoder():
     assert Gains(*coarse.gains).velocity_p < 0.5 * Gains(*fine.gains).velocity_p
     assert any("where the encoder's 200 counts cause current noise of 10 % of rated" in note for note in coarse.notes)
     assert not any("counts" in note for note in fine.notes)
+
+
+# --- what each rule asks for, by its own formula ----------------------------------------------------------------------
+VISCOUS = {"viscous": 2e-5}
+CURRENT_LAG = 1.5 / DEVICE.current_rate
+
+
+def proposed(rule, axis):
+    """What a rule proposes in SI, and the crossover of its velocity loop [rad/s]."""
+    proposal = propose(rule, DEVICE, MOTOR, axis)
+    si = gains_in_si(DEVICE, axis.supply, proposal.gains)
+    return proposal, si, si.velocity_p * axis.torque_constant / axis.inertia
+
+
+def small_of(axis, si, loss=0.0):
+    """The small time constants that the velocity loop has around the current loop that was reached [s]."""
+    return velocity_lag(DEVICE, axis, axis.L / (si.torque_p + loss))
+
+
+@pytest.mark.parametrize(
+    ("rule", "torque_p", "torque_time", "crossover", "time", "position"),
+    [  # over L / lag, L / R, 1 / small, 1 / crossover (or J / viscous), crossover
+        ("modulus_optimum", 1 / 2, 1.0, 1 / 2, None, 1 / 2),
+        ("symmetrical_optimum", 1 / 2, 1.0, 1 / 2, 2.0, 1 / 4),
+        ("imc", 1 / 4, 1.0, 1 / 3, None, 1 / 2),
+        ("cascade", 1 / 2, 1.0, 1 / 3, 3.0, 1 / 4),
+        ("simc", 1 / 2, None, 1 / 2, 4.0, 1 / 3),
+    ],
+)
+def test_the_shares_of_a_rule(rule, torque_p, torque_time, crossover, time, position):
+    axis = plant(**VISCOUS)
+    _, si, reached = proposed(rule, axis)
+    assert si.torque_p == pytest.approx(torque_p * axis.L / CURRENT_LAG, rel=0.01)
+    winding = axis.L / axis.R if torque_time else min(axis.L / axis.R, 8.0 * CURRENT_LAG)
+    assert si.torque_integration == pytest.approx(winding, rel=0.02)
+    assert reached == pytest.approx(crossover / small_of(axis, si), rel=0.01)
+    own = axis.inertia / axis.viscous if time is None else time / reached
+    assert si.velocity_integration == pytest.approx(own, rel=0.3 if time is None else 0.02)  # seconds: a coarse integer
+    assert si.position_p == pytest.approx(position * reached, rel=0.01)
+
+
+@pytest.mark.parametrize("rule", ["modulus_optimum", "imc"])
+def test_an_axis_without_viscous_friction_has_no_lag_to_cancel_and_this_is_said(rule):
+    _, with_friction, _ = proposed(rule, plant(**VISCOUS))
+    proposal, si, _ = proposed(rule, plant())
+    assert si.velocity_p == pytest.approx(with_friction.velocity_p, rel=1e-3)
+    assert (
+        Gains(*proposal.gains).velocity_i == 0
+        and Gains(*propose(rule, DEVICE, MOTOR, plant(**VISCOUS)).gains).velocity_i
+    )
+    assert [note for note in proposal.notes if "no integral part: a constant load leaves an error" in note]
+
+
+def test_poles_of_a_loop_that_is_slower_than_its_lags_allow():
+    """w_0 such that 2 zeta w_0 times the lags is 0.35 rad; zeta 0.9 of the current loop, 1 of the velocity loop."""
+    axis = plant(**VISCOUS)
+    _, si, _ = proposed("pole_placement", axis)
+    natural = max(0.35 / (1.8 * CURRENT_LAG), 0.6 * axis.R / (0.9 * axis.L))
+    assert si.torque_p == pytest.approx(1.8 * natural * axis.L - axis.R, rel=0.01)
+    assert si.torque_integration == pytest.approx(si.torque_p / (natural**2 * axis.L), rel=0.03)
+    natural = 0.35 / (2.0 * small_of(axis, si, axis.R))
+    storage, loss = axis.inertia / axis.torque_constant, axis.viscous / axis.torque_constant
+    assert si.velocity_p == pytest.approx(2.0 * natural * storage - loss, rel=0.01)
+    assert si.velocity_integration == pytest.approx(si.velocity_p / (natural**2 * storage), rel=0.02)
+    assert si.position_p == pytest.approx(natural / 3.0, rel=0.01)
+
+
+def test_a_plant_that_is_fast_by_itself_leaves_a_pole_placement_a_fifth_of_its_loss():
+    """Of 2 zeta w_0 = 1.2 times what it has alone, winding or axis."""
+    axis = plant(viscous=0.02)
+    _, si, _ = proposed("pole_placement", axis)
+    storage, loss = axis.inertia / axis.torque_constant, axis.viscous / axis.torque_constant
+    assert si.velocity_p == pytest.approx(0.2 * loss, rel=0.02)
+    natural = (si.velocity_p + loss) / (2.0 * storage)
+    assert si.position_p == pytest.approx(natural / 3.0, rel=0.02)
+    slow = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1e-5, R=40.0)
+    _, si, _ = proposed("pole_placement", slow)
+    assert si.torque_p == pytest.approx(0.2 * 40.0, rel=0.02)
+
+
+def test_margin_targets_leave_the_integral_part_a_quarter_of_the_crossover():
+    axis = plant()
+    for name in TARGETS:
+        _, si, crossover = proposed(name, axis)
+        assert si.velocity_integration == pytest.approx(4.0 / crossover, rel=0.1)
+        assert si.torque_integration == pytest.approx(axis.L / axis.R, rel=0.02)
+    assert TARGETS == {
+        "margin_45": (45.0, 8.0), "margin_55": (55.0, 12.0), "margin_60": (60.0, 20.0), "margin_65": (65.0, 35.0),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("greatest", [1, 2, 3, 17, 18, 19, 20, 100, 999, 1000])
+def test_the_greatest_integer_is_found_below_the_first_that_fails(greatest):
+    bench, tried = bench_of_a_gain(1000), []
+    found = Margins(50.0, 10.0, 1.0, 1.0, 1.0)
+
+    def margins_of(p):
+        assert 1 <= p <= 1000
+        tried.append(p)
+        return p, found
+
+    assert _greatest(bench, ("velocity", "P"), margins_of, lambda seen: seen[0] <= greatest, 45.0, 8.0) == greatest
+    assert len(tried) < 100
+    ends = ["velocity P ends at 1000, the greatest integer, with margin to spare"]
+    assert bench.notes == (ends if greatest == 1000 else [])
+
+
+def test_where_no_integer_keeps_the_margins_the_least_is_told_with_its_own():
+    bench = bench_of_a_gain(1000)
+    found = Margins(33.4, 5.26, 1.0, 1.0, 1.0)
+    assert _greatest(bench, ("velocity", "P"), lambda p: found, lambda seen: False, 45.0, 8.0) == 1
+    assert bench.notes == [
+        "velocity P: no integer keeps 45 degrees and 8 dB: 1, the least, has 33 degrees and 5.3 dB"
+    ]  # fmt: skip
+
+
+def bench_of_a_gain(highest):
+    notes = []
+    return SimpleNamespace(row=lambda part: ("velocity_p", "velocity P", (1, 2), highest, "", ""), note=notes.append,
+                           notes=notes)  # fmt: skip
+
+
+# --- what is said of integers and limits ------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("wanted", "raw", "note"),
+    [
+        (0.0, 0, None),
+        (0.2, 1, "would have to be 0.2, and 1 is the least: 5.0 times as much"),
+        (0.51, 1, "would have to be 0.51; no integer comes nearer than 1, 96 % off"),
+        (10.4, 10, None),
+        (10.6, 11, None),
+        (9.51, 10, "would have to be 9.51; no integer comes nearer than 10, 5 % off"),
+        (9.53, 10, None),
+        (RAW_MAX + 0.4, RAW_MAX, None),
+        (2.0 * RAW_MAX, RAW_MAX, "would have to be 65534, and no integer above 32767 exists: 50 % of it is reached"),
+    ],
+)
+def test_what_an_integer_misses_by_more_than_a_twentieth_is_said(wanted, raw, note):
+    bench = Workbench(DEVICE, plant())
+    part = ("velocity", "P")
+    reached = bench.p("velocity", wanted / bench.per_si[part])
+    assert reached == pytest.approx(raw / bench.per_si[part]) == pytest.approx(bench.si(part, raw))
+    assert [text.split("P ", 1)[1] for text in bench._notes] == ([] if note is None else [note])
+    assert bench.so_far() == (1, 1, raw, 1, 1) and bench.so_far({("torque", "P"): 7, ("velocity", "P"): 3})[2] == 3
+    assert bench.raw(part, 9) == pytest.approx(9 / bench.per_si[part]) and bench.so_far()[2] == 9
+
+
+@pytest.mark.parametrize(("wanted_hz", "slowed"), [(19.9, False), (20.1, True)])
+def test_a_loop_is_slowed_above_half_the_anti_resonance(wanted_hz, slowed):
+    notes = []
+    elastic = plant(anti_resonance=40.0, resonance=70.0)
+    small = 0.3 / (2.0 * math.pi * wanted_hz)
+    found = slow_enough(SimpleNamespace(note=notes.append), elastic, small, 0.3)
+    assert found == pytest.approx(0.3 / (2.0 * math.pi * 20.0) if slowed else small, rel=1e-9)
+    assert notes == (["velocity loop limited to 20 Hz, half the anti-resonance at 40 Hz; the lags alone would allow "
+                      "20 Hz"] if slowed else [])  # fmt: skip
+
+
+def test_a_cascade_that_counts_limit_says_to_what_and_from_what():
+    """A tenth of the rated current is what the noise of counts may cause."""
+    coarse = plant(counts=200)
+    proposal, si, _ = proposed("cascade", coarse)
+    quiet = 0.1 * MOTOR.rated_current / velocity_noise(DEVICE, coarse)
+    assert si.velocity_p == pytest.approx(quiet, rel=0.01)
+    hz = quiet * coarse.torque_constant / coarse.inertia / (2.0 * math.pi)
+    _, _, alone = proposed("cascade", plant())
+    assert any(
+        f"velocity loop limited to {hz:.0f} Hz" in note
+        and f"alone would allow {alone / (2.0 * math.pi):.0f} Hz" in note
+        for note in proposal.notes
+    )
+
+
+@pytest.mark.parametrize(
+    ("rule", "share"), [("modulus_optimum", 1 / 2), ("symmetrical_optimum", 1 / 2), ("imc", 1 / 3), ("simc", 1 / 2),
+                        ("cascade", 1 / 3), ("relay", math.pi / 2 / 3.2)],
+)  # fmt: skip
+@pytest.mark.parametrize("slope", [0.7, 1.9])  # rad/(A s^2), of a load that is as heavy as a car
+def test_what_a_rule_asks_for_is_over_what_an_ampere_accelerates_by(rule, share, slope):
+    axis = plant(inertia=MOTOR.torque_constant / slope, counts=10**8)
+    proposal = propose(rule, DEVICE, MOTOR, axis)
+    small = small_of(axis, gains_in_si(DEVICE, axis.supply, proposal.gains))
+    bench = Workbench(DEVICE, axis)
+    assert proposal.wanted["velocity_p"] / bench.per_si["velocity", "P"] == pytest.approx(
+        share / (slope * small), rel=1e-3
+    )
+
+
+# --- side by side -----------------------------------------------------------------------------------------------------
+def test_the_margins_of_a_proposal_are_those_of_its_velocity_loop():
+    """From 0.5 Hz to just below half the loop's rate."""
+    gains = propose("simc", DEVICE, MOTOR, plant()).gains
+    found = velocity_margins(DEVICE, plant(), gains)
+    assert found == pytest.approx(margins(F, velocity_open_loop(DEVICE, plant(), gains, F)), rel=1e-3)
+    assert len(found) == 7
+
+
+def test_axes_without_an_inertia_have_a_reason_in_place_of_a_model(monkeypatch):
+    said = []
+
+    def identify(target, progress):
+        progress("inertia", 0.5)
+        known, reason = Estimate(2e-5, 2e-5, 2e-5, ""), refused("", "the travel is too short")
+        return [Identification({"inertia": one}, 1.0) for one in (known, reason)]
+
+    monkeypatch.setattr("tuning.identify.identification.identify", identify)
+    target = SimpleNamespace(
+        drives=SimpleNamespace(safety=None), device=DEVICE, motor=MOTOR, supply=np.array([30.0, 24.0])
+    )
+    monkeypatch.setattr(side_by_side, "swinging_allowed", lambda drives: nullcontext())
+    one, other = side_by_side.identified_plants(target, said.append)
+    assert (one.supply, one.inertia) == (30.0, 2e-5) and said == [0.5]
+    assert other == "the axis has no identified inertia: the travel is too short"
+    assert list(side_by_side.proposals(target, one, ["simc", "imc"])) == ["simc", "imc"]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_relay_experiments_have_the_rules_current_loops_and_drives_their_own_gains_afterwards(fails, monkeypatch):
+    written, axis = [], plant()
+    slope = axis.torque_constant / axis.inertia
+    reasons = ("", "the travel is too short", "")
+    swing = Swing(*(np.full(3, 1.0),) * 2, np.array([slope, slope, 4.0 * slope]), np.full(3, 1e-3), reasons)
+
+    def experiment(target):
+        if fails:
+            raise OSError("the cable is out")
+        return swing
+
+    monkeypatch.setattr("tuning.rules.relay.relay_experiment", experiment)
+    monkeypatch.setattr("tuning.search.trial_bench.read_gains", lambda target: "before")
+    monkeypatch.setattr(
+        side_by_side,
+        "write_gains",
+        lambda drives, gains: written.append(gains if isinstance(gains, str) else gains.tolist()),
+    )
+    target = SimpleNamespace(drives=None, device=DEVICE, motor=MOTOR)
+    rule = list(propose("relay", DEVICE, MOTOR, axis).gains)
+    if fails:
+        with pytest.raises(OSError, match="cable"):
+            side_by_side.swung_proposals(target, [axis] * 3)
+        assert written == [[rule] * 3, "before"]
+        return
+    one, short, other = side_by_side.swung_proposals(target, [axis] * 3)
+    assert written == [[rule] * 3, "before"] and short == "the travel is too short"
+    assert one == gains_from_swing(DEVICE, axis, slope, swing.ultimate(0))
+    assert "it swings at its load's resonance" in other

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -135,3 +137,43 @@ def test_a_gaussian_process_gets_to_the_bottom():
     pytest.importorskip("torch")
     points = search(new_proposer("gp", LOW, HIGH, seed=1), 20, 1)
     assert min(bowl(point) for point in points) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("sampler", "generation", "kind", "options"),
+    [
+        ("random", 1, "RandomSampler", {}),
+        ("tpe", 1, "TPESampler", {"multivariate": True, "n_startup_trials": 6}),
+        ("cmaes", 3, "CmaEsSampler", {"popsize": None, "n_startup_trials": 0}),
+        ("cmaes", 4, "CmaEsSampler", {"popsize": 4, "n_startup_trials": 0}),
+        ("gp", 1, "GPSampler", {"n_startup_trials": 6}),
+    ],
+)
+def test_what_a_sampler_is_told_and_that_each_point_has_a_seed_of_its_own(
+    sampler, generation, kind, options, monkeypatch
+):
+    made = []
+
+    def noted(name):
+        return lambda **given: made.append((name, given))
+
+    monkeypatch.setattr(samplers, "check_installed", lambda name: None)
+    proposer = new_proposer(sampler, LOW, HIGH, seed=3, generation=generation)
+    proposer._optuna = SimpleNamespace(samplers=SimpleNamespace(**{
+        name: noted(name) for name in ("RandomSampler", "TPESampler", "CmaEsSampler", "GPSampler")
+    }))  # fmt: skip
+    for number in (0, 1):
+        proposer._new_sampler(number)
+    seeds = [given.pop("seed") for _, given in made]
+    assert made == [(kind, options)] * 2
+    assert seeds == [int(np.random.SeedSequence((3, number)).generate_state(1)[0]) for number in (0, 1)]
+
+
+@pytest.mark.parametrize(("trials", "levels"), [(1, 1), (3, 1), (4, 2), (8, 2), (9, 3), (10, 3)])
+def test_a_grid_has_as_many_levels_as_its_trials_allow(trials, levels):
+    points = search(new_proposer("grid", LOW, HIGH, seed=0, trials=trials), 100, 7)
+    assert len(points) == levels**2
+    first = new_proposer("grid", LOW, HIGH, seed=0, trials=trials + 1, first=[BEST])  # one of them is given
+    assert len(search(first, 100, 7)) == levels**2 + 1 and first.told == levels**2 + 1
+    cubic = new_proposer("grid", np.zeros(3), np.ones(3), seed=0, trials=125)  # whose root is a little less than 5
+    assert len(cubic.ask(1000)) == 125

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType, SimpleNamespace
+
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
+from drive_env.dictionary.roles import Role
+from drive_env.emulator.parameters import WIRING
 from drive_env.gains import (
     BASELINE_RULE,
     Gains,
@@ -16,8 +20,11 @@ from drive_env.gains import (
     small_time_constants,
 )
 from drive_env.motors import MOTORS
+from drive_env.trials import score as module
 from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped
-from drive_env.trials.score import VARIANTS, RobustScore, Terms, cost, robust_cost
+from drive_env.trials.score import VARIANTS, CurrentSwings, RobustScore, Terms, cost, robust_cost
+from mechanics.loads import find_load
+from mechanics.shaft import one, way
 from research import fit_rule
 
 DEVICE, MOTOR = find_device("tmcm1636"), MOTORS["qbl4208"]
@@ -352,3 +359,227 @@ def test_swing_is_the_worst_of_the_windows_of_a_watch():
 
 def test_a_jump_between_two_windows_is_seen_by_neither():
     assert swing(np.repeat([0.0, 5.0], 25)[:, None], 2.0) == pytest.approx([0.0])
+
+
+# --- without a machine: what is set, in which order, and what is made of what is recorded -----------------------------
+SCALE = 65536 / (2 * np.pi)
+
+
+class Machines:
+    """Emulated drives of two machines, three runs and two axes, which do what a test says."""
+
+    def __init__(self, frees=None, loaded=None):
+        self.num_axes, self.device, self.motor, self.log = 12, DEVICE, MOTOR, []
+        self.load = SimpleNamespace(
+            parameters=[SimpleNamespace(name=name, field=field) for name, field in
+                        (("inertia", "body_inertia"), ("mass", "body_mass"), ("stiffness", "jnt_stiffness"),
+                         ("contact", "contact_stiffness"), ("stuff", "density"), ("friction", "dof_frictionloss"))]
+        )  # fmt: skip
+        log = self.log
+
+        class Machine:
+            supply, diverged = np.full(12, 24.0), np.zeros(6, bool)
+            parameters = MappingProxyType({"stage.velocity_filter": np.array([100.0, 200.0, 400.0] * 2)})
+
+            def reset(self):
+                log.append("reset")
+
+            def set_all(self, values, where):
+                log.append(({name: value.tolist() for name, value in values.items()}, where.tolist()))
+
+            def __setattr__(self, name, value):
+                log.append((name, np.asarray(value).tolist()))
+                self.__dict__[name] = value
+
+        self.machine = Machine()
+        self.records = [frees, loaded]
+
+    def record(self, objects, seconds):
+        self.log.append(("record", list(objects), round(seconds, 6)))
+        rows, known = round(seconds / 1e-3), self.records.pop(0) or {}
+        zero = np.zeros((rows, 12), int)
+        found = {name: zero + known.get(name, 0) for name in objects}
+        found[STATUS] = zero + 0x0637 if STATUS not in known else zero + known[STATUS]
+        return found
+
+
+POSITION, CURRENT, STATUS = 0x6064, 0x6077, 0x6041
+
+
+def scored(variants=VARIANTS[:3], repeats=1, **recorded):
+    """A score of two machines of two axes, three runs of each."""
+    made = RobustScore.__new__(RobustScore)
+    made.variants, made.num_machines, made.repeats = variants[: 3 // repeats], 2, repeats
+    made._runs, made._axes = 3, (2, 3, 2)
+    made._drives = Machines(**recorded)
+    made._constant, made._load_torque = np.zeros(6), -0.25
+    made._factors = np.tile(np.repeat([1.0, 2.0, 3.0], 2), 2)
+    made._t_0, made._reference = np.full(12, 0.01), np.ones((2, 2))
+    one = np.full(12, 10_000)
+    made._move = Move(one * np.tile([1, -1], 6), one, one, np.full(12, SCALE), 4096 / (2 * np.pi))
+    return made
+
+
+LOAD = {f"load.{name}": np.ones(2) for name in ("inertia", "mass", "stiffness", "contact", "stuff", "friction")}
+
+
+def test_machines_have_their_parameters_in_all_variants_each_with_its_factor():
+    made = scored((VARIANTS[1], VARIANTS[3], VARIANTS[0]))
+    two = np.array([1.0, 2.0])
+    given = {f"load.{name}": two for name in ("inertia", "mass", "stiffness", "contact", "stuff", "friction")}
+    made.set_machines(given | {"motor.R_s": two}, np.array([20.0, 30.0]))
+    (values, where), supply = made._drives.log
+    heavy, soft, plain = ([k * x for k in (1.0, 2.0) for x in row] for row in
+                          ((1.3, 1.0, 1.0), (1.0, 0.8, 1.0), (1.0, 1.0, 1.0)))  # fmt: skip
+    expected = {"load.inertia": heavy, "load.mass": heavy, "load.stuff": heavy, "load.stiffness": soft,
+                "load.contact": soft, "load.friction": plain, "motor.R_s": plain}  # fmt: skip
+    assert values == {name: pytest.approx(row) for name, row in expected.items()}
+    assert where == [True] * 6 and supply == ("supply", [20.0] * 6 + [30.0] * 6)
+    expected = 4.0 * small_time_constants(DEVICE, np.array([100.0, 200.0, 400.0] * 2))
+    np.testing.assert_allclose(made._t_0, np.repeat(expected, 2))
+
+
+def test_how_motors_are_wired_changes_nothing_of_a_score():
+    made = scored()
+    made.set_machines(LOAD | {name: np.ones(2) for name in [*WIRING, "motor.R_s"]}, np.full(2, 24.0))
+    assert set(made._drives.log[0][0]) == {"motor.R_s", *LOAD}
+
+
+def test_only_machines_that_are_asked_for_are_set():
+    made = scored()
+    made.set_machines(LOAD, np.array([20.0, 30.0]), np.array([False, True]))
+    assert made._drives.log[0][1] == [False] * 3 + [True] * 3
+    assert made._drives.log[1] == ("supply", [24.0] * 6 + [30.0] * 6)
+    made.set_constant_load(np.array([0.1, -0.2]))
+    assert made._constant.tolist() == [0.1] * 3 + [-0.2] * 3
+    move = Move(*(np.array([1, 2, 3, 4]) * k for k in (1, 10, 100, 1000.0)), 7.0)
+    made.set_moves(move, np.array([False, True]))
+    assert made._move.distance.tolist() == [10_000, -10_000] * 3 + [3, 4] * 3
+    assert made._move.velocity.tolist() == [10_000] * 6 + [30, 40] * 3
+    assert made._move.acceleration.tolist() == [10_000] * 6 + [300, 400] * 3
+    assert made._move.increments.tolist() == [SCALE] * 6 + [3000.0, 4000.0] * 3 and made._move.counts == 7.0
+    made.set_moves(move)
+    assert made._move.distance.tolist() == [1, 2] * 3 + [3, 4] * 3
+
+
+@pytest.fixture
+def unmoved(monkeypatch):
+    """What a run does to drives besides, in its order."""
+    done = []
+    monkeypatch.setattr(module, "ampere_per_count", lambda drives: 1e-3)
+    for name in ("write_gains", "write_profile", "power_up", "start"):
+
+        def note(drives, *more, name=name):
+            drives.log.append(name)
+            done.append((name, *more))
+
+        monkeypatch.setattr(module, name, note)
+    return done
+
+
+def test_a_run_is_a_move_and_then_a_load_step(unmoved):
+    made = scored()
+    made._constant = np.array([0.1, 0.1, 0.1, -0.2, -0.2, -0.2])
+    gains = np.array([[1000, 200, 800, 100, 50]] * 4)
+    terms, disturbance, swings = made._run(gains)
+    constant, loaded = made._constant.tolist(), (made._constant - 0.25).tolist()
+    objects = [POSITION, CURRENT, Role.TORQUE_ERROR, STATUS]
+    assert made._drives.log == [
+        ("load_torque", constant), "reset", "write_gains", "write_profile", "power_up", "start",
+        ("record", objects, 0.15), ("load_torque", loaded), ("record", objects, 0.1),
+    ]  # fmt: skip
+    written = unmoved[0][1]
+    assert written[:, 2].tolist() == [800, 800, 1600, 1600, 2400, 2400] * 2
+    assert unmoved[1][1] is made._move and unmoved[3][1] is made._move.distance
+    assert terms.settling.shape == disturbance.shape == swings.moving.shape == (2, 3, 2)
+    assert not terms.tripped.any() and (terms.disturbance == 1.0).all()
+    # It stands still: 10,000 increments from its target, out of the band for 90 ms, and for 100 ms under load.
+    np.testing.assert_allclose(terms.settling, 10.0)
+    np.testing.assert_allclose(disturbance, 10_000 / SCALE * 0.1)
+    assert not terms.noise.any() and not terms.overshoot.any() and not swings.resting.any()
+
+
+def test_what_is_counted_in_a_run_by_hand(unmoved):
+    """Ripple is of the demanded current, the actual one and its error; swings are of the actual one."""
+    direction = np.tile([1, -1], 6)
+    there = 10_000 * direction
+    ripple = np.where(np.arange(SETTLED)[:, None] % 2, 0, 70)
+    free = {POSITION: there + 500 * direction * (np.arange(SETTLED)[:, None] == 80), CURRENT: ripple,
+            Role.TORQUE_ERROR: 2 * ripple}  # fmt: skip
+    under = {POSITION: there + np.where(np.arange(12) < 6, 100, 0)}
+    made = scored(frees=free, loaded=under)
+    terms, disturbance, swings = made._run(np.array([[1, 1, 1, 1, 1]] * 4))
+    np.testing.assert_allclose(terms.noise, 3 * 0.07 / MOTOR.rated_current)
+    np.testing.assert_allclose(terms.overshoot, 0.05)
+    np.testing.assert_allclose(swings.moving, 0.07 / MOTOR.rated_current)
+    np.testing.assert_allclose(disturbance[0], 100 / SCALE * 0.1)
+    np.testing.assert_allclose(disturbance[1], made._move.least_error)
+
+
+def test_a_fault_of_an_axis_and_what_left_physics_of_a_machine_trip(unmoved):
+    made = scored(loaded={STATUS: np.where(np.arange(12) == 3, 0x0238, 0x0637) * np.ones((100, 1), int)})
+    made._drives.machine.diverged = np.array([False, False, False, False, False, True])
+    terms, *_ = made._run(np.array([[1, 1, 1, 1, 1]] * 4))
+    assert terms.tripped.reshape(-1).tolist() == [k in (3, 10, 11) for k in range(12)]
+
+
+def test_a_drive_that_tells_no_error_of_its_current_has_the_actual_one(unmoved):
+    made = scored()
+    made._drives.device = SimpleNamespace(roles={}, gains=DEVICE.gains)
+    made._run(np.array([[1, 1, 1, 1, 1]] * 4))
+    assert made._drives.log[6] == ("record", [POSITION, CURRENT, STATUS], 0.15)
+
+
+def by_hand(settling, noise=0.0):
+    values = np.asarray(settling, float)
+    zero = 0.0 * values
+    return Terms(values, zero + 1.0, zero + noise, zero, values > 1e9)
+
+
+def test_a_machine_is_its_worst_axis_and_its_robust_cost_half_its_worst_variant():
+    """J of two axes: 32^0.4 is 4, 1024^0.4 is 16."""
+    made = scored()
+    terms = by_hand([[[1.0, 32.0], [1.0, 1.0], [1024.0, 1.0]], [[32.0, 32.0], [1.0, 32.0], [1.0, 1.0]]])
+    moving, resting = np.arange(12.0).reshape(2, 3, 2), -np.arange(12.0).reshape(2, 3, 2)
+    made._reference = np.array([[2.0, 2.0], [1.0, 1.0]])
+    found = made._scores(terms, np.ones((2, 3, 2)) * [[[2.0]], [[1.0]]], CurrentSwings(moving, resting))
+    np.testing.assert_allclose(found.j, [[4.0, 1.0, 16.0], [4.0, 4.0, 1.0]])
+    np.testing.assert_allclose(found.robust_cost, [0.5 * 4.0 + 0.5 * 16.0, 4.0])
+    assert found.terms.settling.tolist() == [[32.0, 1.0, 1024.0], [32.0, 32.0, 1.0]]
+    assert found.swing.tolist() == [[1.0, 3.0, 5.0], [7.0, 9.0, 11.0]]
+    assert found.rest.tolist() == [[0.0, -2.0, -4.0], [-6.0, -8.0, -10.0]]
+
+
+def test_runs_that_are_repeated_count_by_their_mean_and_a_swing_by_its_largest():
+    made = scored(repeats=3)
+    terms = by_hand([[[1.0, 1.0], [32.0, 1.0], [1.0, 1024.0]], [[1.0, 1e10], [1.0, 1.0], [1.0, 1.0]]])
+    three = np.arange(12.0).reshape(2, 3, 2)
+    found = made._scores(terms, np.ones((2, 3, 2)), CurrentSwings(three, three))
+    np.testing.assert_allclose(found.robust_cost, [7.0, (30.0 + 2.0) / 3.0])
+    np.testing.assert_allclose(found.j, [[7.0], [32.0 / 3.0]])
+    np.testing.assert_allclose(found.terms.settling[0], [(1.0 + 32.0 + 1024.0) / 3.0])
+    assert found.terms.tripped.tolist() == [[False], [True]]
+    assert found.swing.tolist() == [[5.0], [11.0]] and found.rest.tolist() == [[3.0], [9.0]]
+
+
+def test_the_baseline_rules_disturbance_is_that_of_its_nominal_runs_of_machines_that_are_asked_for():
+    made = scored(repeats=3)
+    e = np.array([[[1.0, 2.0], [3.0, 4.0], [5.0, 9.0]]] * 2)
+    made._run = lambda gains: (by_hand(np.ones((2, 3, 2))), e, CurrentSwings(e, e))
+    made.set_reference(None, np.array([True, False]))
+    assert made._reference.tolist() == [[3.0, 5.0], [1.0, 1.0]]
+    made.repeats, made.variants = 1, VARIANTS[:3]
+    found = made.set_reference(None)
+    assert made._reference.tolist() == [[1.0, 2.0], [1.0, 2.0]]
+    assert found.terms.disturbance[0, 0] == 1.0
+    assert made.score(None).j.tolist() == found.j.tolist()
+
+
+def test_a_load_step_is_three_tenths_of_the_rated_torque_against_the_move():
+    for name, lever in (("inertia", 1.0), ("belt", None)):
+        score = RobustScore("tmcm1636", name, "qbl4208", 1, num_threads=1)
+        packed = one(find_load(name))
+        lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()
+        assert score._load_torque == pytest.approx(-0.3 * MOTOR.rated_torque / lever)
+        assert score._reference.tolist() == [[1.0]] and score._t_0.tolist() == [1.0] * score._drives.num_axes
+        score.close()

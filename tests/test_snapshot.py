@@ -24,12 +24,15 @@ from drive_env.gains import write_gains
 from drive_env.master.can.sdo import SdoClient
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
+from tuning import snapshot as module
 from tuning.commands.cli import app
 from tuning.snapshot import (
+    Snapshot,
     SnapshotError,
     Transaction,
     can_store,
     check_place,
+    check_same_drives,
     file_before,
     load_snapshot,
     put_back,
@@ -523,3 +526,278 @@ def test_only_drives_of_a_bus_that_have_1010h_can_store(bus, has, can):
     description = SimpleNamespace(has=lambda key: has and key == (0x1010, 1))
     drives = SimpleNamespace(bus=SimpleNamespace(description=description))
     assert can_store(SimpleNamespace(bus=bus, drives=drives)) is can
+
+
+# --- by hand, on drives that a test plays -----------------------------------------------------------------------------
+GAIN = GAIN_OBJECTS[0]
+
+
+class Played:
+    """Three axes with a gain and a current limit each; what is done to them is noted."""
+
+    num_axes, bus, safety, device = 3, None, None, find_device("tmcm1636")
+
+    def __init__(self, status=(0x0240,) * 3, stays=0):
+        self.log, self.status, self.stays = [], np.array(status), stays
+
+    def read(self, name):
+        if name == cia402.STATUSWORD:
+            self.stays -= 1
+            return np.where(self.stays >= 0, 0x0637, self.status)
+        return np.zeros(3, int)
+
+    def write(self, name, value, *, where):
+        self.log.append((name, np.asarray(value).tolist(), None if where is None else where.tolist()))
+
+    def advance(self, seconds):
+        self.log.append(("wait", seconds))
+
+
+BEFORE = tuple({GAIN: 10 + k, CURRENT_LIMIT: 7000} for k in range(3))
+
+
+@pytest.fixture
+def transaction(monkeypatch, tmp_path):
+    """A transaction of such axes, as if it had been entered while none was enabled; what it restores is noted."""
+
+    def start(ran=(False, False, False), now=BEFORE, bus=None, **played):
+        drives = Played(**played)
+        target = SimpleNamespace(num_axes=3, drives=drives, bus=bus or {})
+        made = Transaction(target, tmp_path / "before.toml")
+        made._ran, made.before = np.array(ran), Snapshot("tmcm1636", BEFORE, target.bus)
+        monkeypatch.setattr(module, "_read_axes", lambda drives: now)
+        monkeypatch.setattr(
+            module, "restore",
+            lambda drives, snapshot, where, *, whole: drives.log.append(("restored", where.tolist(), whole)),
+        )  # fmt: skip
+        return made, drives
+
+    return start
+
+
+YES, FIRST = [True] * 3, np.array([True, False, False])
+
+
+def test_a_rollback_gives_gains_back_at_once_and_the_rest_when_no_axis_may_turn(transaction):
+    made, drives = transaction(stays=3)
+    made.roll_back()
+    gains = [(key, [10, 11, 12] if key == GAIN else [0, 0, 0], YES) for key in GAIN_OBJECTS]
+    off = (cia402.CONTROLWORD, 0, YES)
+    assert drives.log == [*gains, off, *[("wait", 0.001)] * 3, ("restored", YES, False)]
+    made, drives = transaction()
+    made.roll_back(FIRST)
+    assert {tuple(entry[2]) for entry in drives.log[:-1]} == {(True, False, False)}
+    assert drives.log[-1] == ("restored", [True, False, False], False)
+
+
+def test_an_axis_that_stays_enabled_for_a_second_is_told(transaction):
+    made, drives = transaction(stays=10**9)
+    with pytest.raises(TimeoutError, match="an axis stays enabled for 1 s after its voltage was switched off"):
+        made.roll_back(FIRST)
+    assert drives.log[-1000:] == [("wait", 0.001)] * 1000 and drives.log[-1001][0] == cia402.CONTROLWORD
+    made, drives = transaction(status=(0x0240, 0x0637, 0x0240))  # one that is not asked for may be on
+    made.roll_back(FIRST)
+    assert drives.log[-1][0] == "restored"
+
+
+@pytest.mark.parametrize(
+    ("committed", "ran", "changed", "back"),
+    [
+        ([], [0, 0, 0], [], [1, 1, 1]),
+        ([1], [0, 0, 0], [], [1, 0, 1]),
+        ([0, 1, 2], [0, 0, 0], [], None),
+        ([], [1, 1, 0], [], [0, 0, 1]),  # somebody else's that nobody has changed
+        ([], [1, 1, 0], [1], [0, 1, 1]),
+        ([0], [1, 1, 0], [1], [0, 1, 1]),
+    ],
+)
+def test_which_axes_are_brought_back_at_the_end(transaction, committed, ran, changed, back):
+    now = tuple(values | {CURRENT_LIMIT: 7001} if k in changed else values for k, values in enumerate(BEFORE))
+    made, drives = transaction(np.array(ran, bool), now)
+    for k in committed:
+        made.commit(np.arange(3) == k)
+    assert made.changed == bool(committed)
+    made.__exit__(None, None, None)
+    restored = [entry for entry in drives.log if entry[0] == "restored"]
+    assert restored == ([] if back is None else [("restored", [bool(k) for k in back], False)])
+    if back is None:
+        assert drives.log == []
+    made.commit()
+    drives.log.clear()
+    made.__exit__(None, None, None)
+    assert drives.log == []
+
+
+def test_objects_of_the_communication_area_are_no_change_of_an_axis(transaction):
+    """They are how drives talk, which a master has in use: 1FFFh is the last of them."""
+    now = tuple(values | {(0x1FFF, 0): 5} for values in BEFORE)
+    made, drives = transaction((True, True, True), now)
+    made.__exit__(None, None, None)
+    assert drives.log[-1] == ("restored", [False] * 3, False)
+    made, drives = transaction((True, True, True), tuple(values | {(0x2000, 0): 5} for values in BEFORE))
+    made.__exit__(None, None, None)
+    assert drives.log[-1] == ("restored", YES, False)
+
+
+def test_what_was_stored_is_stored_again_where_it_is_brought_back(transaction, monkeypatch):
+    stored = []
+    monkeypatch.setattr(module, "store", lambda drives, where: stored.append(None if where is None else where.tolist()))
+    made, _ = transaction(bus={"channel": "x"})
+    assert made.store(np.array([True, True, False])) and load_snapshot(made.path).stored
+    made.commit(FIRST)
+    made.__exit__(None, None, None)
+    assert stored == [[True, True, False], [False, True, False]]
+    made, _ = transaction(bus={"channel": "x"})
+    assert made.store()
+    assert stored[2:] == [None] and made._stored.tolist() == YES
+    made, _ = transaction()
+    assert not made.store() and len(stored) == 3 and not made._stored.any()
+    made.__exit__(None, None, None)
+    assert len(stored) == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"), [(ValueError("too far"), "too far"), (KeyboardInterrupt(), "KeyboardInt")]
+)
+def test_what_still_turns_is_braked_after_an_error_alone(transaction, error, reason):
+    for given, stops in ((error, 1), (None, 0)):
+        made, drives = transaction()
+        stopped = []
+        drives.safety = SimpleNamespace(stop=stopped.append)
+        made.__exit__(type(given), given, None)
+        assert len(stopped) == stops and (not stops or stopped[0].startswith(reason))
+        assert drives.log[-1][0] == "restored"
+
+
+def test_an_envelope_may_refuse_one_call_of_a_rollback_and_no_second(transaction, monkeypatch):
+    made, _ = transaction()
+    tried = []
+
+    def refuse(where):
+        tried.append(where.tolist())
+        raise SafetyError("stalled")
+
+    monkeypatch.setattr(made, "roll_back", refuse)
+    with pytest.raises(BusError, match=r"stalled; the drives may have the gains that were tried: drive-tune undo .*"):
+        made.__exit__(None, None, None)
+    assert tried == [YES, YES]
+
+
+def test_a_disk_that_is_full_is_told_with_what_the_drives_have(transaction):
+    full = OSError(28, "No space left", "a.toml")
+    made, _ = transaction()
+    with pytest.raises(OSError, match="No space left; the drives have their state from before; if not") as caught:
+        made.__exit__(OSError, full, None)
+    assert (caught.value.errno, caught.value.filename) == (28, "a.toml")
+    made, _ = transaction()
+    made.commit(FIRST)
+    made.__exit__(OSError, full, None)  # what was kept is not what was before
+    made, _ = transaction()
+    made.__exit__(OSError, OSError("of no file"), None)
+
+
+@pytest.mark.parametrize(
+    ("committed", "left", "error", "said"),
+    [
+        (False, True, "no", "the drives have their state from before; if not, drive-tune undo {} restores it"),
+        (True, True, "no", "drive-tune undo {} restores the state before"),
+        (False, False, "no", None),  # it was never written
+        (False, True, "see {}", None),  # the error says so
+    ],
+)
+def test_who_fails_says_where_the_file_is(committed, left, error, said, monkeypatch, tmp_path, capsys):
+    file = tmp_path / "before.toml"
+
+    class Made:
+        changed = committed
+
+        def __init__(self, target, path):
+            pass
+
+        def __enter__(self):
+            file.touch() if left else None
+
+        def __exit__(self, *error):
+            return False
+
+    monkeypatch.setattr(module, "Transaction", Made)
+    with pytest.raises(ValueError, match=r"no|see"), put_back(None, file, "drive-agent"):
+        raise ValueError(error.format(file))
+    assert capsys.readouterr().err == ("" if said is None else f"drive-agent: {said.format(file)}\n")
+
+
+def test_a_file_that_does_not_read_back_ends_it_before_anything_is_changed(transaction, monkeypatch):
+    made, _ = transaction()
+    monkeypatch.setattr(module, "take", lambda target: Snapshot("tmcm1636", BEFORE))
+    monkeypatch.setattr(module, "load_snapshot", lambda path: Snapshot("tmcm1636", BEFORE, stored=True))
+    with pytest.raises(OSError, match="the state before does not read back as it was written") as caught:
+        made.__enter__()
+    assert caught.value.errno == 5 and caught.value.filename == str(made.path)
+
+
+def test_a_snapshot_is_restored_axis_by_axis_when_all_of_them_rest(monkeypatch):
+    done = []
+    monkeypatch.setattr(module, "_per_axis", lambda drives: "single")
+    monkeypatch.setattr(module, "check_at_rest", lambda single, values, axis: done.append(("look", axis)))
+
+    def write(single, values, axis):
+        done.append((dict(values), axis))
+        return [axis]
+
+    monkeypatch.setattr(module, "write_all_or_none", write)
+    axes = tuple({(0x1FFF, 0): 1, (0x2000, 0): k} for k in range(3))
+    snapshot = Snapshot("tmcm1636", axes)
+    assert restore(Played(), snapshot) == [[0], [1], [2]]
+    assert done == [*(("look", k) for k in range(3)), *((axes[k], k) for k in range(3))]
+    done.clear()
+    assert restore(Played(), snapshot, np.array([True, False, True]), whole=False) == [[0], [], [2]]
+    assert done == [("look", 0), ("look", 2), ({(0x2000, 0): 0}, 0), ({(0x2000, 0): 2}, 2)]
+    with pytest.raises(SnapshotError, match="is of 3 axes of tmcm6212, and here are 3 of tmcm1636; open the drives"):
+        restore(Played(), Snapshot("tmcm6212", axes))
+
+
+def test_an_object_of_one_emulated_axis_is_read_and_written_by_itself():
+    drives = Played()
+    drives.read = lambda name: np.array([4, 5, 6]) if name == CURRENT_LIMIT else None
+    single = module._per_axis(drives)
+    entry = SimpleNamespace(index=0x2003, sub=0)
+    assert [single.read_axis(entry, k) for k in range(3)] == [4, 5, 6]
+    single.write_axis(entry, 1, 77)
+    assert drives.log == [(CURRENT_LIMIT, 77, [False, True, False])]
+    drives.bus = "of a bus"
+    assert module._per_axis(drives) == "of a bus"
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ("axis = 3\n", "is not a file with the state before a change"),
+        ("axis = []\n", "is not a file with the state before a change"),
+        ("axis = [3]\n", "x.toml: 3 is not an axis; give a file that drive-tune saved before a change"),
+        ('[[axis]]\n"2003:00" = 7000\n"20G0:00" = 1\n', "20G0:00 = 1: "),
+        ('[[axis]]\n"2003:00" = 7000\n', None),
+    ],
+)
+def test_axes_of_a_file_are_tables_of_objects(tmp_path, axes, message):
+    file = tmp_path / "x.toml"
+    file.write_text('device = "tmcm1636"\n' + axes, encoding="utf-8")
+    if message is None:
+        found = load_snapshot(file, unchecked=True)
+        assert found == Snapshot("tmcm1636", ({CURRENT_LIMIT: 7000},)) and found.stored is False
+        return
+    with pytest.raises(SnapshotError, match=message):
+        load_snapshot(file, unchecked=True)
+
+
+def test_identities_are_compared_node_by_node(monkeypatch):
+    compared = []
+    monkeypatch.setattr(module, "read_identity", lambda bus, node: f"here {node}")
+    monkeypatch.setattr(
+        module, "check_same_drive",
+        lambda file, written, here, *, other_drive: compared.append((file, written, here, other_drive)),
+    )  # fmt: skip
+    drives = SimpleNamespace(nodes=(7, 9), bus=None)
+    check_same_drives("f", Snapshot("tmcm1636", (), identities=("a", "b")), drives)
+    check_same_drives("f", Snapshot("tmcm1636", (), identities=("a",)), drives, other_drive=True)
+    check_same_drives("f", Snapshot("tmcm1636", ()), drives)
+    assert compared == [("f", "a", "here 0", False), ("f", "b", "here 1", False), ("f", "a", "here 0", True)]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
+import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +14,17 @@ from drive_env import motion
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import MOTORS
 from mechanics.shaft import shaft_load
-from tuning.compare.suite import SHIPPED, groups, load_suite, open_group, open_machines
+from tuning.compare import suite as module
+from tuning.compare.suite import (
+    SHIPPED,
+    SuiteMachine,
+    _draw,
+    _spread,
+    groups,
+    load_suite,
+    open_group,
+    open_machines,
+)
 from tuning.toml_tables import ExperimentError
 
 SMALL = """
@@ -186,3 +198,177 @@ def test_unknown_suites_are_refused_with_those_that_ship():
         load_suite("nowhere.toml")
     with pytest.raises(ExperimentError, match=r"count must be 1 or more, not 0"):
         load_suite(count=0)
+
+
+# --- without a machine: what a file says, what is drawn, and in which order -------------------------------------------
+PLAIN = 'device = "tmcm1636"\n'
+GROUP = (
+    '[[group]]\nload = "inertia"\nmotor = "qbl4208"\nsupply = [24, 20]\n[group.parameters]\n"load.inertia" = [1, 2]\n'
+)
+
+
+@pytest.fixture
+def unmade(monkeypatch, small):
+    """Read a suite whose machines have but an inertia, and draw them by their number alone."""
+    drawn = []
+
+    def draw(where, device, load, motor, seed, number):
+        drawn.append((where, device, load, motor, seed, number))
+        return SuiteMachine(f"drawn-{number}", device, load, motor, {}, 24.0)
+
+    monkeypatch.setattr(module, "_defaults", lambda device, load, motor: {"load.inertia": 3.0})
+    monkeypatch.setattr(module, "_draw", draw)
+
+    def read(text, *arguments, **options):
+        drawn.clear()
+        return load_suite(small(PLAIN + text), *arguments, **options), drawn
+
+    return read
+
+
+def test_a_table_has_a_machine_in_each_column(unmade):
+    (one, other), _ = unmade(GROUP)
+    assert one == SuiteMachine("inertia-qbl4208-0", "tmcm1636", "inertia", "qbl4208", {"load.inertia": 1.0}, 24.0)
+    assert (other.name, other.parameters, other.supply) == ("inertia-qbl4208-1", {"load.inertia": 2.0}, 20.0)
+    assert (one.friction, one.travel, one.kind) == (
+        "stribeck", math.inf, ("tmcm1636", "inertia", "qbl4208", "stribeck"),
+    )  # fmt: skip
+    given = GROUP.replace("supply", 'friction = "lugre"\ntravel = [inf, 0.5]\nsupply')
+    (one, other), _ = unmade(given)
+    assert (one.friction, one.travel, other.travel) == ("lugre", math.inf, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right", "message"),
+    [
+        ("[24, 20]", "[24, 0]", r"supply 0 V and travel inf rev of machine 1 must be above 0"),
+        ("[24, 20]", "[24, 20]\ntravel = [0, 1]", r"supply 24 V and travel 0 rev of machine 0 must be above 0"),
+        ("[24, 20]", "[24, 20]\ntravel = [1]", r"travel has 1 numbers for 2 machines; give one per machine"),
+        ("[24, 20]", "[]", r"supply = \[\] must be an array of numbers, one per machine"),
+        ("[24, 20]", "[24, nan]", r"supply = nan is not finite; give a number"),
+        ("[24, 20]", "[24, true]", r"supply = True is a truth value; it must be a number"),
+        ("[24, 20]\n", "[24, 20]\nweight = 3\n", r"group: key 'weight' is unknown; there are load, motor, friction"),
+        ('motor = "qbl4208"\n', "", r"group: key 'motor' is missing"),
+        (GROUP, "", r"small.toml: it has no machine; add a \[\[group\]\], or \[\[generated\]\] and a seed"),
+        (GROUP, "colour = 3", r"key 'colour' is unknown; there are device, group, generated"),
+        (GROUP, "group = [3]", r"group is a whole number; it must be a table"),
+    ],
+)
+def test_a_mistake_in_a_table_is_told(unmade, wrong, right, message):
+    with pytest.raises(ExperimentError, match=message):
+        unmade(GROUP.replace(wrong, right))
+
+
+def test_machines_are_drawn_in_turn_and_numbered_on_from_table_to_table(unmade):
+    tables = (
+        '[[generated]]\ncount = 3\ngroups = [["a", "x"], ["b", "y"]]\n[[generated]]\ncount = 2\ngroups = [["c", "z"]]\n'
+    )
+    machines, drawn = unmade(GROUP + tables, 7)
+    assert [machine.name for machine in machines] == [
+        "inertia-qbl4208-0", "inertia-qbl4208-1", *(f"drawn-{k}" for k in range(5))
+    ]  # fmt: skip
+    assert drawn == [
+        ("small.toml: generated", "tmcm1636", load, motor, 7, k)
+        for k, (load, motor) in enumerate([("a", "x"), ("b", "y"), ("a", "x"), ("c", "z"), ("c", "z")])
+    ]
+    assert len(unmade(GROUP + tables)[0]) == 2 and unmade(GROUP + tables, 0)[1][0][4] == 0
+    assert len(unmade(tables, 1)[0]) == 5
+    with pytest.raises(ExperimentError, match="it has no machine"):
+        unmade(tables)
+    with pytest.raises(ExperimentError, match="seed must be 0 or more, not -1"):
+        unmade(tables, -1)
+
+
+@pytest.mark.parametrize("groups", ["[]", "3", "[3]", '[["a"]]', '[["a", "b", "c"]]', '[["a", "b"], "c"]'])
+def test_what_is_drawn_are_pairs_of_load_and_motor(unmade, groups):
+    with pytest.raises(ExperimentError, match=r"generated: groups must be an array of \[load, motor\]"):
+        unmade(f"[[generated]]\ncount = 1\ngroups = {groups}\n", 1)
+
+
+def machine(name, load):
+    return SuiteMachine(name, "tmcm1636", load, "qbl4208", {}, 24.0)
+
+
+ROW = [machine("a0", "a"), machine("b0", "b"), machine("a1", "a"), machine("a2", "a"), machine("b1", "b")]
+
+
+def test_machines_of_a_kind_are_grouped_in_the_order_of_their_first():
+    assert groups(ROW) == [[0, 2, 3], [1, 4]] and groups([]) == []
+
+
+@pytest.mark.parametrize(
+    ("count", "names"),
+    [(1, "a0"), (2, "a0 b0"), (3, "a0 b0 a1"), (4, "a0 b0 a1 b1"), (5, "a0 b0 a1 a2 b1"), (9, "a0 b0 a1 a2 b1")],
+)
+def test_so_many_machines_are_taken_from_the_groups_in_turn(count, names):
+    assert [one.name for one in _spread(ROW, count)] == names.split()
+
+
+@pytest.mark.parametrize(("sound", "tries"), [(1, 1), (3, 3), (50, 50), (51, None)])
+def test_a_machine_that_its_motor_cannot_move_is_drawn_again_fifty_times(sound, tries, monkeypatch):
+    drawn = []
+
+    class Laws:
+        def draw(self, rng, known):
+            drawn.append((rng.integers(10**9), known["supply.voltage"], known["load.inertia"]))
+            return {"load.inertia": len(drawn), "supply.voltage": 20.0 + len(drawn)}
+
+    monkeypatch.setattr(module, "_checked_defaults", lambda where, device, load, motor: {"load.inertia": 3.0})
+    monkeypatch.setattr(module, "laws_of", lambda load, device, defaults: Laws())
+    monkeypatch.setattr(module, "_sound", lambda device, load, motor, drawn: drawn["load.inertia"] >= sound)
+    if tries is None:
+        with pytest.raises(ExperimentError, match="here: 50 draws of 'inertia' gave no machine that 'qbl4208' can mov"):
+            _draw("here", "tmcm1636", "inertia", "qbl4208", 5, 7)
+        return
+    found = _draw("here", "tmcm1636", "inertia", "qbl4208", 5, 7)
+    assert (found.name, found.parameters, found.supply) == (
+        "seed5-07-inertia-qbl4208", {"load.inertia": tries}, 20.0 + tries
+    )  # fmt: skip
+    assert len(drawn) == tries and drawn[0][1:] == (24.0, 3.0)
+    assert drawn[0][0] == np.random.default_rng((5, 7)).integers(10**9)
+    with pytest.raises(ExperimentError, match=r"here: load 'anvil' has no distributions; there are .*inertia"):
+        _draw("here", "tmcm1636", "anvil", "qbl4208", 5, 7)
+
+
+def test_the_noise_of_a_machine_follows_from_its_name(small):
+    machines = load_suite(small())
+    with open_group(machines) as target:
+        seeds = target.drives.inside.noise_seeds.tolist()
+        assert (target.axes_per_machine, target.linked, target.machine) == (1, False, "inertia")
+        assert (target.speed, target.current) == (target.motor.rated_speed, target.motor.rated_current)
+    assert seeds == [2.0 + zlib.crc32(one.name.encode()) % (2**32 - 2) for one in machines]
+
+
+@pytest.mark.parametrize(("error", "sound"), [(None, True), (ValueError("no"), False), ("misfit", False)])
+def test_a_machine_is_sound_that_can_be_made_without_a_warning_of_its_inertia(error, sound, monkeypatch):
+    closed = []
+
+    def made(*arguments, **options):
+        assert arguments == ("tmcm1636", "inertia", "qbl4208") and options == {"parameters": {"a": 1}, "num_threads": 1}
+        if error == "misfit":
+            warnings.warn("it cannot move it", MisfitWarning, stacklevel=1)
+        elif error:
+            raise error
+        return SimpleNamespace(close=lambda: closed.append(1))
+
+    monkeypatch.setattr(module, "EmulatedDrives", made)
+    assert module._sound("tmcm1636", "inertia", "qbl4208", {"a": 1}) is sound
+    assert closed == ([1] if sound else [])
+
+
+def test_machines_are_opened_kind_by_kind(monkeypatch):
+    opened = []
+
+    class Opened:
+        def __init__(self, machines, num_threads):
+            opened.append(([one.name for one in machines], num_threads))
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            opened.append("closed")
+
+    monkeypatch.setattr(module, "open_group", Opened)
+    assert [indices for _, indices in open_machines(ROW, 3)] == [[0, 2, 3], [1, 4]]
+    assert opened == [(["a0", "a1", "a2"], 3), "closed", (["b0", "b1"], 3), "closed"]

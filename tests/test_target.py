@@ -18,11 +18,25 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.drives.speeds import per_increment
 from drive_env.master.errors import refused
 from drive_env.motors import find_motor
-from mechanics.loads import LOADS
+from mechanics.loads import LOADS, find_load
+from mechanics.shaft import one, way
 from tuning.commands.options import TargetOptions, errors_as_exit_codes, open_target, parse_travel
-from tuning.target import FREE, Target, emulated, on_bus, timed
+from tuning.target import (
+    FREE,
+    LOCKSTEP_PATIENCE,
+    DriveTime,
+    Target,
+    address_of,
+    emulated,
+    hold_to_travel,
+    of_bus,
+    of_machines,
+    on_bus,
+    timed,
+)
 
 TURN = 2.0 * math.pi
 
@@ -269,3 +283,155 @@ def test_limits_of_a_target(change, message):
         return
     with pytest.raises(ValueError, match=message):
         Target(drives, find_device("tmcm1636"), find_motor("qbl4208"), **given)
+
+
+# --- what is made of drives that are there already ----------------------------------------------------------------
+DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
+
+
+class Envelope:
+    """An envelope that keeps what it was told."""
+
+    def change(self, limits):
+        self.limits = limits
+
+
+def drives_of_a_bus(positions, scale=65536, device=DEVICE):
+    """Drives of a bus that stand somewhere, with so many increments per turn."""
+    values = {0x6064: np.asarray(positions)}
+    return SimpleNamespace(
+        num_axes=len(positions), device=device, safety=Envelope(),
+        read=lambda name: values[name] if name in values else np.full(len(positions), scale),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("axes", "together", "linked"), [("apart", 1, False), ("coupled", 2, False), ("linked", 2, True)]
+)
+def test_how_the_axes_of_a_bus_belong_together(axes, together, linked):
+    target = of_bus(
+        drives_of_a_bus([0, 0]), MOTOR, {"channel": "can3", "nodes": [4, 9]}, travel=((-1.0, 2.0), (-3.0, 0.5)),
+        axes=axes,
+    )  # fmt: skip
+    assert (target.axes_per_machine, target.linked) == (together, linked)
+    assert (target.low.tolist(), target.high.tolist()) == ([-1.0, -3.0], [2.0, 0.5])
+    assert target.machine == "can3, node 4, 9" and target.bus == {"channel": "can3", "nodes": [4, 9]}
+    assert target.supply.tolist() == [24.0, 24.0]
+    assert (target.speed, target.current) == (MOTOR.rated_speed, MOTOR.rated_current)
+
+
+def test_what_the_user_knows_of_a_bus_counts():
+    target = of_bus(drives_of_a_bus([0]), MOTOR, {}, travel=FREE, supply=30.0, speed=7.0, current=0.5)
+    assert (target.supply.tolist(), target.speed, target.current) == ([30.0], 7.0, 0.5)
+    assert target.machine == "a bus, node "
+    with pytest.raises(ValueError, match="--axes loose must be one of apart, coupled, linked"):
+        of_bus(drives_of_a_bus([0]), MOTOR, {}, travel=FREE, axes="loose")
+
+
+@pytest.mark.parametrize(
+    ("travel", "message"),
+    [
+        ((-1e9, 1e9), None),
+        ((-1.001e9, 1.0), r"a travel of -1.001e\+09 to 1 rad is impossible; an axis has 1e\+09 rad to either side"),
+        ((-1.0, 1.001e9), r"impossible"),
+        ((-math.inf, math.nan), "impossible"),
+        ((-math.inf, 5.0), None),
+        (((-1.0, 1.0),) * 3, "3 ranges of travel are given, for 1 axis/axes; give one for all, or one for each"),
+    ],
+)
+def test_no_axis_has_a_travel_beyond_what_counters_hold(travel, message):
+    if message is None:
+        assert of_bus(drives_of_a_bus([0]), MOTOR, {}, travel=travel).high.tolist() == [travel[1]]
+        return
+    with pytest.raises(ValueError, match=message):
+        of_bus(drives_of_a_bus([0]), MOTOR, {}, travel=travel)
+
+
+@pytest.mark.parametrize(
+    ("travel", "slack"),  # in turns
+    [
+        ((-1.0, 1.0), 0.1),  # a twentieth of it
+        ((0.0, 8.0), 0.4),
+        ((-0.1, 0.1), 0.02),  # at least a fiftieth of a turn
+        ((-50.0, 50.0), 0.5),  # at most half a turn
+        ((-1.0, math.inf), 0.02),
+    ],
+)
+def test_the_envelope_lets_an_axis_overshoot_its_travel_by_a_twentieth_of_it(travel, slack):
+    drives = drives_of_a_bus([1000, -500])
+    hold_to_travel(of_bus(drives, MOTOR, {}, travel=tuple(TURN * end for end in travel)))
+    low, high = drives.safety.limits.position
+    here = np.array([1000, -500])
+    np.testing.assert_allclose(low, here + (travel[0] - slack) * 65536)
+    np.testing.assert_allclose(high, here + (travel[1] + slack) * 65536)
+
+
+@pytest.mark.parametrize(("device", "motor", "times"), [("tmcm1636", "qbl4208", 2), ("tmcm3313", None, 3)])
+def test_the_envelope_holds_an_axis_to_a_multiple_of_its_motors_speed(device, motor, times):
+    """Twice the rated one, thrice where an encoder commutates a stepper: it is faster while it catches up."""
+    row = find_device(device)
+    turned = find_motor(motor or row.default_motor)
+    drives = drives_of_a_bus([0], 51_200, row)
+    hold_to_travel(of_bus(drives, turned, {}, travel=FREE))
+    per_radian = 51_200 / TURN * per_increment(drives, 0x606C)
+    counts = float(np.squeeze(times * turned.rated_speed * per_radian))
+    assert drives.safety.limits.velocity == [math.ceil(counts - 1e-9)]
+
+
+def test_positions_and_speeds_are_counted_in_turns_of_the_rotor():
+    target = of_bus(drives_of_a_bus([0, 0], 4096), MOTOR, {}, travel=FREE)
+    assert target.increments() == pytest.approx([4096 / TURN] * 2)
+    assert target.speed_counts() == pytest.approx([4096 / TURN] * 2)  # of this drive increments per second
+
+
+def test_the_address_of_drives_is_what_a_file_can_hold(monkeypatch):
+    for name in ("DRIVE_ENV_INTERFACE", "DRIVE_ENV_CHANNEL"):
+        monkeypatch.delenv(name, raising=False)
+    options = {"bitrate": 250_000, "pace": "lockstep", "safety": False, "bus": object(), "timeout": 3}
+    assert address_of("pcan", "x", (3, 5), options) == {
+        "interface": "pcan", "channel": "x", "nodes": [3, 5], "bitrate": 250_000, "pace": "lockstep",
+    }  # fmt: skip
+    assert address_of(None, None, (1,), {"bitrate": None, "pace": object()}) == {"nodes": [1]}
+    monkeypatch.setenv("DRIVE_ENV_INTERFACE", "socketcan")
+    monkeypatch.setenv("DRIVE_ENV_CHANNEL", "can7")
+    assert address_of(None, "can2", (1,), {}) == {"interface": "socketcan", "channel": "can2", "nodes": [1]}
+    assert address_of("pcan", None, (1,), {}) == {"interface": "pcan", "channel": "can7", "nodes": [1]}
+
+
+def machines_that_stand_at(angles, load="belt"):
+    row = find_load(load)
+    return SimpleNamespace(
+        load=row, num_machines=len(angles) // row.num_axes, num_axes=len(angles), device=DEVICE, motor=MOTOR,
+        machine=SimpleNamespace(rotor_angle=np.array(angles)),
+    )  # fmt: skip
+
+
+def test_the_way_to_the_ends_of_a_load_is_counted_from_where_the_rotor_stands():
+    """A rotor beyond one end has no way to that side; what the user gives narrows it and never widens it."""
+    end = way(one(find_load("belt"))).high[0]
+    made = machines_that_stand_at([0.0, 3.0, -3.0, end + 1.0, -end - 1.0])
+    target = of_machines(SimpleNamespace(num_axes=5), made)
+    np.testing.assert_allclose(target.low, [-end, -end - 3.0, 3.0 - end, -2.0 * end - 1.0, 0.0])
+    np.testing.assert_allclose(target.high, [end, end - 3.0, end + 3.0, 0.0, 2.0 * end + 1.0])
+    assert (target.axes_per_machine, target.linked, target.machine) == (1, False, "belt")
+    assert (target.supply.tolist(), target.speed, target.current) == ([24.0] * 5, MOTOR.rated_speed, 3.5)
+    near = of_machines(SimpleNamespace(num_axes=5), made, travel=(-2.0, 1e6), supply=20.0, speed=3.0, current=1.0)
+    np.testing.assert_allclose(near.low, [-2.0, -2.0, -2.0, -2.0, 0.0])
+    np.testing.assert_allclose(near.high, target.high)
+    assert (near.supply.tolist(), near.speed, near.current) == ([20.0] * 5, 3.0, 1.0)
+
+
+def test_the_axes_of_a_gantry_are_linked():
+    target = of_machines(SimpleNamespace(num_axes=4), machines_that_stand_at([0.0] * 4, "gantry"))
+    assert (target.axes_per_machine, target.linked) == (2, True)
+
+
+def test_time_that_passes_is_added_up():
+    clock = DriveTime()
+    clock.passes(0.25)
+    clock.passes(0.5)
+    assert clock.seconds == 0.75
+
+
+def test_where_time_waits_an_answer_has_five_seconds():
+    assert LOCKSTEP_PATIENCE == 5.0

@@ -85,3 +85,44 @@ def test_a_pass_has_two_periods_at_least(count, passes):
 def test_noise_is_no_distortion():
     _, distortion = directions(WAVE, answer(2.0, 0, 0.5), LINES, 4)
     assert distortion[0] < 0.05
+
+
+def backwards_by(lines):
+    """Four passes of two periods, of which every other answers a tenth less at some lines [Hz]."""
+    spectrum = np.fft.rfft(WAVE[:100, 0])
+    less = spectrum.copy()
+    less[[round(f / 10.0) for f in lines]] *= 0.9
+    one, other = (np.tile(np.fft.irfft(part, 100), 2) for part in (spectrum, less))
+    return np.concatenate([one, other, one, other])[:, None] * [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "seen"),
+    [
+        ((50.0, 60.0), False),  # a tenth of the 20 lines up to 200 Hz is left out at each end
+        ((50.0, 60.0, 70.0), True),
+        ((180.0, 190.0, 200.0), True),
+        ((190.0, 200.0, 210.0), False),
+        (tuple(np.arange(210.0, 401.0, 10.0)), False),  # what differs above 200 Hz is none
+    ],
+)
+def test_passes_are_compared_up_to_200_hz_without_the_tenth_of_lines_that_differ_most(lines, seen):
+    _, distortion = directions(WAVE, backwards_by(lines), LINES, 4)
+    assert np.all(distortion > 1e-3) if seen else np.all(distortion < 1e-6)
+
+
+def test_how_passes_differ_is_the_mean_of_the_lines_that_are_left():
+    """One of 16 lines differs by 0.05 of 0.95 to either side, in two of four passes."""
+    _, distortion = directions(WAVE, backwards_by((50.0, 60.0, 70.0)), LINES, 4)
+    np.testing.assert_allclose(distortion, np.sqrt(4 * 0.05**2 / 3 / 0.95**2 / 16))
+
+
+def test_the_spread_of_few_periods_is_theirs():
+    """sqrt((1 - c) / c / (periods - 1)), of a coherence c; one period has one degree of freedom, too."""
+    found = answer(2.0, 0, 0.5)
+    for periods, freedom in ((8, 7), (3, 2), (2, 1)):
+        _, _, spread = transfer(WAVE[: 100 * periods], found[: 100 * periods], LINES)
+        x, y = (np.fft.rfft(part[: 100 * periods, 0].reshape(periods, 100), axis=1)[:, LINES.bins] for part in
+                (WAVE, found))  # fmt: skip
+        c = np.abs((x.conj() * y).mean(axis=0)) ** 2 / ((np.abs(x) ** 2).mean(axis=0) * (np.abs(y) ** 2).mean(axis=0))
+        np.testing.assert_allclose(spread[:, 0], np.sqrt((1.0 - c) / c / freedom), rtol=1e-6)

@@ -12,17 +12,19 @@ from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.motors import find_motor
 from drive_env.safety.errors import SafetyError
+from drive_env.safety.limits import Limits
 from drive_env.trials.gain_trial import Trial
 from drive_env.trials.method import method_of
 from drive_env.trials.score import Terms
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.search import trial_bench as module
-from tuning.search.trial_bench import MOST_STOPS, TrialBench, Tried
+from tuning.search.trial_bench import TrialBench, Tried, first_gains, leave_oscillations_to_trials, read_gains
 from tuning.search.trial_log import LoggedTrials
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 GAINS = np.array([[1000, 200, 800, 100, 50]] * 4)
 T_0 = 0.004
+MOST_STOPS = 3  # trials in a row that the envelope may end
 
 
 class Drives:
@@ -337,3 +339,122 @@ def test_a_log_of_another_search_is_refused(searched, written, tmp_path, gains, 
         pytest.raises(ShardLogError, match="trials of another search; remove"),
     ):
         LoggedTrials(bench, clock, log).run(gains, np.array(where))
+
+
+# --- a bench is made, and identifies ------------------------------------------------------------------------------
+class Standing(Drives):
+    """Drives of two machines of two axes, of which the second axis is enabled, that have some gains and profile."""
+
+    time_waits, safety, device = True, None, DEVICE
+
+    def __init__(self, machine=None):
+        super().__init__()
+        self.machine = machine
+
+    def read(self, name):
+        known = {
+            cia402.POSITION_ACTUAL: [10, 20, 30, 40], cia402.STATUSWORD: [0x0240, 0x0637, 0x0240, 0x0238],
+            cia402.PROFILE_VELOCITY: [1, 2, 3, 4], cia402.PROFILE_ACCELERATION: [5] * 4,
+            cia402.PROFILE_DECELERATION: [6] * 4,
+        }  # fmt: skip
+        return np.array(known.get(name, [65536] * 4))
+
+
+def target_of(drives, **options):
+    given = {
+        "drives": drives, "num_axes": 4, "axes_per_machine": 2, "device": DEVICE, "motor": MOTOR,
+        "low": np.array([-1.0, -2.0, -math.inf, -2.0]), "high": np.array([2.0, 1.0, math.inf, 2.0]),
+        "supply": np.array([24.0, 24.0, 30.0, 30.0]), "current": 3.5,
+    }  # fmt: skip
+    return SimpleNamespace(**(given | options))
+
+
+def test_a_bench_knows_the_way_the_state_and_the_profile_that_it_found():
+    """The way is the longer one, with its sign; forwards where both are equal."""
+    bench = TrialBench(target_of(Standing()))
+    assert bench.num_machines == 2 and bench.moves.tolist() == bench.aborts.tolist() == [0] * 4
+    assert bench.reach.tolist() == [2.0, -2.0, math.inf, 2.0]
+    assert bench._was_enabled.tolist() == [False, True, False, False]
+    assert {name: values.tolist() for name, values in bench._profile.items()} == {
+        cia402.PROFILE_VELOCITY: [1, 2, 3, 4], cia402.PROFILE_ACCELERATION: [5] * 4,
+        cia402.PROFILE_DECELERATION: [6] * 4,
+    }  # fmt: skip
+    assert bench.t_0 == method_of(DEVICE, MOTOR).t_0() and bench.highest.tolist() == DEVICE.gains.highest.tolist()
+    assert (bench._stops, bench._direction.tolist(), bench._where.tolist()) == (0, [1] * 4, [True] * 4)
+    assert bench.trials is bench._trials
+
+
+@pytest.mark.parametrize(
+    ("anew", "machine", "resets"), [(False, object(), False), (True, object(), True), (True, None, False)]
+)
+def test_only_emulated_machines_can_begin_anew(anew, machine, resets):
+    assert TrialBench(target_of(Standing(machine)), anew=anew)._anew is resets
+    assert TrialBench(target_of(Standing(machine)))._anew is False
+
+
+@pytest.mark.parametrize(("anew", "measures"), [(False, True), (True, True), (False, False)])
+def test_identification_ends_with_safe_gains_on_drives_that_stand(anew, measures, written, monkeypatch):
+    """First gains before anything is enabled; a tenth of a second until what was before has died away."""
+    drives, done = Standing(object()), []
+    bench = TrialBench(target_of(drives), anew=anew)
+    drives.log = done
+    present, first, rule, safe = (np.full((4, 5), k) for k in range(4))
+    monkeypatch.setattr(module, "machine_of", lambda drives: SimpleNamespace(reset=lambda: done.append("reset")))
+    monkeypatch.setattr(module, "read_gains", lambda target: present)
+    monkeypatch.setattr(
+        module, "write_gains", lambda drives, gains, where=None: done.append(("gains", int(gains[0, 0]), where))
+    )
+    planned = []
+
+    def plan(found, scaler, reach):
+        planned.append((found, scaler.tolist(), reach.tolist()))
+        return "move"
+
+    bench.method = SimpleNamespace(
+        measures_current=measures, first=lambda supply: first + int(supply[2] == 30.0) - 1,
+        keep=lambda gains, kept: gains + (100 if kept is present else 0), plan=plan,
+        rule=lambda found, move, supply: rule if (found, move) == ("found", "move") else None,
+        safe=lambda found, move, supply: safe if (found, move) == ("found", "move") else None,
+    )  # fmt: skip
+    bench._trials = SimpleNamespace(recover=lambda where: done.append(("recover", where.tolist())))
+
+    def moved(gains):
+        done.append(("moved", int(gains[0, 0])))
+        return "found", np.array([7, 8, 9, 10])
+
+    monkeypatch.setattr(bench, "_moved", moved)
+    bench.identify()
+    everywhere = ("recover", [True] * 4)
+    assert done == [
+        *(["reset"] if anew else []), ("gains", 101, None), everywhere, ("advance", 0.1), ("moved", 101), everywhere,
+        ("gains", 103, None), ("advance", 0.25),
+    ]  # fmt: skip
+    assert planned == [("found", [65536] * 4, [2.0, -2.0, math.inf, 2.0])]
+    assert (bench.identified, bench.move, bench.origin.tolist()) == ("found", "move", [7, 8, 9, 10])
+    assert bench.began.tolist() == [7, 8, 9, 10] and bench.began is not bench._origin
+    assert (bench.rule[0, 0], bench.safe[0, 0], bench.incumbent[0, 0]) == (102, 103, 103)
+    assert bench.incumbent is not bench.safe
+    assert (bench._fallback.calm is bench.safe) == measures
+
+
+def test_an_axis_whose_drive_measures_no_current_moves_once_for_identification():
+    bench = bench_of()
+    bench._reach, bench.method = "reach", SimpleNamespace(measures_current=False)
+    bench._trials.identify = lambda reach, where: (reach, where.tolist())
+    assert bench._moved(GAINS) == ("reach", [True] * 4) and bench.moves.tolist() == [2] * 4
+
+
+def test_the_envelope_leaves_oscillations_and_pauses_of_a_minute_to_trials():
+    changed = []
+    limits = Limits(position=(-5.0, 5.0))
+    drives = SimpleNamespace(safety=SimpleNamespace(limits=limits, change=changed.append))
+    leave_oscillations_to_trials(drives)
+    assert changed == [Limits(position=(-5.0, 5.0), oscillation=False, stall=60.0)]
+    leave_oscillations_to_trials(SimpleNamespace(safety=None))
+    assert len(changed) == 1
+
+
+def test_first_gains_are_the_methods_and_those_that_are_the_drives(monkeypatch):
+    target = target_of(Standing())
+    assert first_gains(target).tolist() == method_of(DEVICE, MOTOR).first(target.supply).tolist()
+    assert read_gains(target).tolist() == [[65536] * 5] * 4

@@ -66,7 +66,7 @@ class ClosedLoopScore(RobustScore):
         # The plan of the move tells the inertia: it asks for so many times the torque that is there.
         inertia = OVERLOAD * held * move.increments / np.maximum(move.acceleration, 1)
         time = np.sqrt(2.0 * AWAY * full_step(motor) * inertia / ((PUSH - 1.0) * held))
-        machines = (-1, self._axes[2])
+        machines = (self.num_machines * self._runs, self._axes[2])
         torque = self._load_torque / (LOAD_SHARE * motor.rated_torque) * PUSH * held.reshape(machines).max(axis=1)
         lasts = np.clip(np.rint(time.reshape(machines).max(axis=1) / CYCLE), 1, LONGEST_PUSH).astype(np.int64)
         return torque, lasts

@@ -216,7 +216,7 @@ class OpenLoopTrials(Trials):
         if self.sensor is None:
             self.sensor, self.window = now, drives.read(cia402.FOLLOWING_WINDOW)
             self._open_loop()
-            if np.any(self.window != NO_WINDOW):
+            if np.any(self.window):
                 drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
         blind = where & (now != ENCODER)
         if blind.any():
@@ -243,7 +243,8 @@ class OpenLoopTrials(Trials):
         """Give 606Ah and the loop's mode back what they were; the axes must be disabled."""
         if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
             self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
-        if self.sensor is not None and self.window is not None:
+        if self.sensor is not None:
+            assert self.window is not None, "both are read at once"
             if np.any(drifted := self._drives.read(cia402.FOLLOWING_WINDOW) != self.window):
                 self._drives.write(cia402.FOLLOWING_WINDOW, self.window, where=drifted)
             changed = self._drives.read(cia402.SENSOR_SELECTION) != self.sensor

@@ -181,9 +181,8 @@ def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None 
     drives.machine.reset()
     for name, value in (settings or {}).items():
         drives.write(name, value)
-    told = np.repeat(log.objects[command], log.every, axis=0)
-    if log.every > 1 and mode == "csp":
-        told = _between(log.objects[command], log.every)
+    values = log.objects[command]
+    told = _between(values, log.every) if mode == "csp" else np.repeat(values, log.every, axis=0)
     start = told[0] - drives.read((cia402.POSITION_ACTUAL, 0))[:axes] if mode == "csp" else np.zeros(axes, np.int64)
     rows = np.tile(told - start, (1, drives.num_machines))
     if mode == "csp":
@@ -254,9 +253,9 @@ def fit(
     """Fit distributions to a log: draw machines, keep those that respond like it, draw anew around them, and so on.
 
     A population Monte Carlo search without likelihood: every machine of `drives` is a candidate. The first round draws
-    from the distributions given, the later ones from the best `accept` share of all so far, spread by their own
-    covariance. The accepted machines are those within `slack` times the best distance. Their range is not a confidence
-    interval: it is the set of machines that this log cannot tell from the best one by more than that.
+    from the distributions given, the later ones from the best of all so far, as many as `accept` of a round, spread by
+    their own covariance. The accepted machines are those within `slack` times the best distance. Their range is not a
+    confidence interval: it is the set of machines that this log cannot tell from the best one by more than that.
 
     Args:
         drives: Emulated drives, at least 16 machines; the more the better.
@@ -265,7 +264,7 @@ def fit(
         parameters: Which of them to fit.
         settings: As in `replay`.
         rounds: Of candidates, 1 or more.
-        accept: Share that the next round is drawn around.
+        accept: Share of a round's machines: so many of the best the next round is drawn around.
         slack: Distance of the worst machine that is accepted, over that of the best.
         seed: Of the search.
 
@@ -313,7 +312,7 @@ def _candidates(
 ) -> Floats:
     if not len(tried):
         # Stratified: every law's range is covered evenly.
-        strata = np.stack([rng.permutation(count) for _ in range(width)], axis=-1)
+        strata = np.stack([rng.permutation(count) for _ in range(width)], axis=1)
         return (strata + rng.random((count, width))) / count
     best = np.argsort(distances, kind="stable")[: max(2 * width, round(accept * count), 4)]
     # Twice the population's covariance, as in Beaumont et al. 2009 (adaptive approximate Bayesian computation).

@@ -267,10 +267,10 @@ def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[ND
 
     """
     times, signal = _record(t, x)
-    smallest = np.broadcast_to(_per_axis(amplitude, signal, "amplitude"), signal.shape[1:]).reshape(-1)
+    smallest = np.broadcast_to(_per_axis(amplitude, signal, "amplitude"), signal.shape[1:]).ravel()
     if np.any(smallest <= 0):
         raise ValueError(f"amplitude={smallest.min():g} must be positive; give what still counts as steady, unit of x")
-    columns = signal.reshape(len(signal), -1)
+    columns = signal.reshape(len(signal), len(smallest))
     early, late = (_index_at(times, times[0] + share * (times[-1] - times[0])) for share in (TRANSIENT, 0.6))
     diverged = _diverged(columns)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -299,8 +299,7 @@ def _swing(x: Floats) -> Floats:
 def _reversals(x: Floats, swing: Floats) -> NDArray[np.int64]:
     """Return how often each column of x turns around and then moves by `swing` the other way."""
     high, low = x[0], x[0]
-    direction = np.zeros(x.shape[1:], dtype=np.int64)
-    count = np.zeros(x.shape[1:], dtype=np.int64)
+    direction, count = np.zeros((2, *high.shape), dtype=np.int64)
     for row in x[1:]:
         high, low = np.maximum(high, row), np.minimum(low, row)
         turn = np.where((direction <= 0) & (row - low >= swing), 1, 0)
@@ -309,7 +308,7 @@ def _reversals(x: Floats, swing: Floats) -> NDArray[np.int64]:
         count += turned & (direction != 0)
         direction = np.where(turned, turn, direction)
         high, low = np.where(turned, row, high), np.where(turned, row, low)
-    return count
+    return np.asarray(count)
 
 
 def _strongest_line(t: Floats, x: Floats) -> Floats:
@@ -431,7 +430,7 @@ def _record(t: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
 
 def _signal(x: ArrayLike, name: str) -> Floats:
     signal = np.asarray(x, dtype=np.float64)
-    if signal.ndim not in (1, 2) or len(signal) == 0:
+    if signal.ndim not in (1, 2) or not len(signal):
         raise ValueError(f"{name} has shape {signal.shape}; give at least one sample as (n,) or (n, num_axes)")
     return signal
 

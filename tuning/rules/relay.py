@@ -148,7 +148,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     cycles = round(TIME / CYCLE)
     per_count = ampere_per_count(drives)
     speed, current = np.zeros((cycles, n)), np.zeros((cycles, n))
-    inside = axes & (height > 0.0)
+    inside = axes.copy()
     bias = np.zeros(n)
     torque = np.where(inside, height, 0.0)
     try:

@@ -378,7 +378,7 @@ class _Search:
     def _points(self, gains: Integers) -> Floats:
         """Return gains as points of the machines, (num_machines, dimensions)."""
         logs = np.log(gains[:, self._columns] / self._bench.rule[:, self._columns])
-        return np.asarray(logs.reshape(self._bench.num_machines, self._axes, -1).mean(axis=1))
+        return np.asarray(logs.reshape(self._bench.num_machines, self._axes, len(self._columns)).mean(axis=1))
 
     def _gains(self, machine: int, point: Floats) -> Integers:
         """Return the gains of a machine's axes at a point, (axes_per_machine, count)."""
@@ -396,7 +396,7 @@ class _Search:
 
 def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow]:
     """Return the trials that no other is better than in every objective, ordered by the first one."""
-    values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), -1)
+    values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), len(objectives))
     best = [
         k for k, own in enumerate(values) if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))
     ]

@@ -177,10 +177,11 @@ def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
     if len(names) == 1:
         for k, own in enumerate(searches):
             label = "best accepted so far" + (", of each search" if len(searches) > 1 else "")
-            _draw_best(axes, own, [figures(row, names, found.t_0)[0] for row in own], label if k == 0 else None)
+            cost = [value for row in own for value in figures(row, names, found.t_0)]
+            _draw_best(axes, own, cost, label if k == 0 else None)
         axes.set_xlabel("trial")
-        x, y = np.array([row.number for row in rows]), values[:, 0]
-        _scale(axes.yaxis, axes.set_yscale, names[0])
+        x, y = np.array([row.number for row in rows]), values.ravel()
+        _scale(axes.yaxis, axes.set_yscale, *names)
     else:
         x, y = values.T
         front = [figures(row, names[:2], found.t_0) for row in pareto([row for row in rows if row.accepted], names)]
@@ -190,7 +191,7 @@ def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
         axes.set_xlabel(meanings[names[0]])
         _scale(axes.xaxis, axes.set_xscale, names[0])
         _scale(axes.yaxis, axes.set_yscale, names[1])
-    axes.set_ylabel(meanings[names[min(1, len(names) - 1)]])
+    axes.set_ylabel(meanings[names[:2][-1]])
     stopped, fragile = (np.array([getattr(row, name) for row in rows]) for name in ("aborted", "fragile"))
     for where, color, marker, label in (
         (~stopped & ~fragile, KEPT, "o", "trial"),
