@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.gains import check_linear_model
+from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
 from tuning.auto.choice import keep_the_better, try_rule
 from tuning.auto.loop_margins import judge, measure
@@ -136,6 +137,8 @@ def prove_found(
         recorded = keep_the_better(bench, basis, recorded, target)
         verdict = judge(bench, basis, recorded)
         tell_of_lateness(bench)
+        if not is_recorded(target.drives):
+            bench.note(np.ones(target.num_axes, bool), COMPUTED)
         say("writing", 0.96)
         accepted = write(bench, fresh, recorded.gains, transaction)
         kept = keep and bool(accepted.any()) and can_store(target)
