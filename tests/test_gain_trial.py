@@ -150,7 +150,7 @@ def test_an_axis_that_did_not_move_has_its_rotors_inertia_and_no_friction_below_
 class Played:
     """Drives in pp that play what a test has for them: `faults` and `shaking` are (phase, window) -> axes."""
 
-    time_waits = True
+    time_waits, bus = True, None
 
     def __init__(self, axes=4, faults=None, shaking=None, stays_down=False):
         self.num_axes, self.device = axes, DEVICE

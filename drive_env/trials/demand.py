@@ -17,8 +17,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 COMPUTED = (
-    "the position demand (6062h) is in no process data of this drive: that of the moves was computed from target, profile "
-    "velocity and acceleration, to about a millisecond; it was not recorded"
+    "the position demand (6062h) is in no process data of this drive: that of a move is computed from target, profile "
+    "velocity and acceleration, to about a millisecond, and not recorded"
 )
 
 
@@ -45,4 +45,4 @@ def computed(begin: Integers, target: Integers, move: Move, cycles: int) -> Floa
     t = np.minimum(np.arange(cycles)[:, None] * CYCLE, end)
     rising, falling = np.minimum(t, ramp), np.maximum(t - (end - ramp), 0.0)
     gone = 0.5 * acceleration * rising**2 + speed * (t - rising) - 0.5 * acceleration * falling**2
-    return np.asarray(begin + np.sign(way) * np.minimum(gone, distance))
+    return np.asarray(begin + np.sign(way) * np.rint(np.minimum(gone, distance)))

@@ -224,7 +224,7 @@ class OpenLoopTrials(Trials):
             if on.any():
                 motion.disable(drives, where=on)
             drives.write(cia402.SENSOR_SELECTION, ENCODER, where=blind)
-        if np.all(self.down()):
+        if not drives.time_waits and np.all(self.down()):
             self._prepare(self._recorded())
         super().recover(where)
 

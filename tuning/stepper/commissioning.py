@@ -29,7 +29,7 @@ from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has
 from tuning.stepper.moves import WorkingMoves
 from tuning.stepper.obstacle import REACTION, can_load, prove_with_load
 from tuning.stepper.result import StepperAxis, StepperResult, figure
-from tuning.target import Target, timed
+from tuning.target import Target, timed, told_lateness
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -255,5 +255,5 @@ def _axis(
     figures |= {name: figure(values[k]) for name, values in proof.items() if name in LOOP_FIGURES}
     return StepperAxis(
         dict(zip(names, map(int, before[k]), strict=True)), dict(zip(names, map(int, after), strict=True)), reason,
-        tuple(found.reservations[k]), figures,
+        (*found.reservations[k], *filter(None, [told_lateness(target.drives)])), figures,
     )  # fmt: skip
