@@ -198,7 +198,7 @@ def test_a_reset_restarts_the_slave_and_a_restart_of_its_own_is_noticed():
 
 
 @pytest.mark.parametrize(("given", "says"), [
-    ({"nodes": (1,)}, "there is no position 1: 1 slave answer; count from 0"),
+    ({"nodes": (1,)}, "there is no position 1: 1 slave answers; count from 0"),
     ({"nodes": (0, 0)}, "must be positions in the line, from 0, each once"),
     ({"nodes": (-1,)}, "must be positions in the line"),
     ({"pace": "fast"}, "pace is 'real-time' or 'lockstep'"),
@@ -373,6 +373,24 @@ def run(*words):
     done = CliRunner().invoke(app, list(map(str, words)))
     assert done.exit_code == 0, done.output
     return done.output
+
+
+@pytest.mark.parametrize(("words", "says"), [
+    (("scan", "--first", "3"), "--first is for CAN; all slaves of a segment are found"),
+    (("scan", "--bitrate", "500000"), "--bitrate is for CAN"),
+    (("log", "frames.asc"), "carries no CAN frames"),
+    (("get", "6041", "--device", "tmcm3313", "--position", "4"), "there is no position 4: 1 slave answers"),
+    (("get", "6041", "--device", "tmcm3313", "--axis", "9"), "a tmcm3313 has 3 axes"),
+    (("set", "6041", "5", "--device", "tmcm3313"), "can only be read"),
+    (("scope", "6083", "--duration", "0.01", "--device", "tmcm3313"), "cannot be recorded"),
+    (("backup", "drive.toml", "--device", "tgz_d"), "it is a tmcm3313"),
+    (("monitor", "zz", "--device", "tmcm3313"), "no object is named"),
+])  # fmt: skip
+def test_wrong_options_are_told_in_a_line(over_udp, tmp_path, monkeypatch, words, says):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner(env={"COLUMNS": "300", "NO_COLOR": "1"}).invoke(app, [*words, *over_udp])
+    assert isinstance(done.exception, SystemExit) and done.exit_code in (1, 2), done.output
+    assert says in done.output
 
 
 def test_commands_over_udp(over_udp, tmp_path):
