@@ -228,7 +228,7 @@ class CycleRunner:
         try:
             self._have_mapped(call, played)
         except ObjectAccessError:  # as while an axis is enabled, where a drive then changes nothing
-            if not call.ask_for_states():
+            if not self._asks_for_states(call):
                 raise
             call.chosen = self._choose(call, watched, played)
             self._have_mapped(call, played)
@@ -241,12 +241,16 @@ class CycleRunner:
             self._start()
             self._process.map(played, call.chosen)
 
+    def _asks_for_states(self, call: RecordCall) -> bool:
+        """Have states of a call asked for, by the clock: where time waits nothing would come between two cycles."""
+        return not self._pace.time_waits and call.ask_for_states()
+
     def _choose(self, call: RecordCall, watched: Sequence[Entry], played: tuple[Entry, ...]) -> tuple[Entry, ...]:
         """Return what is sampled; states are asked for where not all that a call wants fits."""
         try:
             return self._process.choose(call.mapped, watched, played)
         except ObjectAccessError:
-            if not call.ask_for_states():
+            if not self._asks_for_states(call):
                 raise
             return self._process.choose(call.mapped, watched, played)
 
