@@ -22,6 +22,8 @@ from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.open_loop import encoder_age
+from tuning.search.optimise import Settings
+from tuning.search.samplers import load
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
@@ -46,12 +48,13 @@ MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
 
 
 def check_stepper(target: Target) -> None:
-    """Raise ValueError unless a target's drives have a load detection to be set, before anything is done."""
+    """Load what the search needs; ValueError unless drives have a load detection to be set, before anything is done."""
     if lacks := lacks_load_detection(target.device):
         raise ValueError(
             f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "
             "optimise find its phase currents by trials"
         )
+    load(Settings().sampler)
 
 
 def commission(
