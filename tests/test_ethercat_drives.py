@@ -434,7 +434,7 @@ def test_a_statusword_that_has_no_room_is_asked_for_meanwhile():
         segment.drives.write(0x6040, 0, where=np.array([True, False, False]))
         off = drives.record(FOUR, 0.1)[0x6041] & 0x4F
         assert off[0].tolist()[1:] == [0x07, 0x07] and off[-1].tolist() == [0x40, 0x07, 0x07]
-        with pytest.raises(ObjectAccessError, match="606Ch.* is not in the process image"):
+        with pytest.raises(ObjectAccessError, match=r"606Ch.* is not in the process image"):
             drives.record([0x6064, 0x606C], 0.01)
 
 

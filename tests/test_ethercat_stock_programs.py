@@ -1,8 +1,9 @@
 """SOEM's slaveinfo and pysoem's examples, not a byte of them changed, against drives that `drive-env serve` serves.
 
-They are in the sources alone, and PYSOEM_SOURCE and SOEM_SOURCE are the folders of these (`.ci/run` has them). A SOEM 1.4
-is in pysoem's source package, its folder soem. The library's context there has two fields more than the table that fills it
-for programs with one master, as slaveinfo is, so that the library does not compile for them; a copy of that table has them:
+They are in the sources alone, and PYSOEM_SOURCE and SOEM_SOURCE are the folders of these (`.ci/run` has them). A SOEM
+1.4 is in pysoem's source package, its folder soem. The library's context there has two fields more than the table that
+fills it for programs with one master, as slaveinfo is, so that the library does not compile for them; a copy of that table
+has them:
 
 pip download --no-deps --no-binary pysoem pysoem && tar xf pysoem-*.tar.gz
 """
@@ -76,8 +77,8 @@ def printed(space, *command, expected, code=0):
             "-sdo": (
                 "1 slaves found and configured.", "Calculated workcounter 3", "Output size: 240bits", "State: 4",
                 "Input size: 240bits", "Has DC: 1", "Man: 00000286 ID: 00000cf1 Rev: 00010009",
-                "CoE Object Description found, 331 entries.", '"TMCM-3313"\n', '0x7502      "Supported drive modes axis 2"',
-                "End program",
+                "CoE Object Description found, 331 entries.", '"TMCM-3313"\n',
+                '0x7502      "Supported drive modes axis 2"', "End program",
             ),
             "-map": (
                 "[0x0000.0] 0x6040:0x00 0x10 UNSIGNED16   Controlword",
@@ -88,7 +89,8 @@ def printed(space, *command, expected, code=0):
         ("tgz_d", "gantry", {
             "-sdo": (
                 "Calculated workcounter 3", "Output size: 320bits", "Input size: 320bits", "State: 4",
-                "CoE Object Description found, 160 entries.", '0x6d02      "Supported drive modes axis 1"', "End program",
+                "CoE Object Description found, 160 entries.", '0x6d02      "Supported drive modes axis 1"',
+                "End program",
             ),
             "-map": (
                 "[0x000C.0] 0x6040:0x00 0x10 UNSIGNED16   Controlword",

@@ -1,4 +1,4 @@
-"""`drive-tune auto` and `drive-agent tune` over EtherCAT: in lockstep over UDP, and in real time over a virtual cable."""
+"""`drive-tune auto` and `drive-agent tune` over EtherCAT: in lockstep over UDP, in real time over a virtual cable."""
 
 from __future__ import annotations
 
@@ -106,7 +106,8 @@ def tuned_in_real_time(spaces, device, program, command, out, *more):  # noqa: F
         words = [command, "--device", device, "--interface", "ethercat", "--channel", spaces.master_interface]
         script = f"from drive_env.programs import {program}; {program}()"
         done = subprocess.run(
-            FIRST + inside(spaces.master, "-c", script, *words, "--position", 0, "--yes", "--out", out, "--json", *more),
+            FIRST
+            + inside(spaces.master, "-c", script, *words, "--position", 0, "--yes", "--out", out, "--json", *more),
             capture_output=True, text=True, timeout=600.0,
         )  # fmt: skip
     finally:
@@ -134,7 +135,7 @@ def test_drive_tune_auto_tunes_a_tgz_in_real_time(spaces, tmp_path):  # noqa: F8
 @pytest.mark.slow
 @needs_namespaces
 def test_drive_tune_auto_commissions_a_stepper_in_real_time(spaces, tmp_path):  # noqa: F811
-    """Its image has room for three objects of each axis: the statusword is asked for beside position, demand, current."""
+    """Its image has room for three objects of each axis: position, demand, current; the statusword is asked for."""
     found = tuned_in_real_time(spaces, "tmcm3313", "drive_tune", "auto", tmp_path / "auto", "--travel", "-20:20")
     assert len(found["axes"]) == 3
     for axis in found["axes"]:

@@ -415,7 +415,7 @@ def told_lateness(drives: Drives) -> str:
     if not timing.late:
         return ""
     return (
-        f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {1e3 * timing.worst:.1f} ms: "
-        "this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
+        f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {1e3 * timing.worst:.1f} "
+        "ms: this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
         "`chrt -f 10` before the command (Linux)"
     )

@@ -240,8 +240,8 @@ def _error_control(target: Target, axis: int) -> Iterator[Check]:
     if silence is None:
         yield Check("heartbeat", NOTE, "the drive would not stop if this process ended without stopping it")
     elif not _is_on_can(target):
-        yield Check("watchdog", OK, "the slave can monitor its master by the watchdog of its process data: in real time "
-                                    f"0420h would be set to {1e3 * silence:.0f} ms")  # fmt: skip
+        yield Check("watchdog", OK, "the slave can monitor its master by the watchdog of its process data: in real "
+                                    f"time 0420h would be set to {1e3 * silence:.0f} ms")  # fmt: skip
     elif description.has((0x1016, 1)):
         value = _read(target, (0x1016, 1), axis)
         now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
