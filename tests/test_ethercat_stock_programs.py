@@ -2,8 +2,8 @@
 
 They are in the sources alone, and PYSOEM_SOURCE and SOEM_SOURCE are the folders of these (`.ci/run` has them). A SOEM
 1.4 is in pysoem's source package, its folder soem. The library's context there has two fields more than the table that
-fills it for programs with one master, as slaveinfo is, so that the library does not compile for them; a copy of that table
-has them:
+fills it for programs with one master, as slaveinfo is, so that the library does not compile for them; a copy of that
+table has them:
 
 pip download --no-deps --no-binary pysoem pysoem && tar xf pysoem-*.tar.gz
 """
