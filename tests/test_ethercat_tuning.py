@@ -95,6 +95,18 @@ LATE = ("SYNCs were more than a cycle late", "the program made no call for", "to
 
 
 def tuned_in_real_time(spaces, device, program, command, out, *more):  # noqa: F811
+    """Tune as `tuned_once` does; once more where that was rejected or stopped, as it may be on a busy computer."""
+    try:
+        found = tuned_once(spaces, device, program, command, out, *more)
+        if "'rejected'" not in str(found):
+            return found
+    except AssertionError as error:
+        if not any(text in str(error) for text in LATE):
+            raise
+    return tuned_once(spaces, device, program, command, out.with_name("again"), *more)
+
+
+def tuned_once(spaces, device, program, command, out, *more):  # noqa: F811
     """Tune a drive that is served in one namespace from the other; return exit code and what was printed as JSON."""
     pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
     server = subprocess.Popen(
