@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from ethercat_segment import EmulatedSegment
 from typer.testing import CliRunner
 
 from agents.commands.cli import app
@@ -20,6 +21,8 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import NMT, SDO_REQUEST, Frame
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.ethercat.ethercat_server import EtherCatServer
+from drive_env.ethercat.ways import UdpSocket
 from drive_env.master.can.sdo import SdoClient
 from tuning.target import on_bus
 
@@ -169,3 +172,33 @@ def test_an_emulated_drive_is_rehearsed_as_well(tmp_path, monkeypatch):
     assert found.exit_code == 0 and "1 + 3 trials of 3 moves" in found.stdout
     assert NO + " " not in [line.strip()[:3] for line in found.stdout.splitlines()]
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("pace", "of_demand"), [("lockstep", "6062h, 6077h"), ("real-time", "is computed from")])
+def test_a_drive_of_two_axes_on_ethercat_is_rehearsed(pace, of_demand):
+    with EmulatedSegment("tgz_d", load="inertia", num_machines=2) as segment:
+        segment.world.lockstep = pace == "lockstep"
+        way = UdpSocket(0)
+        with EtherCatServer(segment.world, way):
+            bus = ["--interface", "ethercat-udp", "--channel", str(way.port), "--device", "tgz_d"]
+            more = ["--lockstep"] if pace == "lockstep" else []
+            found = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(
+                app, ["tune", *bus, *more, "--travel", "-2:2", "--dry-run"]
+            )
+        segment.world.lockstep = True
+    assert found.exception is None or isinstance(found.exception, SystemExit), found.exception
+    assert of_demand in found.output
+    for part in ("position 0 axis 1: standstill", "1C13h:01", "0420h would be set to"):
+        assert part in found.output, part
+    assert "PDO" not in found.output and "Nothing was written." in found.output
+
+
+def test_a_node_of_two_axes_on_can_is_rehearsed():
+    world = World(lockstep=True)
+    world.add(EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1), [1])
+    world.power_on()
+    hub = Hub()
+    with Server(world, hub):
+        found = dry_run(hub.channel, "--device", "tgz_d")
+    world.close()
+    assert "node 1 axis 1: standstill: the axis is at rest" in found.output

@@ -9,7 +9,7 @@ import pytest
 from ethercat_rig import STATION, Rig
 from thinning import part
 
-from drive_env.ethercat import datagrams, fmmu
+from drive_env.ethercat import datagrams, fmmu, registers
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.datagrams import Datagram, DatagramCommand, at_station, build_frame
 
@@ -246,6 +246,22 @@ def test_reset_by_three_letters():
     rig.write(0x0040, "53")
     assert rig.read(0x0130, 2) is None  # its station address is gone
     assert rig.read(0x0130, 2, station=0) == b"\x01\x00"
+
+
+def test_one_write_of_many_registers_acts_on_all_of_them():
+    rig = Rig()
+    rig.address()
+    controller = rig.slaves[0].controller
+    for address in (registers.RX_ERRORS, registers.UNIT_ERRORS, registers.LOST_LINKS):
+        controller.count(address)
+    assert rig.write(0x0300, bytes(0x14)) == 1
+    assert rig.read(0x0300, 0x14) == bytes(0x14), "counters of three groups"
+    unit = struct.pack("<IHBBHBBB", 0x10000, 4, 0, 7, 0x0F80, 0, 3, 1)
+    manager = struct.pack("<HHBBBB", 0x1000, 64, 0x26, 0, 1, 0)
+    assert rig.write(0x0600, unit.ljust(0x200, b"\0") + manager) == 1
+    assert rig.send(Datagram(DatagramCommand.LWR, 0x10000, b"abcd"))[0].counter == 1, "the FMMU maps"
+    assert rig.value(0x0F80, 4) == int.from_bytes(b"abcd", "little")
+    assert rig.write(0x1000, bytes(64)) == 1 and rig.value(0x0805, 1) & 0x08, "the sync manager is full"
 
 
 def test_counters_are_cleared_by_a_write():

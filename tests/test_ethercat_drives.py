@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, Limits, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.commands.cli import app
-from drive_env.ethercat import datagrams
+from drive_env.ethercat import datagrams, registers
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.controller import LOGICAL, WRITING
 from drive_env.ethercat.ethercat_server import EtherCatServer
@@ -136,7 +136,7 @@ def test_an_image_is_changed_while_no_axis_is_enabled_and_put_back():
         with pytest.raises(ObjectAccessError, match=refused):
             drives.record([0x6062], 0.002)
         with pytest.raises(ObjectAccessError, match=r"4 objects of 3 axes are more than the 9 .* fewer at a time"):
-            drives.record([0x6041, 0x6064, 0x606C, 0x6077], 0.002)
+            drives.record([0x6062, 0x6064, 0x606C, 0x6077], 0.002)
         with pytest.raises(ObjectAccessError, match="cannot be recorded: it is no process data"):
             drives.record([0x6083], 0.002)
         assert (drives.read(0x6041) & 0x6F == 0x27).all(), "a refusal stops nobody"
@@ -198,7 +198,7 @@ def test_a_reset_restarts_the_slave_and_a_restart_of_its_own_is_noticed():
 
 
 @pytest.mark.parametrize(("given", "says"), [
-    ({"nodes": (1,)}, "there is no position 1: 1 slave answer; count from 0"),
+    ({"nodes": (1,)}, "there is no position 1: 1 slave answers; count from 0"),
     ({"nodes": (0, 0)}, "must be positions in the line, from 0, each once"),
     ({"nodes": (-1,)}, "must be positions in the line"),
     ({"pace": "fast"}, "pace is 'real-time' or 'lockstep'"),
@@ -375,6 +375,24 @@ def run(*words):
     return done.output
 
 
+@pytest.mark.parametrize(("words", "says"), [
+    (("scan", "--first", "3"), "--first is for CAN; all slaves of a segment are found"),
+    (("scan", "--bitrate", "500000"), "--bitrate is for CAN"),
+    (("log", "frames.asc"), "carries no CAN frames"),
+    (("get", "6041", "--device", "tmcm3313", "--position", "4"), "there is no position 4: 1 slave answers"),
+    (("get", "6041", "--device", "tmcm3313", "--axis", "9"), "a tmcm3313 has 3 axes"),
+    (("set", "6041", "5", "--device", "tmcm3313"), "can only be read"),
+    (("scope", "6083", "--duration", "0.01", "--device", "tmcm3313"), "cannot be recorded"),
+    (("backup", "drive.toml", "--device", "tgz_d"), "it is a tmcm3313"),
+    (("monitor", "zz", "--device", "tmcm3313"), "no object is named"),
+])  # fmt: skip
+def test_wrong_options_are_told_in_a_line(over_udp, tmp_path, monkeypatch, words, says):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner(env={"COLUMNS": "300", "NO_COLOR": "1"}).invoke(app, [*words, *over_udp])
+    assert isinstance(done.exception, SystemExit) and done.exit_code in (1, 2), done.output
+    assert says in done.output
+
+
 def test_commands_over_udp(over_udp, tmp_path):
     said = run("scan", *over_udp)
     assert said.split()[:3] == ["position", "0", "tmcm3313"] and "vendor 286h" in said and "Init" in said
@@ -386,6 +404,61 @@ def test_commands_over_udp(over_udp, tmp_path):
     run("set", "6081", "6000", *device)
     run("restore", file, "--yes", *device)
     assert run("get", "6081", "--raw", *device).splitlines()[0].endswith("= 5000")
+
+
+def test_a_scan_reads_an_eeprom_that_a_master_has_left_to_the_device():
+    """As SOEM does; it is left as it was."""
+    with EmulatedSegment(number=2) as segment:
+        for slave in segment.slaves:
+            slave.controller.memory[registers.SII_ACCESS] = 1
+        found = segment.master().look()
+        assert [(one.vendor, one.product) for _, one in found] == [(0x286, 3313)] * 2
+        assert [slave.controller.memory[registers.SII_ACCESS] for slave in segment.slaves] == [1, 1]
+
+
+# --- what has no room in an image -------------------------------------------------------------------------------------
+FOUR = [0x6064, 0x6062, 0x6077, 0x6041]  # of three axes 12, and the image takes 9
+
+
+def test_a_statusword_that_has_no_room_is_asked_for_meanwhile():
+    with linked(pace="real-time", load="inertia", num_machines=3) as (drives, segment):
+        assert drives.can_record(FOUR) and not drives.can_record([*FOUR, 0x606C])
+        trace = drives.record(FOUR, 0.05)
+        assert all(trace[name].shape == (50, 3) for name in FOUR)
+        assert (trace[0x6041] & 0x6F == 0x40).all(), "switch on disabled"
+        motion.enable(drives, mode="pp")
+        enabled = drives.record(FOUR, 0.05)
+        assert (enabled[0x6041] & 0x6F == 0x27).all()
+        less = drives.record([0x6064, 0x6041], 0.02)  # the image cannot be changed now, and lacks one of them
+        assert (less[0x6041] & 0x6F == 0x27).all()
+        segment.drives.write(0x6040, 0, where=np.array([True, False, False]))
+        off = drives.record(FOUR, 0.1)[0x6041] & 0x4F
+        assert off[0].tolist()[1:] == [0x07, 0x07] and off[-1].tolist() == [0x40, 0x07, 0x07]
+        with pytest.raises(ObjectAccessError, match=r"606Ch.* is not in the process image"):
+            drives.record([0x6064, 0x606C], 0.01)
+
+
+def is_mail(frame):
+    """Whether a frame carries a message to a mailbox."""
+    return any(len(one.data) == 256 for one in datagrams.read(frame, datagrams.ETHERNET))
+
+
+def test_a_drive_that_is_silent_is_told_by_what_asks_for_its_statusword():
+    with linked(safety=False, pace="real-time", timeout=0.05, load="inertia", num_machines=3) as (drives, segment):
+        drives.record(FOUR, 0.01)
+        segment.damage = lambda frame: None if is_mail(frame) else frame
+        with pytest.raises(NoAnswerError, match="did not answer"):
+            drives.record(FOUR, 0.2)
+
+
+@pytest.mark.parametrize(("pace", "has"), [("lockstep", True), ("real-time", False)])
+def test_a_tgz_sends_its_demand_in_lockstep_alone(pace, has):
+    with (
+        EmulatedSegment("tgz_d", lockstep=pace == "lockstep", load="gantry") as segment,
+        EtherCatDrives("tgz_d", master=segment.master(), pace=pace, safety=False) as drives,
+    ):
+        assert drives.can_record([0x6064, 0x6077, 0x6041])
+        assert drives.can_record([0x6062]) is has
 
 
 def frames_of(segment):

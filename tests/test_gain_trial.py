@@ -199,7 +199,7 @@ def test_identification_moves_three_rotors_there_and_back_from_where_the_axes_st
 class Played:
     """Drives in pp that play what a test has for them: `faults` and `shaking` are (phase, window) -> axes."""
 
-    time_waits = True
+    time_waits, bus = True, None
 
     def __init__(self, axes=4, faults=None, shaking=None, stays_down=False):
         self.num_axes, self.device = axes, DEVICE

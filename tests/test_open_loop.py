@@ -290,7 +290,7 @@ def test_sensor_window_and_loop_are_what_they_were_afterwards(window, loop, monk
     names = {cia402.SENSOR_SELECTION: "sensor", cia402.FOLLOWING_WINDOW: "window", module.Role.LOOP_MODE: "loop"}
 
     class Drives:
-        num_axes = 2
+        num_axes, time_waits = 2, True
 
         def read(self, name):
             return values[names[name]].copy() if name in names else np.array([0x0240, 0x0240])

@@ -51,6 +51,19 @@ def target(stepper, **options):
     return emulated(stepper, "inertia", NAME, num_threads=1, **({"parameters": LOADED} | options))
 
 
+def test_what_the_search_needs_is_loaded_before_an_axis_is_enabled(stepper, monkeypatch):
+    """It takes a second or more, after which an envelope in real time stops an enabled axis."""
+    was_live = []
+    with target(stepper) as found:
+        monkeypatch.setattr(commissioning, "load", lambda sampler: was_live.append((sampler, live(found).any())))
+        commissioning.check_stepper(found)
+    assert was_live == [(Settings().sampler, False)]
+
+
+def live(found):
+    return cia402.is_live(found.drives.read(cia402.STATUSWORD))
+
+
 def detection_of(found):
     """Return load detection and moves of a target that was identified, at the rule's currents."""
     bench = TrialBench(found)

@@ -405,3 +405,17 @@ def hold_to_travel(target: Target) -> None:
     speed = np.ceil(slack_of_speed * target.motor.rated_speed * target.speed_counts())
     assert drives.safety is not None, "drives of a bus are opened with an envelope"
     drives.safety.change(Limits(position=(low.tolist(), high.tolist()), velocity=speed.tolist()))
+
+
+def told_lateness(drives: Drives) -> str:
+    """Return what to say of SYNCs of a bus in real time that were late, which distorts moves and responses; or ""."""
+    if drives.time_waits or drives.bus is None:
+        return ""
+    timing = drives.bus.total_timing
+    if not timing.late:
+        return ""
+    return (
+        f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {1e3 * timing.worst:.1f} "
+        "ms: this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
+        "`chrt -f 10` before the command (Linux)"
+    )

@@ -18,6 +18,8 @@ from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import bus_of
+from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS
+from drive_env.trials.demand import COMPUTED, is_recorded
 
 if TYPE_CHECKING:
     from tuning.target import Target
@@ -86,7 +88,7 @@ def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
     """
     checks: list[Check] = []
     for axis in range(target.num_axes):
-        prefix = f"node {bus_of(target.drives).nodes[axis]}: " if target.num_axes > 1 else ""
+        prefix = f"{_place(target, axis)}: " if target.num_axes > 1 else ""
         checks += [check._replace(what=prefix + check.what) for check in _checks(target, axis)]
     writes = []
     for name, values, why, stays in _plan(target, keep):
@@ -110,6 +112,25 @@ def _read(target: Target, name: Any, axis: int) -> int:
     return int(target.drives.read(name)[axis])
 
 
+def _node(target: Target, axis: int) -> int:
+    """Return the address of the node that an axis is of."""
+    drives = bus_of(target.drives)
+    return drives.nodes[axis // drives.description.num_axes]
+
+
+def _place(target: Target, axis: int) -> str:
+    """Return the node of an axis as messages name it, and which of its axes, where it has several."""
+    per_node = bus_of(target.drives).description.num_axes
+    name = f"{'node' if _is_on_can(target) else 'position'} {_node(target, axis)}"
+    return name if per_node == 1 else f"{name} axis {axis % per_node}"
+
+
+def _is_on_can(target: Target) -> bool:
+    from drive_env.master.can.can_link import CanLink
+
+    return isinstance(bus_of(target.drives).link, CanLink)
+
+
 # --- what is looked at ------------------------------------------------------------------------------------------------
 def _identity(target: Target, axis: int) -> Iterator[Check]:
     drives, facts = bus_of(target.drives), []
@@ -119,7 +140,7 @@ def _identity(target: Target, axis: int) -> Iterator[Check]:
             continue
         found = drives.read(name)[axis]
         facts.append(word + (f"{found:X}h" if isinstance(name, tuple) else str(found)))
-    yield Check("identity", OK, f"node {drives.nodes[axis]} is a {target.device.name}: {', '.join(facts)}")
+    yield Check("identity", OK, f"{_place(target, axis)} is a {target.device.name}: {', '.join(facts)}")
 
 
 def _state(target: Target, axis: int) -> Iterator[Check]:
@@ -163,6 +184,9 @@ def _answers(target: Target, axis: int) -> Iterator[Check]:
 
 def _samples(target: Target, axis: int) -> Iterator[Check]:
     """Look whether what is sampled and played fits, and whether its PDOs have identifiers."""
+    if not _is_on_can(target):
+        yield _images(target)
+        return
     from drive_env.canopen.frames import IDENTIFIER, RPDO, TPDO
     from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, plan
 
@@ -181,7 +205,7 @@ def _samples(target: Target, axis: int) -> Iterator[Check]:
     for name, groups, communication, standard in (("TPDO", out, 0x1800, TPDO), ("RPDO", into, 0x1400, RPDO)):
         for number, group in enumerate(groups):
             cob_id = _read(target, (communication + number, 1), axis)
-            identifier = cob_id & IDENTIFIER or standard[number] + drives.nodes[axis]
+            identifier = cob_id & IDENTIFIER or standard[number] + _node(target, axis)
             if cob_id & 1 << 29:
                 yield Check("PDO", NO, f"{name} {number + 1} has a 29-bit identifier ({cob_id:08X}h in "
                                        f"{communication + number:04X}h:01); give it an 11-bit one")  # fmt: skip
@@ -191,12 +215,33 @@ def _samples(target: Target, axis: int) -> Iterator[Check]:
     yield Check("PDO", OK, "; ".join(texts))
 
 
+def _images(target: Target) -> Check:
+    """Look whether the process images of a slave can carry what is sampled and played."""
+    drives = bus_of(target.drives)
+    find = drives.description.dictionary.find
+    try:
+        drives.link.process.check_played([find(name) for name in PLAYED])
+    except ObjectAccessError as error:
+        return Check("image", NO, f"{error}")
+    demand = is_recorded(drives)
+    sampled = [name for name in SAMPLED if demand or name != cia402.POSITION_DEMAND]
+    if not drives.can_record(sampled):
+        names = ", ".join(find(name).label for name in sampled)
+        return Check("image", NO, f"no process image of this drive has {names} together")
+    objects = ", ".join(f"{find(name).index:04X}h" for name in sampled)
+    text = f"the process images would carry {objects}"
+    return Check("image", OK, text) if demand else Check("image", NOTE, f"{text}; {COMPUTED}")
+
+
 def _error_control(target: Target, axis: int) -> Iterator[Check]:
     """Look who would stop the drive if this process died."""
     drives, description = bus_of(target.drives), bus_of(target.drives).description
     silence = None if drives.safety is None else drives.safety.limits.silence
     if silence is None:
         yield Check("heartbeat", NOTE, "the drive would not stop if this process ended without stopping it")
+    elif not _is_on_can(target):
+        yield Check("watchdog", OK, "the slave can monitor its master by the watchdog of its process data: in real "
+                                    f"time 0420h would be set to {1e3 * silence:.0f} ms")  # fmt: skip
     elif description.has((0x1016, 1)):
         value = _read(target, (0x1016, 1), axis)
         now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
@@ -350,6 +395,17 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
 
 def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
     """Yield what is written so that samples come in PDOs and the drive watches over its master."""
+    if _is_on_can(target):
+        yield from _pdos(target)
+    else:
+        for index in (OUTPUTS, INPUTS):
+            for sub in (0, 1):
+                yield (index, sub), "", "which process image is carried, chosen in Pre-Op", False
+    yield from _safeguards(target)
+
+
+def _pdos(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
+    """Yield what is written of PDOs."""
     from drive_env.master.can.pdo import OUT_OF_DRIVE, slots
 
     known = bus_of(target.drives).description.dictionary
@@ -361,6 +417,10 @@ def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]
                     yield (entry.index, entry.sub), "", why, False
     for number in slots(bus_of(target.drives).description, OUT_OF_DRIVE, 0).numbers[2:]:
         yield (0x1800 + number, 1), "", f"TPDO {number + 1} off during the run, if it is sent with SYNC", False
+
+
+def _safeguards(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
+    """Yield what is written so that the drive stops by itself where it must."""
     if np.isfinite(target.low).all() and np.isfinite(target.high).all():
         for sub, end in ((1, "lower"), (2, "upper")):
             if bus_of(target.drives).description.has((cia402.POSITION_LIMITS, sub)):
@@ -377,6 +437,8 @@ def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]
             "an axis that is stopped is held at first, in case of a hanging load",
             False,
         )
+    if not _is_on_can(target):
+        return
     if target.drives.time_waits and bus_of(target.drives).description.has(0x1017):
         yield (0x1017, 0), "1", "for a hundredth of a second: to check that time waits for SYNC", False
     in_real_time = (

@@ -20,6 +20,7 @@ from drive_env.commands.options import (
 from drive_env.commands.tables import print_lines
 
 NOTHING_FOUND = 1
+LOWEST, HIGHEST = 1, 127  # node-IDs
 GAP = 0.001  # between two requests [s]: 127 at once would overrun small controllers
 STRINGS = {0x1008: "name", 0x1009: "hardware", 0x100A: "software"}
 IDENTITY = {1: "vendor", 2: "product", 3: "revision", 4: "serial"}
@@ -29,8 +30,12 @@ def scan(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
-    first: Annotated[int, typer.Option(min=1, max=127, help="First node-ID to ask.")] = 1,
-    last: Annotated[int, typer.Option(min=1, max=127, help="Last node-ID to ask.")] = 127,
+    first: Annotated[
+        int | None, typer.Option(min=1, max=127, help="First node-ID to ask, on CAN.", show_default="1")
+    ] = None,
+    last: Annotated[
+        int | None, typer.Option(min=1, max=127, help="Last node-ID to ask, on CAN.", show_default="127")
+    ] = None,
     timeout: Annotated[float, typer.Option(help="Longest wait for an answer [s].")] = 0.3,
     json: Json = False,
 ) -> None:
@@ -44,8 +49,12 @@ def scan(
 
         check_time("--timeout", timeout)
         if is_ethercat(interface):
+            for name, value in (("bitrate", bitrate), ("first", first), ("last", last)):
+                if value is not None:
+                    raise ValueError(f"--{name} is for CAN; all slaves of a segment are found: leave it out")
             _scan_ethercat(interface, channel, json)
             return
+        first, last = first or LOWEST, last or HIGHEST
         if last < first:
             raise ValueError(f"--last {last} is below --first {first}")
         options = {"bitrate": bitrate} if bitrate else {}

@@ -312,12 +312,12 @@ class SlaveController:
     # --- what writing registers sets off ------------------------------------------------------------------------------
     def _write_registers(self, address: int, data: bytes | bytearray, now: int) -> bool:
         end = address + len(data)
+        done = False
         for first, last in registers.COUNTERS:
             if address < last and end > first:
                 self.memory[first:last] = bytes(last - first)
-                return True
+                done = True
         locked = self._locked(address, end)
-        done = False
         for k, byte in enumerate(data, address):
             mask = MASKS[k]
             if mask and k not in locked:
@@ -349,25 +349,25 @@ class SlaveController:
             self._station = self.register(registers.STATION_ADDRESS, 2)
             is_on = self.memory[registers.DL_CONTROL + 3] & ALIAS_ENABLE
             self._alias = self.register(registers.ALIAS, 2) if is_on else 0
-        elif has(registers.AL_CONTROL, 1):
+        if has(registers.AL_CONTROL, 1):
             self.al_control = self.register(registers.AL_CONTROL, 2)
-        elif has(registers.RESET, 1):
+        if has(registers.RESET, 1):
             self._step_reset(self.memory[registers.RESET])
-        elif has(registers.FMMUS, FMMUS_END - registers.FMMUS):
+        if has(registers.FMMUS, FMMUS_END - registers.FMMUS):
             size = registers.FMMU_SIZE
             parsed = [fmmu.parse(self.memory[k : k + size]) for k in range(registers.FMMUS, FMMUS_END, size)]
             self._units = [unit for unit in parsed if unit is not None]
-        elif has(registers.SYNC_MANAGERS, SYNC_MANAGERS_END - registers.SYNC_MANAGERS):
+        if has(registers.SYNC_MANAGERS, SYNC_MANAGERS_END - registers.SYNC_MANAGERS):
             self._configure_managers()
-        elif has(registers.SII_CONTROL + 1, 1):
+        if has(registers.SII_CONTROL + 1, 1):
             self.sii.command(now * 1e-9)
-        elif has(registers.RECEIVE_TIMES, 4):
+        if has(registers.RECEIVE_TIMES, 4):
             self.clock.latch(0, now)
-        elif has(registers.SYSTEM_TIME, 4) and len(data) >= 4 and address == registers.SYSTEM_TIME:
+        if has(registers.SYSTEM_TIME, 4) and len(data) >= 4 and address == registers.SYSTEM_TIME:
             self.clock.compare(int.from_bytes(data[:4], "little"), now)
-        elif has(registers.SPEED_START, 2):
+        if has(registers.SPEED_START, 2):
             self.clock.restart_comparison(now)
-        elif has(registers.SYNC_ACTIVATION, 1):
+        if has(registers.SYNC_ACTIVATION, 1):
             self.clock.activate(now)
 
     def _configure_managers(self) -> None:

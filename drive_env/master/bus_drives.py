@@ -72,7 +72,9 @@ class BusDrives:
         self.device = description.device
         self.nodes = link.nodes
         self.num_axes = len(self.nodes) * description.num_axes
-        self._cycle_runner = CycleRunner(description, self.num_axes, link, pace, self.start, self._catch_up)
+        self._cycle_runner = CycleRunner(
+            description, self.num_axes, link, pace, self.start, self._catch_up, self.read_entry
+        )
         self._started = False
         self._closed = False
         self.safety: Envelope | None = None
@@ -197,6 +199,11 @@ class BusDrives:
             values[key] = np.tile(self.read_entry(entry), (rows, 1)) if self.is_dry else found[key][::every]
         times = np.arange(rows, dtype=np.float64) * (every * self._description.cycle)
         return Trace(times, values, self._description.dictionary, lambda: scales_of(self))
+
+    def can_record(self, objects: Sequence[ObjectName]) -> bool:
+        """Return whether objects can be recorded together; what would be mapped for it is not."""
+        self._enter()
+        return self._cycle_runner.can_record(objects)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.

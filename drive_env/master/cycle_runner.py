@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.master.asked_rows import CAN_BE_ASKED, AskedRows
 from drive_env.master.description import Description, Key
 from drive_env.master.link import Link, Outputs, Samples
 from drive_env.master.pace import Pace
@@ -41,6 +43,7 @@ class RecordCall:
     watched: What the envelope wanted sampled when `chosen` was made.
     chosen: What is sampled: `sampled` and as much of `watched` as fits.
     mapping: The number of the mapping that has all of it.
+    asked: Of `sampled`, what is asked for by SDO meanwhile, since it does not fit.
     """
 
     sampled: tuple[Entry, ...]
@@ -48,6 +51,18 @@ class RecordCall:
     watched: Sequence[Entry] | None = None
     chosen: tuple[Entry, ...] = ()
     mapping: int = -1
+    asked: tuple[Entry, ...] = ()
+
+    @property
+    def mapped(self) -> tuple[Entry, ...]:
+        """What process data are to carry of `sampled`."""
+        return tuple(entry for entry in self.sampled if entry not in self.asked)
+
+    def ask_for_states(self) -> bool:
+        """Have states asked for that are sampled; return whether that leaves less to process data."""
+        before = self.asked
+        self.asked = tuple(entry for entry in self.sampled if (entry.index, entry.sub) in CAN_BE_ASKED)
+        return self.asked != before
 
 
 class CycleRunner:
@@ -60,6 +75,7 @@ class CycleRunner:
         pace: When SYNCs are due.
         start: Takes the nodes to where they exchange process data, once.
         catch_up: Returns when nodes in lockstep have seen every SYNC.
+        read: Reads an object of every axis by SDO.
     """
 
     def __init__(
@@ -70,10 +86,11 @@ class CycleRunner:
         pace: Pace,
         start: Callable[[], None],
         catch_up: Callable[[], None],
+        read: Callable[[Entry], Integers],
     ) -> None:
         self._description, self._num_axes = description, num_axes
         self._link, self._pace, self._process = link, pace, link.process
-        self._start, self._catch_up = start, catch_up
+        self._start, self._catch_up, self._read = start, catch_up, read
         self._calls: dict[object, RecordCall] = {}
         self._running = threading.RLock()  # one user of SYNC at a time: the program, or its supervisor
         self._nothing = RecordCall((), ())
@@ -146,6 +163,14 @@ class CycleRunner:
         made = self._calls[names] = RecordCall(sampled, played)
         return made
 
+    def can_record(self, objects: Sequence[ObjectName]) -> bool:
+        """Return whether objects can be recorded together."""
+        try:
+            self._choose(self.call(objects, ()), NOTHING, ())
+        except ObjectAccessError:
+            return False
+        return True
+
     def rows(self, call: RecordCall, given: Sequence[ArrayLike], cycles: int) -> dict[Entry, Integers]:
         """Return what is played, each of shape (cycles, num_axes).
 
@@ -177,7 +202,12 @@ class CycleRunner:
             samples = self._process.samples()
             epoch = None if any((entry.index, entry.sub) == CONTROLWORD for entry in played) else _NOW
             try:
-                found = self._run(cycles, outputs, samples, envelope, epoch=epoch)
+                if call.asked and samples is not None:
+                    with AskedRows(call.asked, self._read, samples.complete) as asked:
+                        found = self._run(cycles, outputs, samples, envelope, epoch=epoch)
+                    found |= asked.rows(cycles)
+                else:
+                    found = self._run(cycles, outputs, samples, envelope, epoch=epoch)
             except BaseException:
                 if envelope is not None:
                     envelope.after_failed_play(played)
@@ -192,15 +222,37 @@ class CycleRunner:
         watched = NOTHING if envelope is None else envelope.watched()
         played = tuple(dict.fromkeys(call.played))
         if call.watched is not watched:
-            call.watched, call.chosen, call.mapping = watched, self._process.choose(call.sampled, watched, played), -1
+            call.watched, call.chosen, call.mapping = watched, self._choose(call, watched, played), -1
         if call.mapping == self._process.mapping:
             return
-        if not self._process.is_mapped(played, call.chosen):
-            self._start()
-            self._process.map(played, call.chosen)
+        try:
+            self._have_mapped(call, played)
+        except ObjectAccessError:  # as while an axis is enabled, where a drive then changes nothing
+            if not self._asks_for_states(call):
+                raise
+            call.chosen = self._choose(call, watched, played)
+            self._have_mapped(call, played)
         call.mapping = self._process.mapping
         if envelope is not None:
             envelope.sampled(self._process.sampled_entries())
+
+    def _have_mapped(self, call: RecordCall, played: tuple[Entry, ...]) -> None:
+        if not self._process.is_mapped(played, call.chosen):
+            self._start()
+            self._process.map(played, call.chosen)
+
+    def _asks_for_states(self, call: RecordCall) -> bool:
+        """Have states of a call asked for, by the clock: where time waits nothing would come between two cycles."""
+        return not self._pace.time_waits and call.ask_for_states()
+
+    def _choose(self, call: RecordCall, watched: Sequence[Entry], played: tuple[Entry, ...]) -> tuple[Entry, ...]:
+        """Return what is sampled; states are asked for where not all that a call wants fits."""
+        try:
+            return self._process.choose(call.mapped, watched, played)
+        except ObjectAccessError:
+            if not self._asks_for_states(call):
+                raise
+            return self._process.choose(call.mapped, watched, played)
 
     def _run(
         self,

@@ -125,6 +125,8 @@ class ClosedLoopTrials(OpenLoopTrials):
     The machine is identified with the loop open; it is closed then, and is what it was after `leave`.
     """
 
+    computes_demand = False  # how far an axis is behind is what is seen of its loop
+
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float, closed: ClosedLoop) -> None:
         super().__init__(drives, motor, axes, t_0)
         self._closed = closed
@@ -183,6 +185,7 @@ class ClosedLoopTrials(OpenLoopTrials):
             aborted[phase] = stopped
             sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
             settling[phase], noise[phase], overshoot[phase] = self._terms(position, current, move, target, sign)
+            assert demand is not None, "it is recorded, or the drive refuses"
             error = wrapped(demand - position)
             following[phase] = np.abs(error / self._following_scale(move)).sum(axis=0) * CYCLE
             if phase == 0:

@@ -21,6 +21,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains
 from drive_env.motors import Motor
+from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
     CYCLE,
@@ -112,7 +113,10 @@ class Trials:
 
     Attributes:
         look: If not None, called after every cycle.
+        computes_demand: Where drives do not send their demand, that of the profile does.
     """
+
+    computes_demand = True
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         self.look: Callable[[], None] | None = None
@@ -186,6 +190,8 @@ class Trials:
                 position, current * ampere_per_count(drives), move, self._t_0, self._motor.rated_current, target, sign
             )
             size = np.maximum(np.abs(move.distance), 1)
+            if demand is None:
+                demand = computed(away if phase == 1 else origin, target, move, TRIAL)
             error = wrapped(demand - position) / size
             following[phase] = np.maximum(np.abs(error).sum(axis=0), 0.5) * CYCLE
             if phase == 0:
@@ -221,10 +227,15 @@ class Trials:
 
     def _phase(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
-    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
-        """Move; return position, demand, current, the machines stopped so far, and the axes that caused it now."""
+    ) -> tuple[Floats, Floats | None, Floats, Mask, Mask]:
+        """Move; return position, demand, current, the machines stopped so far, and the axes that caused it now.
+
+        The demand is None where the drives cannot send it.
+        """
         drives, to = self._drives, _on_the_counter(target)
-        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
+        objects = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
+        if has_demand := not self.computes_demand or is_recorded(drives):
+            objects.insert(1, cia402.POSITION_DEMAND)
         traces = []
         culprit = np.zeros(len(stopped), bool)
         self._prepare(objects)
@@ -244,8 +255,9 @@ class Trials:
             if down.any():
                 clear(drives, down)
                 start(drives, to, down)
-        position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
-        return position, demand, current, stopped, culprit
+        seen = {name: np.concatenate([trace[name] for trace in traces]) for name in objects}
+        demand = seen[cia402.POSITION_DEMAND] if has_demand else None
+        return seen[cia402.POSITION_ACTUAL], demand, seen[cia402.TORQUE_ACTUAL], stopped, culprit
 
     def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
         """Return which axes oscillate in the samples of a look, (num_axes,)."""

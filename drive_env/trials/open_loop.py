@@ -224,7 +224,14 @@ class OpenLoopTrials(Trials):
             if on.any():
                 motion.disable(drives, where=on)
             drives.write(cia402.SENSOR_SELECTION, ENCODER, where=blind)
+        if not drives.time_waits and np.all(self.down()):
+            self._prepare(self._recorded())
         super().recover(where)
+
+    def _recorded(self) -> list[Any]:
+        """Return what trials record, all together: some drives change nothing of it while an axis is enabled."""
+        objects: list[Any] = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
+        return [*objects, cia402.TORQUE_ACTUAL] if device_of(self._drives).gains.closed_loops else objects
 
     def power_up(self, where: Mask) -> None:
         """Take drives that were switched on just now to pp, enabled, by the encoder."""

@@ -157,7 +157,7 @@ class PidTrials(ClosedLoopTrials):
 
     def _phase(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
-    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+    ) -> tuple[Floats, Floats | None, Floats, Mask, Mask]:
         found = super()._phase(target, incumbent, stopped, where)
         if (slipped := found[3] & ~stopped & where).any():
             self._make_up(slipped)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.gains import check_linear_model
+from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
 from tuning.auto.choice import keep_the_better, try_rule
 from tuning.auto.loop_margins import judge, measure
@@ -28,7 +29,7 @@ from tuning.auto.trials import prove
 from tuning.identify.quick_identification import identify_briefly
 from tuning.outcome import Outcome
 from tuning.snapshot import Transaction, can_store
-from tuning.target import timed
+from tuning.target import timed, told_lateness
 
 if TYPE_CHECKING:
     from tuning.auto.result import Result
@@ -136,6 +137,8 @@ def prove_found(
         recorded = keep_the_better(bench, basis, recorded, target)
         verdict = judge(bench, basis, recorded)
         tell_of_lateness(bench)
+        if not is_recorded(target.drives):
+            bench.note(np.ones(target.num_axes, bool), COMPUTED)
         say("writing", 0.96)
         accepted = write(bench, fresh, recorded.gains, transaction)
         kept = keep and bool(accepted.any()) and can_store(target)
@@ -150,19 +153,9 @@ def prove_found(
 
 
 def tell_of_lateness(bench: AutoBench) -> None:
-    """Add a reservation if SYNCs of a bus in real time were late, which distorts moves and responses."""
-    drives = bench.target.drives
-    if drives.time_waits or drives.bus is None:
-        return
-    timing = drives.bus.total_timing
-    worst = 1e3 * timing.worst
-    if timing.late:
-        bench.reserve(
-            np.ones(bench.target.num_axes, bool),
-            f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {worst:.1f} ms: "
-            "this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
-            "`chrt -f 10` before the command (Linux)",
-        )
+    """Add a reservation if SYNCs of a bus in real time were late."""
+    if late := told_lateness(bench.target.drives):
+        bench.reserve(np.ones(bench.target.num_axes, bool), late)
 
 
 def tune(target: Target, rng: np.random.Generator) -> Outcome:

@@ -19,6 +19,7 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
+from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trial, Trials, measured_cost, softness
 from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import (
@@ -239,14 +240,18 @@ class ProvingGround:
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
         self.moves[where] += 1
-        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
+        objects = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
+        if has_demand := is_recorded(drives):
+            objects.append(cia402.POSITION_DEMAND)
         traces, stopped = [], np.zeros(self.target.num_axes, bool)
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
             stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
         swing = self._swing(away, where & ~stopped)
         measured = self._noise(gains, where & ~stopped & (swing > RESTLESS) & (swing < OSCILLATION))
-        position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
+        seen = {name: np.concatenate([part[name] for part in traces]) for name in objects}
+        position, current = seen[cia402.POSITION_ACTUAL], seen[cia402.TORQUE_ACTUAL]
+        demanded = seen[cia402.POSITION_DEMAND] if has_demand else computed(self._origin, away, self.move, TRIAL)
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
         error = wrapped(position - away) * way

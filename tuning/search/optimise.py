@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drive_env.gains import RAW_MAX
 from drive_env.trials.method import check_tried
 from tuning.runs.shard_log import ShardLog
-from tuning.search.samplers import SAMPLERS, Proposer, new_proposer
+from tuning.search.samplers import SAMPLERS, Proposer, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
 from tuning.search.trial_log import LoggedTrials
 from tuning.target import Target, timed
@@ -160,6 +160,7 @@ def optimise(
     columns = target.device.gains.columns(chosen)
     with timed(target) as (watched, clock):
         bench = TrialBench(watched, anew=anew, gains=chosen)
+        load(settings.sampler)
         bench.identify()
         search = _Search(bench, settings, columns, shared, bench if log is None else LoggedTrials(bench, clock, log))
         while search.generation():

@@ -101,6 +101,12 @@ def check_installed(sampler: str) -> None:
         )
 
 
+def load(sampler: str) -> None:
+    """Import what a sampler needs, which takes a second or more: too long with an axis enabled."""
+    if sampler != "grid":
+        importlib.import_module("optuna.samplers")
+
+
 class _Grid:
     """Every point of a grid, in the order of counting, the given points first."""
 

@@ -22,6 +22,8 @@ from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.open_loop import encoder_age
+from tuning.search.optimise import Settings
+from tuning.search.samplers import load
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
@@ -29,7 +31,7 @@ from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has
 from tuning.stepper.moves import WorkingMoves
 from tuning.stepper.obstacle import REACTION, can_load, prove_with_load
 from tuning.stepper.result import StepperAxis, StepperResult, figure
-from tuning.target import Target, timed
+from tuning.target import Target, timed, told_lateness
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -46,12 +48,13 @@ MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
 
 
 def check_stepper(target: Target) -> None:
-    """Raise ValueError unless a target's drives have a load detection to be set, before anything is done."""
+    """Load what the search needs; ValueError unless drives have a load detection to be set, before anything is done."""
     if lacks := lacks_load_detection(target.device):
         raise ValueError(
             f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "
             "optimise find its phase currents by trials"
         )
+    load(Settings().sampler)
 
 
 def commission(
@@ -255,5 +258,5 @@ def _axis(
     figures |= {name: figure(values[k]) for name, values in proof.items() if name in LOOP_FIGURES}
     return StepperAxis(
         dict(zip(names, map(int, before[k]), strict=True)), dict(zip(names, map(int, after), strict=True)), reason,
-        tuple(found.reservations[k]), figures,
+        (*found.reservations[k], *filter(None, [told_lateness(target.drives)])), figures,
     )  # fmt: skip

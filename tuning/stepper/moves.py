@@ -1,7 +1,8 @@
 """Moves at the working speed, there and back, with load reading and load angle of their steady parts.
 
-Load readings are read by SDO, some milliseconds apart: drives of steppers do not map them into process data. An axis
-that loses steps is stopped with the next sample, and stays out.
+Load readings are read by SDO, some milliseconds apart: drives of steppers do not map them into process data. How long
+that takes is not known in real time, so that where an axis is in its profile is told by its demand. An axis that loses
+steps is stopped with the next sample, and stays out.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ SETTLE = 0.06  # s after the ramp, until the rotor's swing has died away
 STEADY, LEAST_STEADY = 0.3, 0.06  # s at constant speed: wanted, and at least
 LEAST_STEPS = 20.0  # full steps at constant speed
 REST = 0.1  # s at the end of a move
+LATE = 0.02  # s: a load reading that is read by SDO in real time may be so much later than its sample
 
 
 class Steady(NamedTuple):
@@ -122,14 +124,13 @@ class WorkingMoves:
         ramp = speed / self.acceleration
         for leg, target in enumerate((self.origin + distance, self.origin)):
             shift = self.trials.shift()
+            begun = self.drives.read(cia402.POSITION_DEMAND)
             self.trials.go(target, where & ~lost & ~stopped)
             end = 2.0 * float(ramp.max()) + SETTLE + float(steady.max()) + REST
             for k in range(1, math.ceil(end / SAMPLE) + 1):
-                self.drives.advance(SAMPLE)
+                demand, actual = self._sample()
                 t = k * SAMPLE
-                lag = wrapped(
-                    self.drives.read(cia402.POSITION_DEMAND) - self.drives.read(cia402.POSITION_ACTUAL) - shift
-                )
+                lag = wrapped(demand - actual - shift)
                 enabled = cia402.matches(self.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
                 stopped |= where & ~enabled
                 out = where & ~lost & (np.abs(lag) > LOST * full_step)
@@ -140,7 +141,8 @@ class WorkingMoves:
                     look(leg, t)
                 if until_stopped and not np.any(where & ~stopped):
                     break
-                is_steady = where & ~lost & ~stopped & (t > ramp + SETTLE) & (t < ramp + SETTLE + steady)
+                at, late = (t, 0.0) if self.drives.time_waits else (self._time(demand - begun, speed, ramp), LATE)
+                is_steady = where & ~lost & ~stopped & (at > ramp + SETTLE) & (at < ramp + SETTLE + steady - late)
                 if is_steady.any():
                     reading = np.asarray(self.drives.read(Role.LOAD_VALUE), float)
                     readings.append(np.where(is_steady, reading, np.nan))
@@ -148,6 +150,19 @@ class WorkingMoves:
                     angle = (along - speed * self.age) * self.motor.n_p
                     angles.append(np.where(is_steady, angle, np.nan))
         return _steady(readings, angles, lost, stopped)
+
+    def _sample(self) -> tuple[Integers, Integers]:
+        """Let time pass, and return demand and encoder of one moment [inc], (num_axes,)."""
+        if self.drives.time_waits:
+            self.drives.advance(SAMPLE)
+            return self.drives.read(cia402.POSITION_DEMAND), self.drives.read(cia402.POSITION_ACTUAL)
+        trace = self.drives.record([cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL], SAMPLE)
+        return trace[cia402.POSITION_DEMAND][-1], trace[cia402.POSITION_ACTUAL][-1]
+
+    def _time(self, gone: Integers, speed: float, ramp: Floats) -> Floats:
+        """Return when a demand that has gone so far [inc] is there [s], of a profile whose ramps take `ramp` [s]."""
+        way = np.abs(wrapped(gone)) / self.increments
+        return np.asarray(np.where(way < 0.5 * speed * ramp, 0.0, way / speed + 0.5 * ramp))
 
 
 def _steady(readings: list[Floats], angles: list[Floats], lost: Mask, stopped: Mask) -> Steady:

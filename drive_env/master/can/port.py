@@ -53,6 +53,11 @@ def open_bus(interface: str | None = None, channel: str | None = None, **options
             "no CAN channel is given; give interface and channel (--interface socketcan --channel can0, or --channel "
             f"socket://127.0.0.1:PORT of `drive-env serve`), or set {INTERFACE_VARIABLE} and {CHANNEL_VARIABLE}"
         )
+    if interface in ("ethercat", "ethercat-udp"):
+        raise OpenError(
+            f"interface {interface!r} carries no CAN frames, which this is for; frames of EtherCAT are written by "
+            "`drive-env serve --pcap FILE`, or on a cable by Wireshark"
+        )
     token = options.pop("token", None)
     over_tcp = channel.startswith("socket://")
     if interface in (None, "slcan") and over_tcp and not options.keys() - {"bitrate"}:

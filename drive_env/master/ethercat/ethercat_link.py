@@ -81,8 +81,8 @@ class EtherCatLink:
             beyond = [position for position in self.nodes if position >= count]
             if beyond:
                 raise BusError(
-                    f"there is no position {beyond[0]}: {count} slave{'s' if count > 1 else ''} answer; count from 0, "
-                    "or look with `drive-env scan`"
+                    f"there is no position {beyond[0]}: {count} slave{'s answer' if count > 1 else ' answers'}; count "
+                    "from 0, or look with `drive-env scan`"
                 )
             if sync0:
                 check_clocks(master, range(count))

@@ -142,8 +142,15 @@ class FrameMaster:
         """
         found = []
         for position in range(self._count()):
-            status = self._surely(C.APRD, -position, registers.AL_STATUS, bytes(6), f"position {position}")
-            found.append((_status(status), self._identity(C.APRD, C.APWR, -position)))
+            what = f"position {position}"
+            status = self._surely(C.APRD, -position, registers.AL_STATUS, bytes(6), what)
+            # A master that was there before may have left the EEPROM to the device, where nobody else can read it.
+            owner = self._surely(C.APRD, -position, registers.SII_ACCESS, bytes(1), what)
+            self._surely(C.APWR, -position, registers.SII_ACCESS, bytes(1), what)
+            try:
+                found.append((_status(status), self._identity(C.APRD, C.APWR, -position)))
+            finally:
+                self._surely(C.APWR, -position, registers.SII_ACCESS, owner, what)
         return found
 
     def begin(self) -> int:
@@ -231,7 +238,8 @@ class FrameMaster:
         deadline = time.monotonic() + PATIENCE
         while True:
             found = self._surely(read, station, registers.SII_CONTROL, bytes(10), what)
-            if not struct.unpack_from("<H", found)[0] & SII_BUSY:
+            control, taken = struct.unpack_from("<HI", found)
+            if not control & SII_BUSY and taken == address:
                 return found[6:10]
             if time.monotonic() > deadline:
                 raise NoAnswerError(f"{what} stays busy; check its power")

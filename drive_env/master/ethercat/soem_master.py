@@ -1,4 +1,9 @@
-"""A master on a network interface: SOEM, by pysoem (extra `ethercat`), finds slaves, maps images, transfers objects."""
+"""A master on a network interface: SOEM, by pysoem (extra `ethercat`), finds slaves, maps and exchanges images.
+
+Objects are transferred by a mailbox of ours over SOEM's datagrams. SOEM's own transfers in one thread would hold up the
+images that go in another: its threads take each other's frames from the socket, and who waits there for one that it
+already has waits for the socket's shortest time, 1 us, of which Linux makes one or two of its ticks, 4 to 20 ms.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,6 @@ import math
 import struct
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -24,7 +28,7 @@ from drive_env.master.ethercat.ethercat_master import (
     SlaveStatus,
     Sync0,
 )
-from drive_env.master.ethercat.mailbox_client import SdoAbortError
+from drive_env.master.ethercat.mailbox_client import MailboxClient, SdoAbortError
 from drive_env.master.ethercat.state_names import refusal
 from drive_env.master.link import ReceivedEmergency
 
@@ -32,12 +36,11 @@ MICROSECONDS = 1e6
 REGISTER_TIMEOUT = 20_000  # us
 # us. SOEM has 2 ms for a frame and 20 ms for room in a mailbox, for a chip and a computer that does nothing else.
 FRAME_TIMEOUT, ROOM_TIMEOUT = 20_000, 200_000
-NO_ROOM = 0.25  # s: SOEM gives up sooner only where a mailbox had no room, and the request was not sent
-LEAST_TIMEOUT = 0.3  # s for an answer, so that the two can be told apart
-POST_TIMEOUT = 1000  # us
 STATE_LOOK = 0.005  # s between two looks at the slaves' states while images are exchanged
 PATIENCE = 5.0  # s for a state
-LARGEST_OBJECT = 4096  # bytes
+PROBE, PROBES = 0.1, 3  # s for an answer that shows that the slave takes our mailbox counter, and how often it is asked
+HAS_MAIL = 0x08  # of a sync manager's status
+DEVICE_TYPE = 0x1000
 
 
 class SoemMaster:
@@ -50,7 +53,7 @@ class SoemMaster:
         OpenError: If pysoem is not installed, or the interface cannot be opened.
 
     Attributes:
-        alive: Called while an answer is waited for; here before each transfer, which SOEM does in one call.
+        alive: Called again and again while an answer is waited for.
         clock: What `map` sets the distributed clocks to; delays and offsets are SOEM's to measure.
         system_time: The reference's time that the last exchange has brought [ns].
     """
@@ -77,9 +80,9 @@ class SoemMaster:
                 f"{interface} cannot be opened: it is no network interface here, or the right CAP_NET_RAW is missing: "
                 "run as root, or see the page on EtherCAT for how to give it to Python"
             ) from None
-        self._turn = threading.RLock()  # process data and registers; a transfer of objects has its slave's
-        self._turns: list[threading.RLock] = []
-        self._emergencies: deque[ReceivedEmergency] = deque()
+        self._turn = threading.RLock()  # a frame and its answer
+        self._mailboxes: list[MailboxClient] = []
+        self._has_counted: list[bool] = []  # whether the last message to a slave's mailbox was ours
         self._mapped: dict[int, ImageSizes] = {}
         self._looked, self._states = -math.inf, dict[int, SlaveStatus]()
 
@@ -91,11 +94,10 @@ class SoemMaster:
             count = int(self._master.config_init())
             if count <= 0:
                 raise NoAnswerError(f"no slave answers on {self._interface}; check cable, power and channel")
-            self._turns = [threading.RLock() for _ in range(count)]
-            for position, slave in enumerate(self._master.slaves):
-                slave.add_emergency_callback(lambda one, position=position: self._take_emergency(position, one))
             for position in range(count):
                 self._await(position, AlState.PRE_OP)
+            self._mailboxes = [self._mailbox(position) for position in range(count)]
+            self._has_counted = [False] * count
             return count
 
     def recover(self, position: int) -> bool:
@@ -172,10 +174,12 @@ class SoemMaster:
         """Give the images of all slaves their places, and take them from Pre-Op to Safe-Op."""
         with self._turn:
             if self.clock is not None:
-                check_clocks(self, range(len(self._turns)))
+                check_clocks(self, range(len(self._mailboxes)))
                 self._master.config_dc()
                 waiting = [k for k in sizes if self.status(k).state == AlState.PRE_OP]
                 start_sync0(self, waiting, self.clock.cycle, self.clock.is_lockstep)
+            for position in sizes:
+                self._give_the_mailbox_back(position)
             try:
                 self._master.config_map()
             except self._soem.ConfigMapError as error:
@@ -236,75 +240,82 @@ class SoemMaster:
     # --- objects ----------------------------------------------------------------------------------------------------
     def upload(self, position: int, index: int, sub: int, timeout: float) -> bytes:
         """Return the bytes of an object."""
-        slave = self._slave(position)
-        found = self._transact(
-            position, timeout, lambda: slave.sdo_read(index, sub, LARGEST_OBJECT, release_gil=True), is_repeatable=True
-        )
-        return bytes(found)
+        return self._our_mailbox(position).upload(index, sub, timeout)
 
     def download(self, position: int, index: int, sub: int, data: bytes, timeout: float) -> None:
         """Write the bytes of an object."""
-        slave = self._slave(position)
-        self._transact(position, timeout, lambda: slave.sdo_write(index, sub, data, release_gil=True), False)
+        self._our_mailbox(position).download(index, sub, data, timeout)
 
     def post(self, position: int, index: int, sub: int, data: bytes) -> None:
-        """Send a short write, unless a transfer is under way."""
-        if not self._turns[position].acquire(blocking=False):
-            return
-        try:
-            self._master.sdo_write_timeout = POST_TIMEOUT
-            self._quietly(lambda: self._slave(position).sdo_write(index, sub, data, release_gil=True))
-        finally:
-            self._turns[position].release()
-
-    def _transact(self, position: int, timeout: float, call: Callable[[], Any], is_repeatable: bool) -> Any:
-        soem, deadline = self._soem, time.monotonic() + timeout
-        while True:
-            self.alive()
-            with self._turns[position]:
-                longest = round(max(timeout, LEAST_TIMEOUT) * MICROSECONDS)
-                self._master.sdo_read_timeout = self._master.sdo_write_timeout = longest
-                begun = time.monotonic()
-                try:
-                    return call()
-                except soem.SdoError as error:
-                    raise SdoAbortError(error.abort_code & 0xFFFFFFFF, f"abort {error.abort_code:08X}h") from None
-                except soem.MailboxError as error:
-                    raise BusError(f"a mailbox error of the slave, detail {error.error_code}") from None
-                except (soem.WkcError, soem.PacketError):
-                    was_sent = time.monotonic() - begun > NO_ROOM
-            if time.monotonic() > deadline or (was_sent and not is_repeatable):
-                raise NoAnswerError("no answer came in time")
+        """Send a short write and wait for no answer, unless a transfer is under way."""
+        self._our_mailbox(position).post(index, sub, data)
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
         """Return and forget the emergencies that came."""
-        for position, turn in enumerate(self._turns):
-            if not turn.acquire(blocking=False):
-                continue
-            try:
-                self._slave(position).mbx_receive()
-            except self._soem.Emergency as error:
-                self._take_emergency(position, error)
-            except (self._soem.MailboxError, self._soem.SdoError, self._soem.PacketError, self._soem.WkcError):
-                pass  # of a transfer that nobody waits for any more
-            finally:
-                turn.release()
-        found = list(self._emergencies)
-        for _ in found:
-            self._emergencies.popleft()
+        found = []
+        for position, mailbox in enumerate(self._mailboxes):
+            mailbox.look(0.0)
+            while mailbox.emergencies:
+                found.append(ReceivedEmergency(position, *mailbox.emergencies.popleft()))
         return found
 
-    def _take_emergency(self, position: int, one: Any) -> None:
-        extra = (one.b1, one.w1 & 0xFF, one.w1 >> 8, one.w2 & 0xFF, one.w2 >> 8)
-        self._emergencies.append(ReceivedEmergency(position, one.error_code, one.error_reg, extra))
+    def _our_mailbox(self, position: int) -> MailboxClient:
+        """Return the client of a slave's mailbox, once the slave takes its counter.
+
+        A slave ignores a message with the counter of the one before, and SOEM does not tell its own.
+        """
+        mailbox = self._mailboxes[position]
+        if not self._has_counted[position]:
+            for _ in range(PROBES):
+                with contextlib.suppress(NoAnswerError, SdoAbortError):
+                    mailbox.upload(DEVICE_TYPE, 0, PROBE)
+                    break
+            self._has_counted[position] = True
+        return mailbox
+
+    def _give_the_mailbox_back(self, position: int) -> None:
+        """Let SOEM send a message that the slave may ignore, so that it takes the next."""
+        if self._has_counted[position]:
+            self._master.sdo_read_timeout = round(PROBE * MICROSECONDS)
+            self._quietly(lambda: self._slave(position).sdo_read(DEVICE_TYPE, 0))
+            self._has_counted[position] = False
+
+    def _mailbox(self, position: int) -> MailboxClient:
+        """Return a client of a slave's mailbox, where SOEM has put it."""
+        found = self.register(position, registers.SYNC_MANAGERS, 2 * registers.SYNC_MANAGER_SIZE)
+        if found is None:
+            raise NoAnswerError(f"position {position} does not answer; check cable and power")
+        receive, room, send, length = struct.unpack("<HH4xHH4x", found)
+        second = registers.SYNC_MANAGERS + registers.SYNC_MANAGER_SIZE
+
+        def write(data: bytes) -> bool:
+            with self._turn:
+                slave = self._slave(position)
+                return self._quietly(lambda: slave._fpwr(receive, data, REGISTER_TIMEOUT) or True) is not None
+
+        def fetch() -> bytes | None:
+            with self._turn:
+                status = self.register(position, second + 5, 1)
+                if status is None or not status[0] & HAS_MAIL:
+                    return b""
+                found = self._quietly(lambda: self._slave(position)._fprd(send, length, REGISTER_TIMEOUT))
+            return None if found is None else bytes(found)
+
+        def repeat() -> None:
+            activate = self.register(position, second + 6, 1)
+            if activate is not None:
+                with contextlib.suppress(NoAnswerError):
+                    self.write_register(position, second + 6, bytes((activate[0] ^ 2,)))
+
+        return MailboxClient(write, fetch, repeat, (room, length), lambda: self.alive())
 
     def close(self) -> None:
         """Take all slaves to Init, as far as they answer, and let go of the interface."""
         with self._turn:
-            if self._turns:
+            if self._mailboxes:
                 self._master.state = int(AlState.INIT)
                 self._master.write_state()
-            for position in range(len(self._turns) if self.clock is not None else 0):
+            for position in range(len(self._mailboxes) if self.clock is not None else 0):
                 with contextlib.suppress(NoAnswerError):
                     self.write_register(position, registers.SYNC_ACTIVATION, bytes(1))
             self._master.close()

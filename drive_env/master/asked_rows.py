@@ -1,0 +1,70 @@
+"""What no process data carry, asked for by SDO while cycles pass: each row has what was told last.
+
+For states alone, which change seldom: of a position a row would be wrong by what is some milliseconds old.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Key
+
+Integers = NDArray[np.int64]
+CAN_BE_ASKED = ((cia402.STATUSWORD, 0),)
+PAUSE = 0.004  # s between two answers and the next question
+
+
+class AskedRows:
+    """Asks for objects in a thread, as long as a with statement lasts.
+
+    Args:
+        entries: The objects.
+        read: Returns one of every axis.
+        passed: Returns how many rows there are by now.
+    """
+
+    def __init__(self, entries: Sequence[Entry], read: Callable[[Entry], Integers], passed: Callable[[], int]) -> None:
+        self._entries = tuple(entries)
+        self._read, self._passed = read, passed
+        self._told: list[tuple[int, list[Integers]]] = []
+        self._error: BaseException | None = None
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="asked meanwhile", daemon=True)
+
+    def _run(self) -> None:
+        try:
+            while not self._told or not self._is_over.wait(PAUSE):
+                # What comes belongs to the row that is next when it is there.
+                values = [self._read(entry) for entry in self._entries]
+                self._told.append((self._passed(), values))
+        except BaseException as error:  # told by whoever waits for the rows
+            self._error = error
+
+    def rows(self, count: int) -> dict[Key, Integers]:
+        """Return each object of shape (count, num_axes); raises what kept it from being asked."""
+        if self._error is not None:
+            raise self._error
+        # The first answer stands for the rows before it, too.
+        begins = np.minimum([0, *(row for row, _ in self._told[1:])], count)
+        times = np.diff(begins, append=count)
+        return {
+            (entry.index, entry.sub): np.repeat(np.stack([values[k] for _, values in self._told]), times, axis=0)
+            for k, entry in enumerate(self._entries)
+        }
+
+    def __enter__(self) -> AskedRows:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._is_over.set()
+        self._thread.join()

@@ -1,0 +1,48 @@
+"""The position demand of a move in pp: as the drive has it, or as it follows from what the drive was told.
+
+Some drives have no 6062h among their process data. Their demand is computed then, from the profile that was written. It
+is that of the drive to about a millisecond: when exactly a set-point that is written by SDO began to act, nobody tells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.drives.interface import Drives
+from drive_env.trials.positioning import CYCLE, Move
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+COMPUTED = (
+    "the position demand (6062h) is in no process data of this drive: that of a move is computed from target, profile "
+    "velocity and acceleration, to about a millisecond, and not recorded"
+)
+
+
+def is_recorded(drives: Drives) -> bool:
+    """Return whether drives can record their position demand."""
+    return drives.bus is None or drives.bus.can_record([cia402.POSITION_DEMAND])
+
+
+def computed(begin: Integers, target: Integers, move: Move, cycles: int) -> Floats:
+    """Return the demand of the profile of a move from rest to rest [inc], shape (cycles, num_axes).
+
+    Args:
+        begin: Where it begins [inc], (num_axes,).
+        target: Where it ends [inc], (num_axes,).
+        move: Its velocity and acceleration.
+        cycles: How many, the first when it begins.
+    """
+    way = np.asarray(target, float) - begin
+    distance = np.abs(way)
+    acceleration = np.asarray(move.acceleration, float)
+    speed = np.minimum(move.velocity, np.sqrt(distance * acceleration))
+    ramp = speed / acceleration
+    end = np.where(distance > 0.0, distance / np.maximum(speed, 1e-9) + ramp, 0.0)
+    t = np.minimum(np.arange(cycles)[:, None] * CYCLE, end)
+    rising, falling = np.minimum(t, ramp), np.maximum(t - (end - ramp), 0.0)
+    gone = 0.5 * acceleration * rising**2 + speed * (t - rising) - 0.5 * acceleration * falling**2
+    return np.asarray(begin + np.sign(way) * np.rint(np.minimum(gone, distance)))
