@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import BasicDrives
+from drive_env.drives.interface import BasicDrives, axis_number
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -63,12 +63,12 @@ def wait_for(
         if fault.any() and pattern != cia402.FAULT:
             axis = int(np.flatnonzero(fault)[0])
             raise RuntimeError(
-                f"axis {axis} is in fault while waiting for {what}; see emergencies(), then reset_fault()"
+                f"axis {axis_number(drives, axis)} is in fault while waiting for {what}; see emergencies(), then reset_fault()"
             )
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
             raise TimeoutError(
-                f"axis {axis} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h"
+                f"axis {axis_number(drives, axis)} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h"
                 + _why_not_heard(drives, int(status[axis]))
             )
         drives.advance(STEP)
@@ -131,7 +131,7 @@ def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
             raise TimeoutError(
-                f"axis {axis} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
+                f"axis {axis_number(drives, axis)} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
                 "mode, and the axis is halted; disable it, then select the mode"
             )
         drives.advance(STEP)
@@ -282,7 +282,7 @@ def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float =
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
-            raise TimeoutError(f"axis {axis} stays in fault: the cause is still there; see emergencies()")
+            raise TimeoutError(f"axis {axis_number(drives, axis)} stays in fault: the cause is still there; see emergencies()")
         drives.advance(STEP)
         waited += STEP
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
@@ -391,7 +391,7 @@ def _check_can_move(drives: BasicDrives, where: Mask | None) -> None:
         if wrong.any():
             axis = int(np.flatnonzero(wrong)[0])
             raise RuntimeError(
-                f"axis {axis} {what} and cannot move: statusword {status[axis]:04X}h, mode {mode[axis]}; "
+                f"axis {axis_number(drives, axis)} {what} and cannot move: statusword {status[axis]:04X}h, mode {mode[axis]}; "
                 'motion.enable(drives, mode="pp") first'
             )
 
@@ -419,7 +419,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
             axis = int(np.flatnonzero(fault | failed)[0])
             what = "is in fault while homing; see emergencies()" if fault[axis] else "did not complete homing"
             raise RuntimeError(
-                f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
+                f"axis {axis_number(drives, axis)} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
             )
         still = axes & (bits != cia402.HOMED)
         if not still.any():
@@ -430,7 +430,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])
-            raise TimeoutError(f"axis {axis} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
+            raise TimeoutError(f"axis {axis_number(drives, axis)} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)
 
 

@@ -20,7 +20,7 @@ from drive_env.devices import Device
 from drive_env.devices.gain_set import RUN
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import Drives, axis_number, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
@@ -422,7 +422,7 @@ class OpenLoopTrials(Trials):
         if still.size:
             k = int(still[0])
             raise RuntimeError(
-                f"axis {k}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
+                f"axis {axis_number(self._drives, k)}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
                 "rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
                 "without an encoder nothing is seen of an open-loop stepper that could be scored"
             )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.interface import Drives, axis_number, machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
@@ -179,7 +179,7 @@ class TrialBench:
             self._reach = self._reach - wrapped(drives.read(cia402.POSITION_ACTUAL) - began) / scaler * 2.0 * np.pi
         axis = int(np.flatnonzero(watch.swung)[0])
         raise RuntimeError(
-            f"axis {axis} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
+            f"axis {axis_number(drives, axis)} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
             "gains that its motor's data sheet gives; check motor and wiring"
         )
 

@@ -119,7 +119,7 @@ def commission(
         result = StepperResult(
             tuple(_axis(k, target, bench, before, detection, proof_figures) for k in range(target.num_axes)),
             target.device.name, target.motor.name, target.machine, speed, clock.seconds, transaction.path, kept,
-            can_load(target),
+            can_load(target), target.axis_numbers,
         )  # fmt: skip
         with files(result):
             if kept:

@@ -60,6 +60,7 @@ class StepperResult:
         drive_seconds: Time that passed on the drives [s].
         file: The state before.
         kept: Whether drives on a bus stored the settings.
+        numbers: What each axis is called; its place by default.
         proved_with_load: Whether load and obstacle were put on the axis: emulated machines of one axis only.
     """
 
@@ -72,6 +73,7 @@ class StepperResult:
     file: Path
     kept: bool
     proved_with_load: bool
+    numbers: tuple[int, ...] = ()
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
@@ -100,7 +102,7 @@ class StepperResult:
                     "after": axis.after,
                     "figures": axis.figures,
                 }
-                for k, axis in enumerate(self.axes)
+                for k, axis in zip(self.numbers or range(len(self.axes)), self.axes, strict=True)
             ],
             "versions": versions(),
         }
