@@ -156,3 +156,27 @@ def test_errors_call_an_axis_by_its_own_number():
             chosen.advance(0.3)
             motion.move_to(chosen, 1000)
         assert {message.axis for message in chosen.emergencies()} == {0}
+
+
+# --- drive-env export -------------------------------------------------------------------------------------------------
+def test_export_of_one_axis_has_its_values_and_the_nodes_in_process_and_on_a_bus():
+    from drive_env.master.commissioned_eds import commissioned_values
+
+    with partly_wired() as whole:
+        world = World(lockstep=True)
+        world.add(whole, [1])
+        bus = WorldBus(world)
+        whole.write(0x2003, np.arange(100, 100 + AXES))
+        every, one = commissioned_values(whole), commissioned_values(whole, axis=3)
+        with CanDrives("tmcm6212", bus=bus, pace="lockstep", safety=False) as drives:
+            read = commissioned_values(drives, axis=3)
+        bus.shutdown()
+        world.close()
+    assert (one[0x2603, 0], (0x2003, 0) in one, (0x2203, 0) in one) == (103, False, False)
+    of_node = {key: value for key, value in every.items() if key[0] >= 0x2000 and whole.device.is_shared(key[0])}
+    of_axis = {key: value for key, value in every.items() if whole.device.locate(key[0])[0] == 3}
+    assert len(of_axis) > 30 and one.items() >= (of_node | of_axis).items()
+    assert {key: value for key, value in read.items() if key[0] >= 0x2000} == {
+        key: value for key, value in one.items() if key[0] >= 0x2000
+    }
+    assert {whole.device.locate(index)[0] for index, _ in read if not whole.device.is_shared(index)} == {3}
