@@ -139,7 +139,6 @@ class ClosedLoopTrials(OpenLoopTrials):
     def power_up(self, where: Mask) -> None:
         """Do so with drives that were switched on just now, in as many milliseconds whatever becomes of them."""
         super().power_up(where)
-        self._watch_no_window()
         if self._closes.any():
             self._drives.write(Role.LOOP_MODE, self._closed.mode, where=where & self._closes)
             self._drives.advance(CLOSING)
@@ -205,12 +204,6 @@ class ClosedLoopTrials(OpenLoopTrials):
     def _following_scale(self, move: Move) -> Floats:
         """Return over what the integral of |demand - encoder| counts [inc]."""
         return np.maximum(np.abs(move.distance), 1).astype(float)
-
-    def _watch_no_window(self) -> None:
-        """Take 6065h away, which drives have again that were switched on: an axis that is overloaded falls behind."""
-        drives = self._drives
-        if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
-            drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
 
     def _close(self, where: Mask, longest: float) -> None:
         """Close loops that are open, and wait until they commutate; one that does not is stopped in its trial."""

@@ -21,9 +21,9 @@ from drive_env.gains import (
 from drive_env.phase_current import currents_for, rated_setting, swing_period, with_currents
 from drive_env.trials.closed_loop import ClosedLoopTrials, plan_overload
 from drive_env.trials.gain_trial import Identified, Trials, softness
-from drive_env.trials.open_loop import OpenLoopTrials, open_loop_cost, open_loop_softness
+from drive_env.trials.open_loop import OpenLoopTrials, acceleration_share, open_loop_cost, open_loop_softness
 from drive_env.trials.position_pid import PID_I, PID_P, PidTrials, load_step_error, pid_time, plan_pid
-from drive_env.trials.positioning import highest_ramp, plan_move
+from drive_env.trials.positioning import SPEED_SHARE, highest_ramp, plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
 
 if TYPE_CHECKING:
@@ -157,8 +157,11 @@ class OpenLoop(NamedTuple):
         return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return the move of trials."""
-        return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device))
+        """Return the move of trials: with what friction and a constant load leave of the torque."""
+        speed = SPEED_SHARE * self.motor.rated_speed
+        taken = self.motor.torque_constant * (found.coulomb + np.abs(found.offset) + found.viscous * speed)
+        share = acceleration_share(self.device, self.motor, taken)
+        return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device), share)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return currents with which the load takes 30 degrees of load angle in the move."""
