@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device
@@ -486,7 +486,7 @@ class OpenLoopTrials(Trials):
         tooth = np.asarray(drives.read(Role.POSITION_SCALE), float) / self._motor.n_p
         return np.asarray(np.rint(self._zero + tooth * np.rint((now - self._zero) / tooth)))
 
-    def _check_moved(self, position: Integers, move: Move, where: Mask) -> None:
+    def _check_moved(self, position: Floats, move: Move, where: Mask) -> None:
         way = np.abs(wrapped(position - position[0])).max(axis=0)
         still = np.flatnonzero(where & (way < LEAST_WAY * np.abs(move.distance)))
         if still.size:

@@ -109,6 +109,10 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
             continue
         lines.append(f"axis {k}: {axis.verdict}")
         lines += [f"axis {k}: {name}: {'not measured' if v is None else f'{v:g}'}" for name, v in axis.figures.items()]
+        lines += [
+            f"axis {k}: {name.replace(':', 'h:')}: {values['before']} before, {values['after']} now"
+            for name, values in axis.settings.items()
+        ]
         lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
     lines.append(
         f"not measured: current and load step ({unmeasured(target.device)}), frequency response and margins (open loop)"

@@ -13,7 +13,7 @@ falls to 0 there, before the motor falls out of step at 90 degrees. CoolStep low
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,10 +67,11 @@ class Found:
     """What was found of the axes, (num_axes,) each; nan and 0 where nothing was.
 
     per_volt: Counts of the reading of a volt given back. margin: Reading of the axis' own load with the threshold.
-    wanted: What that was to be. angle: Load angle at the working speed [rad]. stop_speed: Above which a stall stops
+    wanted: What that was to be. speed: The working speed [rad/s]. angle: Load angle at the working speed [rad]. stop_speed: Above which a stall stops
     [rad/s]. saved: Share of the current that CoolStep took away, by the load angle. reasons: Why axes were given up.
     """
 
+    speed: Floats
     per_volt: Floats
     margin: Floats
     wanted: Floats
@@ -84,8 +85,8 @@ class Found:
     @classmethod
     def nothing(cls, count: int) -> Found:
         """Return it before anything was found."""
-        a, b, c, d, e, f, g = (np.full(count, np.nan) for _ in range(7))
-        return cls(a, b, c, d, e, f, g, [""] * count, [[] for _ in range(count)])
+        blank = (np.full(count, np.nan) for _ in range(8))
+        return cls(*blank, reasons=[""] * count, reservations=[[] for _ in range(count)])  # type: ignore[misc]
 
     def going(self) -> Mask:
         """Return which axes have not been given up."""
@@ -103,9 +104,21 @@ class LoadDetection:
     def __init__(self, drives: Drives, motor: Motor, moves: WorkingMoves, gains: Integers, speed: float) -> None:
         self.gains = gains.copy()
         self.found = Found.nothing(drives.num_axes)
+        self.found.speed[:] = speed
         self._drives, self._motor, self._moves, self._speed = drives, motor, moves, speed
         self._known: GainSet = device_of(drives).gains
         self._run, _ = run_and_standby(device_of(drives), gains)
+
+    def take(self, other: LoadDetection, where: Mask) -> None:
+        """Take what was found of some axes in other moves."""
+        self.gains = np.where(where[:, None], other.gains, self.gains)
+        self._run = np.where(where, other._run, self._run)
+        for row in fields(Found):
+            own, new = getattr(self.found, row.name), getattr(other.found, row.name)
+            if isinstance(own, list):
+                setattr(self.found, row.name, [b if take else a for a, b, take in zip(own, new, where, strict=True)])
+            else:
+                setattr(self.found, row.name, np.where(where, new, own))
 
     # --- the threshold ------------------------------------------------------------------------------------------------
     def find_threshold(self) -> None:
