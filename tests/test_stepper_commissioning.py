@@ -25,8 +25,9 @@ from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench, leave_oscillations_to_trials
 from tuning.stepper import commissioning
 from tuning.stepper.commissioning import WORKING_SHARE, commission
-from tuning.stepper.load_detection import STALL_ANGLE, LoadDetection
-from tuning.stepper.moves import WorkingMoves
+from drive_env.trials.load_reading import STALL_ANGLE
+from tuning.stepper.load_detection import LoadDetection
+from drive_env.trials.working_moves import WorkingMoves
 from tuning.stepper.obstacle import prove_with_load
 from tuning.target import Target, emulated
 

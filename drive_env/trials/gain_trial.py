@@ -112,7 +112,10 @@ class Trials:
 
     Attributes:
         look: If not None, called after every cycle.
+        returns: Whether a trial ends where it began; else where its move did.
     """
+
+    returns = False
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         self.look: Callable[[], None] | None = None

@@ -191,7 +191,7 @@ class _Search:
         self.rows: list[TrialRow] = []
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
-        self._columns, self._highest = columns, bench.highest[columns]
+        self._columns = columns
         # Machines of a search: they are its generation.
         self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
         self._start = self._points(bench.safe if settings.safe else bench.rule)
@@ -377,14 +377,16 @@ class _Search:
 
     def _points(self, gains: Integers) -> Floats:
         """Return gains as points of the machines, (num_machines, dimensions)."""
-        logs = np.log(gains[:, self._columns] / self._bench.rule[:, self._columns])
+        known = self._bench.target.device.gains
+        logs = known.change(gains, self._bench.rule, self._columns)
         return np.asarray(logs.reshape(self._bench.num_machines, self._axes, -1).mean(axis=1))
 
     def _gains(self, machine: int, point: Floats) -> Integers:
         """Return the gains of a machine's axes at a point, (axes_per_machine, count)."""
-        gains = self._bench.rule[self._axes_of(machine)].copy()
-        gains[:, self._columns] = np.clip(np.rint(gains[:, self._columns] * np.exp(point)), 1, self._highest)
-        return gains
+        known = self._bench.target.device.gains
+        return known.changed(
+            self._bench.rule[self._axes_of(machine)], point, self._columns, self._bench.highest
+        )
 
     def _axes_of(self, machine: int) -> slice:
         return slice(int(machine) * self._axes, (int(machine) + 1) * self._axes)

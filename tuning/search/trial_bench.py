@@ -204,7 +204,7 @@ class TrialBench:
         # Until the next trial, and not those of the probe.
         write_gains(target.drives, np.where(self._fallback.calmed[:, None], self.safe, self.incumbent), axes)
         self._trials.recover(axes)
-        if not self._anew:  # a trial ends where its move did, and the next one goes the other way
+        if not (self._anew or self._trials.returns):  # it ends where its move did, and the next one goes the other way
             self._origin = np.where(axes, self._origin + self._direction * self.move.distance, self._origin)
             self._direction = np.where(axes, -self._direction, self._direction)
         self.moves[axes] += MOVES_OF_TRIAL

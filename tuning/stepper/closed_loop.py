@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
+from drive_env.trials.load_reading import LOWER
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.stepper.load_detection import LoadDetection
@@ -43,9 +44,12 @@ def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[
     names = tuple(loop.gains)
     columns = known.columns(names)
     speeds = {role: drives.read(role) for role in roles}
+    lower = known.column(*LOWER)
     try:
-        for role in roles:
-            drives.write(role, 0)
+        if Role.STALL_SPEED in roles:
+            drives.write(Role.STALL_SPEED, 0)
+        if lower is not None:  # a CoolStep that works from no speed on works always
+            drives.write(known.keys[lower], 0)
         found = optimise(target, Settings(trials=TRIALS, gains=names, safe=bool(target.bus)))
         before, after, (stood, held) = _compared(target, names, found.gains)
     finally:

@@ -21,12 +21,13 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
+from drive_env.trials.load_reading import LOWER, STALL_ANGLE, has_coolstep, lacks_load_detection
 from drive_env.trials.open_loop import encoder_age
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
-from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
-from tuning.stepper.moves import WorkingMoves
+from tuning.stepper.load_detection import LoadDetection
+from drive_env.trials.working_moves import WorkingMoves
 from tuning.stepper.obstacle import REACTION, can_load, prove_with_load, why_not_loaded
 from tuning.stepper.result import StepperAxis, StepperResult, figure
 from tuning.target import Target, timed
@@ -119,7 +120,8 @@ def _commissioned(
 ) -> tuple[LoadDetection, dict[str, Floats]]:
     """Return what was found at the working speed; of axes that fail there at a lower one, which it says."""
     detection, figures = _found_at(bench, target, gains, ~weak, WORK[0], say)
-    detection.found.reject(weak, "it loses steps or goes into fault in trials with the motor's rated current")
+    for k in np.flatnonzero(weak):
+        detection.found.reasons[k] = "it loses steps or goes into fault in trials with the motor's rated current"
     for work in WORK[1:]:
         left = ~detection.found.going() & ~weak
         if not left.any():
