@@ -97,7 +97,8 @@ def test_an_episode_of_gain_tuning():
             assert not terminated.any() and env.observation_space.contains(observation)
             costs.append(float(info["trial_robust_cost"][0]))
             ended = bool(truncated[0])
-        assert len(costs) == 3 and abs(costs[0] / first[0] - 1.0) > 0.02, "the currents change the score"
+        # A lower run current and a higher standby current may cost the same in one of the trials.
+        assert len(costs) == 3 and max(abs(cost / first[0] - 1.0) for cost in costs) > 0.02, "the currents change it"
         tried = info["trial_gains"][0, 0] - rule[0, 0]
         assert tried[0] < 0 < tried[1] and not tried[2:].any(), "what is no current stays"
     finally:

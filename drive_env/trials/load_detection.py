@@ -71,34 +71,6 @@ class LoadDetectionTrials(OpenLoopTrials):
         count = drives.num_axes if drives is not None else 0
         self._speed = WORKING_SHARE * motor.rated_speed
         self._away, self._acceleration, self._per_volt = np.ones((3, count))
-        self._speeds: dict[Role, Integers] = {}
-
-    def recover(self, where: Mask) -> None:
-        """Bring axes to pp, enabled, with nothing that acts by the load."""
-        self._forget_load(where)
-        super().recover(where)
-
-    def power_up(self, where: Mask) -> None:
-        """Do so with drives that were switched on just now."""
-        self._forget_load(where)
-        super().power_up(where)
-
-    def _forget_load(self, where: Mask) -> None:
-        for role in (Role.STALL_SPEED, Role.COOLSTEP_SPEED):
-            if role in device_of(self._drives).roles:
-                self._speeds.setdefault(role, self._drives.read(role))
-        self._stop_by_load(where)
-
-    def _stop_by_load(self, where: Mask) -> None:
-        """Have no stall stop an axis, and no CoolStep lower its current: the one is off at 0, the other beyond all."""
-        self._drives.write(Role.STALL_SPEED, 0, where=where)
-        self._cool(False, where)
-
-    def leave(self) -> None:
-        """Give the speeds of load detection and CoolStep back, too."""
-        for role, values in self._speeds.items():
-            self._drives.write(role, values)
-        super().leave()
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
         """Identify the axes, and how many counts of the reading a volt has.

@@ -222,7 +222,8 @@ def with_run_current(device: Device, gains: Integers, factor: float | Floats) ->
 class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
-    606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches no
+    Nothing acts by the load reading meanwhile, unless `acts_by_load`: no stall stops an axis, no CoolStep lowers its
+    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches no
     longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are what
     they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
     counter gets.
@@ -233,6 +234,8 @@ class OpenLoopTrials(Trials):
         self.sensor: Integers | None = None
         self.window: Integers | None = None
         self.loop: Integers | None = None
+        self.acts_by_load = False
+        self._speeds: dict[Role, Integers] = {}  # of load detection and CoolStep, as they were
         self._zero: Floats | None = None
         self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
 
@@ -245,6 +248,7 @@ class OpenLoopTrials(Trials):
             self._open_loop()
             if np.any(self.window != NO_WINDOW):
                 drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
+        self._let_load_alone(where)
         blind = where & (now != ENCODER)
         if blind.any():
             on = blind & ~self.down()
@@ -257,7 +261,22 @@ class OpenLoopTrials(Trials):
         """Take drives that were switched on just now to pp, enabled, by the encoder."""
         self._drives.write(cia402.SENSOR_SELECTION, ENCODER, where=where)
         self._watch_no_window()
+        self._let_load_alone(where)
         super().power_up(where)
+
+    def _let_load_alone(self, where: Mask) -> None:
+        """Have nothing act by the load reading: stop on stall is off at 0, CoolStep beyond all speeds."""
+        drives, device = self._drives, device_of(self._drives)
+        if self.acts_by_load:
+            return
+        for role in (Role.STALL_SPEED, Role.COOLSTEP_SPEED):
+            if (key := device.roles.get(role)) is not None:
+                now = drives.read(role)
+                self._speeds.setdefault(role, now)
+                off = 0 if role is Role.STALL_SPEED else device.new_dictionary().find(key).high
+                assert off is not None, "a speed is a number"
+                if np.any(acting := where & (now != off)):
+                    drives.write(role, off, where=acting)
 
     def _watch_no_window(self) -> None:
         """Take 6065h away, which drives have again that were switched on: what falls behind is seen by the encoder."""
@@ -277,6 +296,9 @@ class OpenLoopTrials(Trials):
         """Give 606Ah and the loop's mode back what they were; the axes must be disabled."""
         if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
             self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
+        for role, values in self._speeds.items():
+            if np.any(off := self._drives.read(role) != values):
+                self._drives.write(role, values, where=off)
         if self.sensor is not None and self.window is not None:
             if np.any(drifted := self._drives.read(cia402.FOLLOWING_WINDOW) != self.window):
                 self._drives.write(cia402.FOLLOWING_WINDOW, self.window, where=drifted)

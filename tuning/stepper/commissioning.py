@@ -90,6 +90,7 @@ def commission(
         bench.identify()
         say("trying the currents", 0.15)
         gains, weak = _currents(bench)
+        bench.trials.acts_by_load = True
         detection, proof_figures = _commissioned(bench, watched, gains, weak, say)
         found = detection.found
         if target.device.gains.loop_of_kind(LOAD_ANGLE) is not None and found.going().any():
@@ -259,6 +260,7 @@ def _leave(
         drives.advance(REACTION)
         bench.trials.recover(everywhere)
     motion.disable(drives, where=~bench.trials.down())
+    speeds = {role: drives.read(role) for role in roles}
     bench.trials.leave()
     if not accepted.any():
         return
@@ -268,7 +270,7 @@ def _leave(
         wanted |= {key: int(gains[k, column]) for column, key in enumerate(bench.target.device.gains.keys)}
         is_cooled = lower is not None and gains[k, lower] > 0
         wanted |= {
-            key: int(drives.read(role)[k])
+            key: int(speeds[role][k])
             for role, key in roles.items()
             if role is not Role.COOLSTEP_SPEED or is_cooled
         }

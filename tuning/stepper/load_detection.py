@@ -187,9 +187,9 @@ class LoadDetection:
     def find_coolstep(self) -> None:
         """Set CoolStep so that it lowers the current of the axis' own load without a lost step, and prove it."""
         found = self.found
-        falls = found.per_volt * flux(self._motor, self._run) * self._speed * (falls(COOL_ANGLE) - falls(STALL_ANGLE))
+        counts = found.per_volt * flux(self._motor, self._run) * self._speed * (falls(COOL_ANGLE) - falls(STALL_ANGLE))
         highest = self._known.rows[self._column(LOWER)].highest
-        lower = np.clip(np.ceil(np.nan_to_num(falls, nan=COOL_UNIT) / COOL_UNIT), 1, highest)
+        lower = np.clip(np.ceil(np.nan_to_num(counts, nan=COOL_UNIT) / COOL_UNIT), 1, highest)
         for part, value in ((WIDTH, COOL_WIDTH), (LEAST, 0), (DOWN, COOL_DOWN), (UP, COOL_UP)):
             self._set(part, np.full(len(lower), value))
         self._write_speed(Role.COOLSTEP_SPEED, np.where(found.going(), found.stop_speed, 0.0))
