@@ -151,7 +151,6 @@ def emulated(
     speed: float | None = None,
     current: float | None = None,
     factory_fresh: bool = False,
-    chosen: Sequence[int] | None = None,
     **options: Any,
 ) -> Target:
     """Return emulated machines as a target.
@@ -168,14 +167,15 @@ def emulated(
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         factory_fresh: Leave the drives as they come out of the box, all gains 0, instead of commissioned for the motor.
-        chosen: Axes of each machine that are tuned, from 0; the others stay off. All by default.
-        options: What `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
+        options: `chosen`, the axes of each machine that are tuned, from 0, all by default (the others stay off); and what
+            `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
 
     Raises:
         ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
     """
     from drive_env import EmulatedDrives
 
+    chosen: Sequence[int] | None = options.pop("chosen", None)
     drives = EmulatedDrives(
         device,
         load=load,
@@ -260,7 +260,6 @@ def on_bus(
     speed: float | None = None,
     current: float | None = None,
     axes: str = "apart",
-    chosen: Sequence[int] | None = None,
     **options: Any,
 ) -> Target:
     """Return the drives of a bus as a target, inside the envelope.
@@ -279,14 +278,15 @@ def on_bus(
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         axes: How the nodes' axes belong together, one of `AXES`; a bus does not show it.
-        chosen: Axes of each node that are tuned, from 0; the others are never commanded. All by default.
-        options: What `CanDrives` takes besides.
+        options: `chosen`, the axes of each node that are tuned, from 0, all by default (the others are never commanded);
+            and what `CanDrives` takes besides.
 
     Raises:
         ValueError: For an unknown name, a travel that does not hold 0, or an axis that the device does not have;
             BusError if a node does not answer.
     """
     check_coupling(axes)
+    chosen: Sequence[int] | None = options.pop("chosen", None)
     from drive_env.devices import find_device
     from drive_env.master.open_drives import default_nodes, open_drives
     from drive_env.motors import find_motor

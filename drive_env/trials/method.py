@@ -289,7 +289,7 @@ class ClosedStepper(NamedTuple):
         return self.device.gains.columns_of_loop(self.loop)
 
 
-class LoadDetection(NamedTuple):
+class LoadSettings(NamedTuple):
     """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or what a load needs."""
 
     device: Device
@@ -362,7 +362,7 @@ class LoadDetection(NamedTuple):
         return OpenLoop(self.device, self.motor)
 
 
-Method = Cascade | OpenLoop | ClosedStepper | LoadDetection
+Method = Cascade | OpenLoop | ClosedStepper | LoadSettings
 
 
 def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Method:
@@ -370,7 +370,7 @@ def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Meth
     if (loop := device.gains.loop_of(names)) is not None:
         return ClosedStepper(device, motor, loop)
     if is_load_detection(device, names):
-        return LoadDetection(device, motor)
+        return LoadSettings(device, motor)
     return OpenLoop(device, motor) if device.gains.is_open_loop else Cascade(device, motor)
 
 

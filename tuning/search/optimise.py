@@ -16,8 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import RAW_MAX
+from drive_env import cia402
+from drive_env.gains import RAW_MAX, write_gains
 from drive_env.trials.method import check_tried
+from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
+from drive_env.trials.positioning import wrapped
 from tuning.runs.shard_log import ShardLog
 from tuning.search.samplers import SAMPLERS, Proposer, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
@@ -165,6 +168,8 @@ def optimise(
         while search.generation():
             progress(search.share())
         gains, cost = search.best()
+        if isinstance(bench.trials, PidTrials):
+            search.tell_of_swings(gains)
         bench.leave(gains)
     return Optimised(
         gains, bench.rule, cost, search.judged(), clock.seconds, bench.moves, bench.aborts, tuple(search.notes),
@@ -239,6 +244,29 @@ class _Search:
                 if row is not None:
                     gains[self._axes_of(machine)], cost[machine] = row.gains, row.cost
         return gains, cost
+
+    def tell_of_swings(self, gains: Integers) -> None:
+        """Add a reservation where the rotor swings with the best gains of a PID at a steady speed."""
+        bench = self._bench
+        drives = bench.target.drives
+        everywhere = np.ones(bench.target.num_axes, bool)
+        write_gains(drives, gains)
+        bench.trials.recover(everywhere)
+        # There and back from where the trials have left the axes, toward where they began if that is the longer way.
+        gone = wrapped(drives.read(cia402.POSITION_ACTUAL) - bench.began) / bench.target.increments()
+        left = bench.reach - gone
+        swings = bench.trials.steady_swings(left, everywhere).reshape(len(STEADY_SPEEDS), bench.num_machines, -1)
+        worst = np.nan_to_num(swings).max(axis=2)
+        for machine in range(bench.num_machines):
+            seen = [f"{worst[k, machine]:.2g} at {speed:g} rev/s"
+                    for k, speed in enumerate(STEADY_SPEEDS) if worst[k, machine] > SWING]  # fmt: skip
+            if seen:
+                said = (
+                    f"reservation: at a steady speed the rotor swings by more than {SWING:g} full steps RMS "
+                    f"({', '.join(seen)}), which the short moves of trials do not show: close the loop by the load "
+                    "angle for such speeds, or change the run current"
+                )
+                self.notes[machine] = "; ".join(filter(None, (self.notes[machine], said)))
 
     def judged(self) -> tuple[TrialRow, ...]:
         """Return every trial, those marked whose gains were found fragile later."""
