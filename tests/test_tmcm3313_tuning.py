@@ -125,7 +125,7 @@ def test_gains_that_won_by_noise_are_not_kept(tmp_path, monkeypatch):
         bench.identify()
         gains = target.device.gains.scaled(bench.rule, 0.1, target.device.gains.columns(settings.gains))
         bench.leave(gains)
-        return SimpleNamespace(gains=gains, cost=np.array([0.0]))
+        return SimpleNamespace(gains=gains, cost=np.array([0.0]), rows=(), rule=gains)
 
     monkeypatch.setattr("tuning.stepper.closed_loop.optimise", praise)
     result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
@@ -150,7 +150,7 @@ def test_a_closed_loop_whose_every_trial_is_stopped_is_not_certified(tmp_path, m
         bench = TrialBench(target, gains=settings.gains)
         bench.identify()
         bench.leave(bench.rule)
-        return SimpleNamespace(gains=bench.rule, cost=np.array([0.0]))
+        return SimpleNamespace(gains=bench.rule, cost=np.array([0.0]), rows=(), rule=bench.rule)
 
     monkeypatch.setattr("tuning.stepper.closed_loop.optimise", search)
     monkeypatch.setattr("tuning.stepper.closed_loop.TrialBench", Stopped)
@@ -183,7 +183,7 @@ def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
 @pytest.mark.parametrize(
     ("names", "remedy"),
     [
-        (("stall_threshold",), "drive-tune auto"),
+        (("stall_threshold", "run_current"), "search the others by themselves"),
         (("correction_velocity_p", "run_current"), "search the others by themselves"),
     ],
 )

@@ -192,7 +192,9 @@ def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
         if key not in _BUS:
             raise SnapshotError(f"{file}: [bus] has a key {key!r}, which is not one of {', '.join(_BUS)}; remove it")
         numbers = value if isinstance(value, list) else [value]
-        if (isinstance(value, list) != (key in ("nodes", "axes"))) or any(type(one) is not _BUS[key] for one in numbers):
+        if (isinstance(value, list) != (key in ("nodes", "axes"))) or any(
+            type(one) is not _BUS[key] for one in numbers
+        ):
             raise SnapshotError(
                 f"{file}: [bus] {key} = {value!r} is not of type {_BUS[key].__name__}; restore the file"
             )

@@ -94,8 +94,9 @@ class Target:
         wrong = np.flatnonzero(~((self.low <= 0.0) & (self.high >= 0.0) & (self.low < self.high)))
         if wrong.size:
             k = int(wrong[0])
+            number = self.axis_numbers[k]
             raise ValueError(
-                f"axis {self.axis_numbers[k]}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is now, "
+                f"axis {number}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is now, "
                 "and must not be empty; give the free way to both sides"
             )
         for name, unit in (("speed", "rad/s"), ("current", "A")):
@@ -167,8 +168,8 @@ def emulated(
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         factory_fresh: Leave the drives as they come out of the box, all gains 0, instead of commissioned for the motor.
-        options: `chosen`, the axes of each machine that are tuned, from 0, all by default (the others stay off); and what
-            `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
+        options: `chosen`, the axes of each machine that are tuned, from 0, all by default (the others stay off); and
+            what `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
 
     Raises:
         ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
@@ -278,8 +279,8 @@ def on_bus(
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         axes: How the nodes' axes belong together, one of `AXES`; a bus does not show it.
-        options: `chosen`, the axes of each node that are tuned, from 0, all by default (the others are never commanded);
-            and what `CanDrives` takes besides.
+        options: `chosen`, the axes of each node that are tuned, from 0, all by default (the others are never
+            commanded); and what `CanDrives` takes besides.
 
     Raises:
         ValueError: For an unknown name, a travel that does not hold 0, or an axis that the device does not have;

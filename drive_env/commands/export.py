@@ -94,4 +94,6 @@ def export(
             kbit = CAN_KBIT if bitrate is None else bitrate // KBIT
             text = commissioned_eds(source, values, one.name, node_id=(node or 1) if is_dcf else None, bit_rate=kbit)
             write_whole(one, text)
-            print(f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {node or 1}'}{part}")
+            print(
+                f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {node or 1}'}{part}"
+            )

@@ -1,12 +1,12 @@
-"""Blank time and off time of a stepper driver's chopper for a motor (TMC5160 class), where the factory's do not suit it.
+"""Blank time and off time of a stepper driver's chopper for a motor (TMC5160 class), where the factory's do not suit.
 
 In spread cycle a phase current ripples by no less than what it rises by in the blank time, in which nothing is
 measured, and falls by in both slow decays of a cycle:
 
     ripple = (u t_blank + 2 R i t_off) / L
 
-The factory's blank time of 36 clocks and off time of 172 suit windings of some millihenries. For a winding on which this
-is more than `MOST` of the run current, the two that the data sheet of the chip has besides are taken: a blank time of
+The factory's blank time of 36 clocks and off time of 172 suit windings of some millihenries. For one on which this is
+more than `MOST` of the run current, the two that the data sheet of the chip has besides are taken: a blank time of
 24 clocks ("1 or 2 for most applications", TBL) and the off time 3 of its first example of a CHOPCONF (000100C3h). The
 chopper's frequency grows, and with it the losses of switching, which is why it is not done for every motor.
 """

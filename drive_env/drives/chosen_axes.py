@@ -1,4 +1,4 @@
-"""Chosen axes of some drives as drives of their own: the others are never commanded, and no parameter of theirs written.
+"""Chosen axes of some drives as drives of their own: the others are never commanded, and their parameters stay.
 
 A module may have more axes than motors. What is done to all axes of such drives is done to the chosen ones; each keeps
 its number (`axis_numbers`), by which results and errors call it. On a bus, process data are still those of whole nodes:

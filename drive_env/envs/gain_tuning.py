@@ -160,10 +160,10 @@ class GainTuning(VectorEnvironment):
     With `privileged` it is a dict of "observation" and "privileged": each true parameter's difference from its default
     over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
-    The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a discount of
-    1, less `abort_cost` for a trial that was stopped. On given drives, and of the settings of a load detection, there is
-    no robust cost; it is that of ln J by measured terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be
-    cleared.
+    The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a
+    discount of 1, less `abort_cost` for a trial that was stopped. On given drives, and of the settings of a load
+    detection, there is no robust cost; it is that of ln J by measured terms. The episode is `truncated` when its
+    trials are used up, `terminated` if a given drive cannot be cleared.
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
     the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of

@@ -24,7 +24,7 @@ from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified, Mask, Trials
-from drive_env.trials.open_loop import NO_WINDOW, OPEN, TOOTH, OpenLoopTrials, with_run_current
+from drive_env.trials.open_loop import OPEN, TOOTH, OpenLoopTrials, with_run_current
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import (
     CYCLE,

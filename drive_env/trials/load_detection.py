@@ -1,4 +1,4 @@
-"""One trial of the StallGuard threshold and of CoolStep: moves at a working speed, without CoolStep, with it, and a probe.
+"""One trial of StallGuard threshold and CoolStep: moves at a working speed, without CoolStep, with it, and a probe.
 
 What is wanted of them is no false stall of the axis' own load, a stall that is seen before steps are lost, and less
 current. Nobody need push at the axis for it: the load reading is all but linear in cos d - sin d of the load angle d
@@ -85,9 +85,7 @@ class LoadDetectionTrials(OpenLoopTrials):
         torque = RAMP_SHARE * holding_torque(motor, run)
         away = np.clip(REACH_SHARE * np.nan_to_num(reach, posinf=LONGEST, neginf=-LONGEST), -LONGEST, LONGEST)
         self._away = np.where(where, away, self._away)
-        self._acceleration = np.where(
-            where, np.minimum(torque / found.inertia, MOST_ACCELERATION), self._acceleration
-        )
+        self._acceleration = np.where(where, np.minimum(torque / found.inertia, MOST_ACCELERATION), self._acceleration)
         moves = self._moves(origin)
         if np.any(short := where & (np.abs(away) < moves.least_reach(self._speed))):
             k = int(np.flatnonzero(short)[0])

@@ -79,7 +79,7 @@ TRIP = 30.0
 OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.02, 0.1
 
 
-# Of the holding torque, that a ramp may ask for at once: a rotor that is suddenly pulled swings beyond the angle of that
+# Of the holding torque, that a ramp may ask for at once: a rotor that is pulled suddenly swings beyond the angle of the
 # torque, and comes back from up to 0.725 of it (equal areas under the sine of the torque). The rest is left to what the
 # current lacks at speed.
 PULLED_AT_ONCE = 0.725
@@ -223,8 +223,8 @@ class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
     Nothing acts by the load reading meanwhile, unless `acts_by_load`: no stall stops an axis, no CoolStep lowers its
-    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches no
-    longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are what
+    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches
+    no longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are what
     they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
     counter gets.
     """
@@ -352,9 +352,7 @@ class OpenLoopTrials(Trials):
         now = wrapped(drives.read(cia402.POSITION_DEMAND) - drives.read(cia402.POSITION_ACTUAL))
         self._zero = np.where(where, now, 0.0 if self._zero is None else self._zero)
 
-    def _identify_by(
-        self, move: Move, origin: Integers, reach: Floats, where: Mask
-    ) -> tuple[Identified, Floats, Mask]:
+    def _identify_by(self, move: Move, origin: Integers, reach: Floats, where: Mask) -> tuple[Identified, Floats, Mask]:
         """Move there and back, and swing; return what was identified, the way of the encoder, and who lost steps."""
         drives, motor = self._drives, self._motor
         write_profile(drives, move, where)
@@ -513,8 +511,9 @@ class OpenLoopTrials(Trials):
         still = np.flatnonzero(where & (way < LEAST_WAY * np.abs(move.distance)))
         if still.size:
             k = int(still[0])
+            number = axis_number(self._drives, k)
             raise RuntimeError(
-                f"axis {axis_number(self._drives, k)}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
+                f"axis {number}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
                 "rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
                 "without an encoder nothing is seen of an open-loop stepper that could be scored"
             )

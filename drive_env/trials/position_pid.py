@@ -53,7 +53,7 @@ VIBRATION = 0.1  # full steps, by which the encoder changes from millisecond to 
 # RMS of the change of that in a look [full steps]: a light rotor that swings as a ramp begins makes 0.2 of it, one that
 # oscillates or rolls over its teeth 0.33 and more.
 SHAKES = 0.3
-# Steady speeds [rev/s] at which gains are looked at after a search: trials are too short to show how a rotor swings with
+# Steady speeds [rev/s] at which gains are looked at after a search: trials are too short to show how a rotor swings by
 # the steps of a speed. Time of it, and of a ramp before it [s], and the swing that is worth a word [full steps, RMS].
 STEADY_SPEEDS, STEADY, RAMP, SWING = (0.25, 0.5, 1.0, 2.0), 0.4, 0.15, 0.1
 LONGEST_WAY_BACK, BACK, LOOK = 2.0, 0.5, 0.05  # s, full steps, s: what slipped is made up for before the next phase

@@ -305,9 +305,7 @@ def _report(
     _print(found, settings, folder, before, where, options)
 
 
-def _print(
-    found: Any, settings: Any, folder: Path, before: Path | None, where: str, options: dict[str, Any]
-) -> None:
+def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str, options: dict[str, Any]) -> None:
     import numpy as np
 
     from drive_env.devices import find_device

@@ -87,8 +87,8 @@ ChosenAxis = Annotated[
     list[int] | None,
     typer.Option(
         "--axis",
-        help="Axis of nodes with several that is tuned, from 0; may be repeated. The others are never enabled, and keep "
-        "their parameters.",
+        help="Axis of nodes with several that is tuned, from 0; may be repeated. The others are never enabled, and "
+        "keep their parameters.",
         show_default="all",
     ),
 ]

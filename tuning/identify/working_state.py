@@ -144,10 +144,8 @@ def working_state(target: Target, where: Mask | None = None) -> Iterator[Working
     status = drives.read(cia402.STATUSWORD)
     enabled = axes & cia402.matches(status, cia402.OPERATION_ENABLED)
     if enabled.any():
-        raise RuntimeError(
-            f"axis {axis_number(drives, int(np.flatnonzero(enabled)[0]))} is enabled: disable it, identification begins "
-            "with a drive at rest"
-        )
+        number = axis_number(drives, int(np.flatnonzero(enabled)[0]))
+        raise RuntimeError(f"axis {number} is enabled: disable it, identification begins with a drive at rest")
     before = {key: drives.read(key) for key in borrowed(target.device)}
     mode = drives.read(cia402.MODE)
     try:

@@ -412,9 +412,7 @@ class _Search:
     def _gains(self, machine: int, point: Floats) -> Integers:
         """Return the gains of a machine's axes at a point, (axes_per_machine, count)."""
         known = self._bench.target.device.gains
-        return known.changed(
-            self._bench.rule[self._axes_of(machine)], point, self._columns, self._bench.highest
-        )
+        return known.changed(self._bench.rule[self._axes_of(machine)], point, self._columns, self._bench.highest)
 
     def _axes_of(self, machine: int) -> slice:
         return slice(int(machine) * self._axes, (int(machine) + 1) * self._axes)

@@ -177,9 +177,9 @@ class TrialBench:
             self._trials.recover(self._where)
             drives.advance(CALM)
             self._reach = self._reach - wrapped(drives.read(cia402.POSITION_ACTUAL) - began) / scaler * 2.0 * np.pi
-        axis = int(np.flatnonzero(watch.swung)[0])
+        number = axis_number(drives, int(np.flatnonzero(watch.swung)[0]))
         raise RuntimeError(
-            f"axis {axis_number(drives, axis)} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
+            f"axis {number} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
             "gains that its motor's data sheet gives; check motor and wiring"
         )
 

@@ -23,11 +23,11 @@ from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.load_reading import LOWER, STALL_ANGLE, has_coolstep, lacks_load_detection
 from drive_env.trials.open_loop import encoder_age
+from drive_env.trials.working_moves import WorkingMoves
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
 from tuning.stepper.load_detection import LoadDetection
-from drive_env.trials.working_moves import WorkingMoves
 from tuning.stepper.obstacle import REACTION, can_load, prove_with_load, why_not_loaded
 from tuning.stepper.result import StepperAxis, StepperResult, figure
 from tuning.target import Target, timed
@@ -90,7 +90,6 @@ def commission(
         bench.identify()
         say("trying the currents", 0.15)
         gains, weak = _currents(bench)
-        bench.trials.acts_by_load = True
         detection, proof_figures = _commissioned(bench, watched, gains, weak, say)
         found = detection.found
         if target.device.gains.loop_of_kind(LOAD_ANGLE) is not None and found.going().any():
@@ -250,8 +249,8 @@ def _leave(
 ) -> None:
     """Leave the accepted axes with their settings and all else as it was, disabled.
 
-    A stall above the speed of 20A4h stops them from then on, as it was found; where CoolStep is off its speed is what it
-    was.
+    A stall above the speed of 20A4h stops them from then on, as it was found; where CoolStep is off its speed is what
+    it was.
     """
     drives, gains = bench.target.drives, detection.gains
     lower = bench.target.device.gains.column(*LOWER)
@@ -270,9 +269,7 @@ def _leave(
         wanted |= {key: int(gains[k, column]) for column, key in enumerate(bench.target.device.gains.keys)}
         is_cooled = lower is not None and gains[k, lower] > 0
         wanted |= {
-            key: int(speeds[role][k])
-            for role, key in roles.items()
-            if role is not Role.COOLSTEP_SPEED or is_cooled
+            key: int(speeds[role][k]) for role, key in roles.items() if role is not Role.COOLSTEP_SPEED or is_cooled
         }
         axes.append(wanted)
     restore(drives, replace(transaction.before, axes=tuple(axes)), accepted, whole=False)
@@ -317,7 +314,7 @@ def _axis(
 def _settings(
     k: int, transaction: Transaction, target: Target, roles: dict[Role, tuple[int, int]]
 ) -> dict[str, dict[str, int]]:
-    """Return what an axis had, and has now, of the objects beside the gains: those of an axis that is given up return."""
+    """Return what an axis had, and has now, of the objects beside the gains; one that is given up has what it had."""
     return {
         f"{index:04X}:{sub:02X}": {
             "before": transaction.before.axes[k][index, sub], "after": int(target.drives.read(role)[k]),

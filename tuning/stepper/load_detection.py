@@ -62,8 +62,9 @@ class Found:
     """What was found of the axes, (num_axes,) each; nan and 0 where nothing was.
 
     per_volt: Counts of the reading of a volt given back. margin: Reading of the axis' own load with the threshold.
-    wanted: What that was to be. speed: The working speed [rad/s]. angle: Load angle at the working speed [rad]. stop_speed: Above which a stall stops
-    [rad/s]. saved: Share of the current that CoolStep took away, by the load angle. reasons: Why axes were given up.
+    wanted: What that was to be. speed: The working speed [rad/s]. angle: Load angle at the working speed [rad].
+    stop_speed: Above which a stall stops [rad/s]. saved: Share of the current that CoolStep took away, by the load
+    angle. reasons: Why axes were given up.
     """
 
     speed: Floats
@@ -100,6 +101,7 @@ class LoadDetection:
         self.gains = gains.copy()
         self.found = Found.nothing(drives.num_axes)
         self.found.speed[:] = speed
+        moves.trials.acts_by_load = True  # from now on that is what is set
         self._drives, self._motor, self._moves, self._speed = drives, motor, moves, speed
         self._known: GainSet = device_of(drives).gains
         self._run, _ = run_and_standby(device_of(drives), gains)
@@ -126,7 +128,9 @@ class LoadDetection:
         slow = self._lifted(SLOW * self._speed)
         fast = self._run_moves(self._speed)
         found.angle = fast.angle
-        given = volts(self._motor, self._run, self._speed, fast.angle) - volts(self._motor, self._run, SLOW * self._speed, slow.angle)
+        given = volts(self._motor, self._run, self._speed, fast.angle) - volts(
+            self._motor, self._run, SLOW * self._speed, slow.angle
+        )
         found.per_volt = (fast.reading - slow.reading) / given
         found.reject(
             ~(found.per_volt > 0.0) | (fast.reading >= FULL_READING),
