@@ -96,8 +96,8 @@ class Target:
             k = int(wrong[0])
             number = self.axis_numbers[k]
             raise ValueError(
-                f"axis {number}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is now, "
-                "and must not be empty; give the free way to both sides"
+                f"axis {number}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is "
+                "now, and must not be empty; give the free way to both sides"
             )
         for name, unit in (("speed", "rad/s"), ("current", "A")):
             if not 0.0 < getattr(self, name) < math.inf:

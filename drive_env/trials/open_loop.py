@@ -223,9 +223,9 @@ class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
     Nothing acts by the load reading meanwhile, unless `acts_by_load`: no stall stops an axis, no CoolStep lowers its
-    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches
-    no longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are what
-    they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
+    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h
+    watches no longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are
+    what they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
     counter gets.
     """
 
@@ -513,8 +513,8 @@ class OpenLoopTrials(Trials):
             k = int(still[0])
             number = axis_number(self._drives, k)
             raise RuntimeError(
-                f"axis {number}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
-                "rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
+                f"axis {number}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move "
+                "at rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
                 "without an encoder nothing is seen of an open-loop stepper that could be scored"
             )
 
