@@ -14,7 +14,7 @@ def small_eds(objects, arrays):
 
     Args:
         objects: Index, name, type, access, whether a PDO can carry it.
-        arrays: Index, access and number of entries (UNSIGNED32) of records, and the most that sub-index 0 takes, or None.
+        arrays: Index, access and number of entries (UNSIGNED32) of records, and the most of sub-index 0, or None.
             An access "rw/ro" is that of sub-index 0 and of the entries.
     """
     lines = ["[DeviceInfo]", "VendorName=Test", "[OptionalObjects]", f"SupportedObjects={len(objects) + len(arrays)}"]

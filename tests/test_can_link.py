@@ -1,4 +1,4 @@
-"""The link over CAN over a port of this test: what it sends, whom it tells, and what a cycle of the bus has room for."""
+"""The link over CAN over a port of this test: what it sends, whom it tells, what a cycle has room for."""
 
 from __future__ import annotations
 
@@ -171,8 +171,8 @@ def test_frames_of_a_cycle_without_stuff_bits():
     assert BusTime(1e6, math.inf).excess(groups, 2) is None
     assert BusTime(1e6, needed * 1e-6 * 0.999999).excess(groups, 2) is not None
     assert BusTime(1e5, 0.002).excess(groups, 2) == (
-        "4 PDOs of 2 axes take at least 3.5 ms of a bus of 100 kbit/s, and SYNC comes every 2 ms; record and play fewer "
-        "objects at a time, or give a longer cycle (in Python CanDrives(cycle=0.005))"
+        "4 PDOs of 2 axes take at least 3.5 ms of a bus of 100 kbit/s, and SYNC comes every 2 ms; record and play "
+        "fewer objects at a time, or give a longer cycle (in Python CanDrives(cycle=0.005))"
     )
 
 

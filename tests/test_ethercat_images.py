@@ -160,8 +160,8 @@ def test_what_is_wanted_comes_with_what_a_drive_is_commanded_and_watched_by(plan
 def test_what_is_too_much_for_one_image_is_told(planner, one):
     empty = planner.free(0x1600, ())
     assert planner.plan(OUTPUTS, one(0x607A, 0x6071, 0x2002), empty).entries == one(0x607A, 0x6071, 0x2002)
-    with pytest.raises(ObjectAccessError, match=r"^3 objects of 2 axes are more than the 5 that the process image 1600h ta"
-    ) as error:  # fmt: skip
+    with pytest.raises(ObjectAccessError, match=r"^3 objects of 2 axes are more than the 5 that the process image "
+                       "1600h ta") as error:  # fmt: skip
         planner.plan(OUTPUTS, one(0x607A, 0x6071, 0x6040), empty)
     assert error.value.abort_code == 0x06040042
 
@@ -409,8 +409,8 @@ def test_images_are_not_changed_while_an_axis_is_enabled(bench, data, one):
     data.prepare()
     bench.slaves[1].objects[0x6841, 0] = bytes.fromhex("37 02")
     bench.master.log.clear()
-    with pytest.raises(ObjectAccessError, match=r"^6077h:00 Torque is not in the process image, which cannot be changed "
-                       "while axis 3 is enabled; record or play it once before enabling ") as error:  # fmt: skip
+    with pytest.raises(ObjectAccessError, match=r"^6077h:00 Torque is not in the process image, which cannot be "
+                       "changed while axis 3 is enabled; record or play it once before ") as error:  # fmt: skip
         data.map(one(0x6040), one(0x6041, 0x6077))
     assert error.value.abort_code == 0x08000022
     assert bench.master.take() == []
@@ -565,7 +565,7 @@ def test_samples_that_stay_out_are_told(bench, data):
 
 def test_samples_are_of_all_axes_in_their_order(bench, data, one):
     data.prepare()
-    rows = [[bytes.fromhex("01 00 00 00 00 80 02 00 FF FF FF FF"), bytes.fromhex("03 80 05 00 00 00 04 00 06 00 00 00")],
+    rows = [[bytes.fromhex("010000000080 0200FFFFFFFF"), bytes.fromhex("038005000000 040006000000")],
             [bytes.fromhex("07 00 08 00 00 00 09 00 0A 00 00 00"), bytes(12)], [bytes(12)] * 2]  # fmt: skip
     bench.master.rows, samples = list(rows), data.samples()
     for _ in range(3):

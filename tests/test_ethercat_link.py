@@ -506,7 +506,7 @@ def test_clocks_of_slaves_that_do_not_answer_are_told():
 
 
 def test_offsets_by_the_times_at_which_a_frame_came():
-    """The first slave's local time is 100 when the frame is there, the second's 1000; it is 25 ns from one to the other."""
+    """The first slave's local time is 100 when the frame is there, the second's 1000; the way is 25 ns."""
     found = Registers()
     far = 1 << 56  # the eighth byte of a time of 64 bits
 
@@ -533,8 +533,8 @@ def test_states_have_names():
 @pytest.mark.parametrize(("status", "said"), [
     (SlaveStatus(0, False, 0), "position 3 does not answer; check cable and power"),
     (SlaveStatus(2, True, 0), "position 3 stays in Pre-Op and does not come to Op; it gives no reason"),
-    (SlaveStatus(4, True, AlStatusCode.SM_WATCHDOG), "position 3 stays in Safe-Op and does not come to Op; AL status code "
-     "001Bh: no process data came within its watchdog"),
+    (SlaveStatus(4, True, AlStatusCode.SM_WATCHDOG), "position 3 stays in Safe-Op and does not come to Op; AL "
+     "status code 001Bh: no process data came within its watchdog"),
     (SlaveStatus(4, True, 0x8001), "position 3 stays in Safe-Op and does not come to Op; AL status code 8001h: see the "
      "drive's manual"),
 ])  # fmt: skip

@@ -189,7 +189,10 @@ def test_what_is_read_surely_is_told_by_its_position(way, master):
 @pytest.mark.parametrize("lost", [True, False], ids=["frames are lost", "no slaves"])
 def test_slaves_are_counted_by_a_broadcast_that_is_tried_fifty_times(way, lost):
     master = FrameMaster(way)
-    nothing = lambda asked: [] if lost else [datagrams.build(asked)]
+
+    def nothing(asked):
+        return [] if lost else [datagrams.build(asked)]
+
     way.change = lambda asked, found: [found] if len(way.sent) >= 50 else nothing(asked)
     assert len(master.look()) == 2
     assert way.take()[:51] == ["BRD 0000 0130 2"] * 50 + ["APRD 0000 0130 6"]

@@ -155,7 +155,8 @@ def test_a_slave_that_answers_at_first_and_not_at_last_is_told():
 
 # --- what it is asked, and told ---------------------------------------------------------------------------------------
 def test_the_slave_in_configuration_tells_its_identity_and_its_node_id():
-    bus = Bus("5A 86 02 00 00 77 77 77", "5B 64 06 00 00 00 00 00", "5C 09 00 01 00 00 00 00", "5D 05 00 00 00 00 00 00",
+    bus = Bus("5A 86 02 00 00 77 77 77", "5B 64 06 00 00 00 00 00", "5C 09 00 01 00 00 00 00",
+              "5D 05 00 00 00 00 00 00",
               "5E FF 07 00 00 00 00 00")  # fmt: skip
     master = LssMaster(bus)
     assert master.identity() == IDENTITY and master.node_id() == 255
@@ -306,8 +307,8 @@ def test_a_node_is_waited_for_until_it_answers_under_its_new_node_id(nodes):
     assert len(nodes.asked) == 4 and {one[0] for one in nodes.asked} == {9}
     assert nodes.asked[0][-1] == 0.3
     nodes[9] = IDENTITY._replace(serial=6)
-    with pytest.raises(LssError, match=r"^the node 286:664:10009:5 took the node-ID 9, and does not answer under it within "
-                       "1 s; switch it off and on, and look with `drive-env scan`$"):  # fmt: skip
+    with pytest.raises(LssError, match=r"^the node 286:664:10009:5 took the node-ID 9, and does not answer under it "
+                       "within 1 s; switch it off and on, and look with `drive-env scan`$"):  # fmt: skip
         await_node(None, IDENTITY, 9, 5, 1.0)
     del nodes[9]
     begun = nodes.clock.now
@@ -321,8 +322,8 @@ def test_a_node_whose_node_id_is_taken_away_is_waited_for_until_it_is_silent(nod
     await_node(None, IDENTITY, 255, None, 1.0)
     assert nodes.asked == [(5, 0x1000, 0, "1000h:00", 0.3)]
     nodes[5] = IDENTITY
-    with pytest.raises(LssError, match=r"^the node 286:664:10009:5 took the node-ID 255, and after 1 s it still answers "
-                       "under 5; switch it off and on$"):  # fmt: skip
+    with pytest.raises(LssError, match=r"^the node 286:664:10009:5 took the node-ID 255, and after 1 s it still "
+                       "answers under 5; switch it off and on$"):  # fmt: skip
         await_node(None, IDENTITY, 255, 5, 1.0)
 
 

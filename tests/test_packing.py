@@ -301,7 +301,10 @@ def test_of_a_field_an_object_takes_its_own_bits(drive):
 ])  # fmt: skip
 def test_a_dummy_passes_over_what_comes_in(raw, transmit, taken):
     dummies = {2: 8, 3: 16, 4: 32, 5: 8, 6: 16, 7: 32, 8: 8, 1: 8}
-    find = lambda index, sub: entry(index, dummies[index], mappable=False)
+
+    def find(index, sub):
+        return entry(index, dummies[index], mappable=False)
+
     if taken:
         assert mapping.check_mappable(entry(0x1600, sub=1), raw, transmit, find).index == raw >> 16
     else:

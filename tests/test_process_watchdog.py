@@ -14,7 +14,7 @@ from drive_env.master.link import NoWatchdogError
 
 
 class Slaves:
-    """The registers of slaves, by position; a register that is none reads as None, one of another length as a mistake."""
+    """The registers of slaves, by position; one that is none reads as None, one of another length is a mistake."""
 
     def __init__(self, dividers, control=0x64, takes=True):
         self.registers = {

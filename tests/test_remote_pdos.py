@@ -24,7 +24,8 @@ from drive_env.master.packing import Member
 ROWS = [
     (0x6040, "Controlword", U16, "rww", 1), (0x6041, "Statusword", U16, "ro", 1), (0x6060, "Mode", I8, "rw", 1),
     (0x6064, "Position", I32, "ro", 1), (0x606C, "Velocity", I32, "rwr", 1), (0x6071, "Target torque", I16, "wo", 1),
-    (0x607A, "Target position", I32, "rww", 1), (0x6061, "Mode display", I8, "ro", 0), (0x6081, "Limit", I32, "const", 1),
+    (0x607A, "Target position", I32, "rww", 1), (0x6061, "Mode display", I8, "ro", 0),
+    (0x6081, "Limit", I32, "const", 1),
 ]  # fmt: skip
 ODD = [(0x2000, "Flag", 0x01, "rw", 1), (0x2001, "Name", TEXT, "rw", 1)]
 NUMBERS = range(6)
@@ -250,7 +251,7 @@ def test_a_fifth_pdo_of_an_axis_has_no_identifier():
 
 
 def test_further_axes_borrow_identifiers_in_their_order(pdos, drive, one):
-    """PDO 5 and 6 of the node are the second and third of axis 1: 300h and 400h and the node that they are borrowed of."""
+    """PDO 5 and 6 of the node are the second and third of axis 1: 300h, 400h and the node that they are borrowed of."""
     found = pdos.configure([one(0x6040), one(0x6060), one(0x607A)], INTO_DRIVE)
     assert [one.can_id for one in found] == [0x205, 0x305, 0x405, 0x505, 0x300 + 51, 0x400 + 51]
 

@@ -279,7 +279,8 @@ class Connection:
 
 
 @pytest.mark.parametrize(("answers", "said"), [
-    ((TimeoutError(),), "chan does not answer to the token within 3 s; if it is not the hub of `drive-env serve`, unset"),
+    ((TimeoutError(),), "chan does not answer to the token within 3 s; if it is not the hub of `drive-env serve`, "
+     "unset"),
     ((b"K", TimeoutError()), "chan does not answer to the token within 3 s"),
     ((OSError("reset"),), "chan refuses the token; take the one that `drive-env serve` printed, and wait a second"),
     ((b"K\r", b""), "chan refuses the token"),

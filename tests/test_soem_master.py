@@ -1,4 +1,4 @@
-"""The master by SOEM, over a pysoem of this test: what is asked of SOEM, with what times, and what its errors become."""
+"""The master by SOEM, over a pysoem of this test: what is asked of SOEM, in what times, what its errors become."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ConfigMapError(Exception):
     pass
 
 
-class Emergency(Exception):
+class Emergency(Exception):  # noqa: N818 - its name in pysoem
     def __init__(self, code=0x8611, register=0x20, first=1, second=0x0302, third=0x0504):
         self.error_code, self.error_reg, self.b1, self.w1, self.w2 = code, register, first, second, third
 

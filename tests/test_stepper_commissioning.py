@@ -19,14 +19,15 @@ from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from drive_env.motors import MOTORS
 from drive_env.phase_current import RESERVE, amplitude, holding_torque, run_and_standby
+from drive_env.trials.load_reading import STALL_ANGLE
 from drive_env.trials.open_loop import encoder_age
+from drive_env.trials.working_moves import WorkingMoves
 from tuning.commands.cli import app
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench, leave_oscillations_to_trials
 from tuning.stepper import commissioning
 from tuning.stepper.commissioning import WORKING_SHARE, commission
-from tuning.stepper.load_detection import STALL_ANGLE, LoadDetection
-from tuning.stepper.moves import WorkingMoves
+from tuning.stepper.load_detection import LoadDetection
 from tuning.stepper.obstacle import prove_with_load
 from tuning.target import Target, emulated
 

@@ -97,7 +97,8 @@ def test_an_episode_of_gain_tuning():
             assert not terminated.any() and env.observation_space.contains(observation)
             costs.append(float(info["trial_robust_cost"][0]))
             ended = bool(truncated[0])
-        assert len(costs) == 3 and abs(costs[0] / first[0] - 1.0) > 0.02, "the currents change the score"
+        # A lower run current and a higher standby current may cost the same in one of the trials.
+        assert len(costs) == 3 and max(abs(cost / first[0] - 1.0) for cost in costs) > 0.02, "the currents change it"
         tried = info["trial_gains"][0, 0] - rule[0, 0]
         assert tried[0] < 0 < tried[1] and not tried[2:].any(), "what is no current stays"
     finally:
@@ -124,7 +125,7 @@ def test_gains_that_won_by_noise_are_not_kept(tmp_path, monkeypatch):
         bench.identify()
         gains = target.device.gains.scaled(bench.rule, 0.1, target.device.gains.columns(settings.gains))
         bench.leave(gains)
-        return SimpleNamespace(gains=gains, cost=np.array([0.0]))
+        return SimpleNamespace(gains=gains, cost=np.array([0.0]), rows=(), rule=gains)
 
     monkeypatch.setattr("tuning.stepper.closed_loop.optimise", praise)
     result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
@@ -149,7 +150,7 @@ def test_a_closed_loop_whose_every_trial_is_stopped_is_not_certified(tmp_path, m
         bench = TrialBench(target, gains=settings.gains)
         bench.identify()
         bench.leave(bench.rule)
-        return SimpleNamespace(gains=bench.rule, cost=np.array([0.0]))
+        return SimpleNamespace(gains=bench.rule, cost=np.array([0.0]), rows=(), rule=bench.rule)
 
     monkeypatch.setattr("tuning.stepper.closed_loop.optimise", search)
     monkeypatch.setattr("tuning.stepper.closed_loop.TrialBench", Stopped)
@@ -182,7 +183,7 @@ def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
 @pytest.mark.parametrize(
     ("names", "remedy"),
     [
-        (("stall_threshold",), "drive-tune auto"),
+        (("stall_threshold", "run_current"), "search the others by themselves"),
         (("correction_velocity_p", "run_current"), "search the others by themselves"),
     ],
 )

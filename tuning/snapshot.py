@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -133,7 +133,7 @@ def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
     others = drives.description.of_further_axes()
     return tuple(
         {key: value for key, value in read_parameters(drives, axis).items() if key not in others}
-        for axis in range(of.num_axes)
+        for axis in _places(of)
     )
 
 
@@ -192,14 +192,16 @@ def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
         if key not in _BUS:
             raise SnapshotError(f"{file}: [bus] has a key {key!r}, which is not one of {', '.join(_BUS)}; remove it")
         numbers = value if isinstance(value, list) else [value]
-        if (isinstance(value, list) != (key == "nodes")) or any(type(one) is not _BUS[key] for one in numbers):
+        if (isinstance(value, list) != (key in ("nodes", "axes"))) or any(
+            type(one) is not _BUS[key] for one in numbers
+        ):
             raise SnapshotError(
                 f"{file}: [bus] {key} = {value!r} is not of type {_BUS[key].__name__}; restore the file"
             )
     return bus
 
 
-_BUS = {"interface": str, "channel": str, "nodes": int, "bitrate": int, "pace": str}
+_BUS = {"interface": str, "channel": str, "nodes": int, "axes": int, "bitrate": int, "pace": str}
 
 
 def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, other_drive: bool = False) -> None:
@@ -241,10 +243,11 @@ def restore(
     single = _per_axis(drives)
     changed: list[list[Difference]] = [[] for _ in snapshot.axes]
     wanted = [values if whole else _settings(values) for values in snapshot.axes]
+    places = _places(drives)
     for axis in map(int, np.flatnonzero(axes)):
-        check_at_rest(single, wanted[axis], axis)  # before the first axis is written
+        check_at_rest(single, wanted[axis], places[axis])  # before the first axis is written
     for axis in map(int, np.flatnonzero(axes)):
-        changed[axis] = write_all_or_none(single, wanted[axis], axis)
+        changed[axis] = write_all_or_none(single, wanted[axis], places[axis])
     return changed
 
 
@@ -434,6 +437,11 @@ def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
 def _per_axis(drives: Drives) -> Any:
     """Return drives whose objects are reached axis by axis, as those of a bus are."""
     return drives.bus or _EmulatedPerAxis(drives)
+
+
+def _places(drives: Drives) -> Sequence[int]:
+    """Return where `_per_axis` finds the axes of drives: on a bus among all axes of its nodes."""
+    return drives.axis_numbers if drives.bus is not None else range(drives.num_axes)
 
 
 class _EmulatedPerAxis:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import cia402
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
+from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.drives.speeds import per_increment
@@ -26,6 +27,7 @@ from drive_env.drives.speeds import per_increment
 if TYPE_CHECKING:
     from drive_env import EmulatedDrives
     from drive_env.devices import Device
+    from drive_env.master.bus_drives import BusDrives
     from drive_env.motors import Motor
     from mechanics.load import Load
 
@@ -92,9 +94,10 @@ class Target:
         wrong = np.flatnonzero(~((self.low <= 0.0) & (self.high >= 0.0) & (self.low < self.high)))
         if wrong.size:
             k = int(wrong[0])
+            number = self.axis_numbers[k]
             raise ValueError(
-                f"axis {k}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is now, "
-                "and must not be empty; give the free way to both sides"
+                f"axis {number}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is "
+                "now, and must not be empty; give the free way to both sides"
             )
         for name, unit in (("speed", "rad/s"), ("current", "A")):
             if not 0.0 < getattr(self, name) < math.inf:
@@ -104,6 +107,11 @@ class Target:
     def num_axes(self) -> int:
         """Number of axes."""
         return int(self.drives.num_axes)
+
+    @property
+    def axis_numbers(self) -> tuple[int, ...]:
+        """What results call each axis: of chosen axes their number among all."""
+        return tuple(map(int, self.drives.axis_numbers))
 
     def together(self, where: Mask) -> Mask:
         """Return which axes move where some do: of a machine whose axes pull at one thing, all or none."""
@@ -160,13 +168,15 @@ def emulated(
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         factory_fresh: Leave the drives as they come out of the box, all gains 0, instead of commissioned for the motor.
-        options: What `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
+        options: `chosen`, the axes of each machine that are tuned, from 0, all by default (the others stay off); and
+            what `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
 
     Raises:
         ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
     """
     from drive_env import EmulatedDrives
 
+    chosen: Sequence[int] | None = options.pop("chosen", None)
     drives = EmulatedDrives(
         device,
         load=load,
@@ -177,7 +187,8 @@ def emulated(
         supply=supply,
         **options,
     )
-    return of_machines(drives, drives, supply=supply, travel=travel, speed=speed, current=current)
+    limits = {"supply": supply, "travel": travel, "speed": speed, "current": current}
+    return of_machines(drives, drives, chosen=chosen, **limits)  # type: ignore[arg-type]
 
 
 def of_machines(
@@ -188,6 +199,7 @@ def of_machines(
     travel: Travel | Iterable[Travel] | None = None,
     speed: float | None = None,
     current: float | None = None,
+    chosen: Sequence[int] | None = None,
 ) -> Target:
     """Return emulated machines that are there already as a target.
 
@@ -198,30 +210,40 @@ def of_machines(
         travel: How far the rotors may turn [rad], as `emulated` takes it.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
+        chosen: Axes of each machine that are tuned, from 0; all by default. `travel` is theirs.
 
     Raises:
-        ValueError: For a travel that does not hold 0.
+        ValueError: For a travel that does not hold 0, or an axis that the machines do not have.
     """
     from mechanics.shaft import one, way
     from tuning.identify.linked_axes import are_linked
 
     alone = one(made.load)
     own = way(alone)
-    narrow_low, narrow_high = _ways(FREE if travel is None else travel, made.load.num_axes)
-    lanes, here = made.num_machines, np.asarray(made.machine.rotor_angle)
+    linked, total = are_linked(alone), made.load.num_axes
+    parts = list(range(total) if chosen is None else chosen_parts(chosen, total, f"load {made.load.name}"))
+    if linked and len(parts) < total:
+        raise ValueError(
+            f"--axis {', '.join(map(str, parts))}: the axes of {made.load.name} pull at one thing, and none of them "
+            "moves far without the others; leave --axis out"
+        )
+    narrow_low, narrow_high = _ways(FREE if travel is None else travel, len(parts))
+    lanes = made.num_machines
+    axes = np.add.outer(np.arange(lanes) * total, parts).ravel()
+    here = np.asarray(made.machine.rotor_angle)[axes]
     # The load's ends are places; a rotor that stands at one, or a little beyond, has no way to that side.
-    low = np.maximum(np.minimum(np.tile(own.low, lanes) - here, 0.0), np.tile(narrow_low, lanes))
-    high = np.minimum(np.maximum(np.tile(own.high, lanes) - here, 0.0), np.tile(narrow_high, lanes))
+    low = np.maximum(np.minimum(np.tile(own.low[parts], lanes) - here, 0.0), np.tile(narrow_low, lanes))
+    high = np.minimum(np.maximum(np.tile(own.high[parts], lanes) - here, 0.0), np.tile(narrow_high, lanes))
     volts = made.device.supply_of(made.motor) if supply is None else supply
-    limits = _limits(made.motor, made.num_axes, volts, speed, current)
+    limits = _limits(made.motor, len(axes), volts, speed, current)
     return Target(
-        drives,
+        drives if len(parts) == total else ChosenAxes(drives, axes.tolist()),
         made.device,
         made.motor,
         low=low,
         high=high,
-        axes_per_machine=made.load.num_axes,
-        linked=are_linked(alone),
+        axes_per_machine=len(parts),
+        linked=linked,
         machine=made.load.name,
         **limits,
     )
@@ -257,23 +279,32 @@ def on_bus(
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         axes: How the nodes' axes belong together, one of `AXES`; a bus does not show it.
-        options: What `CanDrives` takes besides.
+        options: `chosen`, the axes of each node that are tuned, from 0, all by default (the others are never
+            commanded); and what `CanDrives` takes besides.
 
     Raises:
-        ValueError: For an unknown name or a travel that does not hold 0; BusError if a node does not answer.
+        ValueError: For an unknown name, a travel that does not hold 0, or an axis that the device does not have;
+            BusError if a node does not answer.
     """
     check_coupling(axes)
+    chosen: Sequence[int] | None = options.pop("chosen", None)
     from drive_env.devices import find_device
     from drive_env.master.open_drives import default_nodes, open_drives
     from drive_env.motors import find_motor
 
     row = find_motor(find_device(device).default_motor if motor is None else motor)
     numbers = default_nodes(interface) if nodes is None else tuple(nodes)
-    drives = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
+    if chosen is not None:  # before a node is asked for anything
+        chosen_parts(chosen, find_device(device).num_axes, device)
+    opened = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
+    drives: Drives = opened
     try:
+        address = address_of(interface, channel, numbers, options)
+        if chosen is not None:
+            drives = of_nodes(opened, chosen)
+            address["axes"] = list(chosen_parts(chosen, opened.description.num_axes, device))
         target = of_bus(
-            drives, row, address_of(interface, channel, numbers, options), supply=supply, travel=travel, speed=speed,
-            current=current, axes=axes,
+            drives, row, address, supply=supply, travel=travel, speed=speed, current=current, axes=axes,
         )  # fmt: skip
         if "safety" not in options:
             hold_to_travel(target)
@@ -281,6 +312,15 @@ def on_bus(
         drives.close()
         raise
     return target
+
+
+def of_nodes(drives: BusDrives, parts: Iterable[int]) -> Drives:
+    """Return axes of every node of a bus by their numbers in it; raises as `chosen_parts` does."""
+    count = drives.description.num_axes
+    chosen = chosen_parts(parts, count, drives.description.name)
+    if len(chosen) == count:
+        return drives
+    return ChosenAxes(drives, [node * count + part for node in range(len(drives.nodes)) for part in chosen])
 
 
 def of_bus(
@@ -316,6 +356,8 @@ def of_bus(
     volts = device.supply_of(motor) if supply is None else supply
     limits = _limits(motor, drives.num_axes, volts, speed, current)
     machine = f"{address.get('channel', 'a bus')}, node {', '.join(map(str, address.get('nodes', ())))}"
+    if "axes" in address:
+        machine += f", axis {', '.join(map(str, address['axes']))}"
     lanes = 1 if axes == "apart" else drives.num_axes
     return Target(drives, device, motor, low=low, high=high, axes_per_machine=lanes, linked=axes == "linked",
                   machine=machine, bus=address, **limits)  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from drive_env.commands.options import (
+    AxisOfNode,
     Bitrate,
     Channel,
     DeviceName,
@@ -31,6 +32,7 @@ def export(
     interface: Interface = None,
     channel: Channel = None,
     node: Node = None,
+    axis: AxisOfNode = None,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     motor: Annotated[
@@ -43,8 +45,11 @@ def export(
     """Write the EDS or DCF of a drive with its commissioned values: of one on a bus, else of an emulated one.
 
     An EDS has them as defaults, a DCF as the values of this node; other masters (python-canopen, CANopen tools) read
-    them. With --interface, --channel, --node or --bitrate they are read from that drive; nothing is written to it.
+    them. With --axis the values of one axis and of the node are written, and all other axes keep what the EDS says.
+    With --interface, --channel, --node or --bitrate they are read from that drive; nothing is written to it.
     """
+    from drive_env.devices import find_device
+    from drive_env.drives.chosen_axes import chosen_parts
     from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds, commissioned_values
     from drive_env.whole_file import write_whole
 
@@ -65,7 +70,9 @@ def export(
                 timeout=timeout,
                 safety=False,
             ) as drives:
-                values = commissioned_values(drives)
+                if axis is not None:
+                    chosen_parts([axis], drives.description.num_axes, drives.description.name)
+                values = commissioned_values(drives, axis=axis)
                 source, whose = drives.description.dictionary.path, drives.description.name
         else:
             if eds is not None:
@@ -73,16 +80,20 @@ def export(
                     f"--eds {eds} is of a drive on a bus, and no bus is named; give --interface and --channel, or make "
                     f"a device of it (drive-env new --eds {eds}) and name that as --device"
                 )
-            from drive_env.devices import find_device
             from drive_env.emulator.emulated_drives import EmulatedDrives
 
             known = find_device(device)
+            if axis is not None:
+                chosen_parts([axis], known.num_axes, device)
             source, whose = known.eds, device
             with EmulatedDrives(device, "inertia", motor, num_machines=known.num_axes, num_threads=1) as emulated:
-                values = commissioned_values(emulated)
+                values = commissioned_values(emulated, axis=axis)
+        part = "" if axis is None else f", axis {axis} alone"
         for one in files:
             is_dcf = one.suffix.lower() == ".dcf"
             kbit = CAN_KBIT if bitrate is None else bitrate // KBIT
             text = commissioned_eds(source, values, one.name, node_id=(node or 1) if is_dcf else None, bit_rate=kbit)
             write_whole(one, text)
-            print(f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {node or 1}'}")
+            print(
+                f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {node or 1}'}{part}"
+            )

@@ -61,6 +61,8 @@ class ClosedLoop(NamedTuple):
         return self.kind != LOAD_ANGLE
 
 
+LOAD_DETECTION = ("load detection", "CoolStep")  # loops of settings by which a stepper's drive acts on its load reading
+PER_UNIT = {"load detection": 12.0, "CoolStep": 2.5}  # steps of such a setting that a search takes for a factor of e
 RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of a stepper's phases: loop and part
 
 
@@ -193,6 +195,36 @@ class GainSet:
         for column in self.columns_of(*loops):
             softer[:, column] = np.maximum(raw[:, column] // divisor, 1)
         return softer
+
+    def changed(self, raw: Integers, by: ArrayLike, columns: Sequence[int] | Integers, highest: Integers) -> Integers:
+        """Return gains of shape (..., count) with some changed, within their ranges; see `change`.
+
+        Args:
+            raw: What is changed.
+            by: How much, of shape (..., len(columns)): the logarithm of a factor; of settings of a load detection, of
+                which 0 and below are values as others are, in units of `PER_UNIT`.
+            columns: Which gains.
+            highest: Of all gains.
+        """
+        unit, result = self._per_unit(columns), raw.copy()
+        by = np.asarray(by, float)
+        some = raw[..., columns]
+        wanted = np.where(unit > 0.0, np.rint(some + by * unit), np.rint(some * np.exp(np.where(unit > 0.0, 0.0, by))))
+        lowest = np.where(unit > 0.0, self.lowest[columns], 1)
+        result[..., columns] = np.clip(wanted, lowest, np.asarray(highest)[columns])
+        return result
+
+    def change(self, raw: Integers, since: Integers, columns: Sequence[int] | Integers) -> NDArray[np.float64]:
+        """Return how far some gains are from others, (..., len(columns)), as `changed` takes it."""
+        unit = self._per_unit(columns)
+        now, before = raw[..., columns], since[..., columns]
+        if not unit.any():
+            return np.asarray(np.log(now) - np.log(before))
+        ratio = np.log(np.where(unit > 0.0, 1, now)) - np.log(np.where(unit > 0.0, 1, before))
+        return np.asarray(np.where(unit > 0.0, (now - before) / np.where(unit > 0.0, unit, 1.0), ratio))
+
+    def _per_unit(self, columns: Sequence[int] | Integers) -> NDArray[np.float64]:
+        return np.array([PER_UNIT.get(self.rows[k].loop, 0.0) for k in columns])
 
     def scaled(self, raw: Integers, factor: ArrayLike, columns: Sequence[int]) -> Integers:
         """Return gains of shape (..., count) with some of them times a factor, within their ranges; 1 at least."""

@@ -54,12 +54,16 @@ class Drives(BasicDrives, Protocol):
         """What the drives are; None where only their EDS is known."""
 
     @property
+    def axis_numbers(self) -> Sequence[int]:
+        """What each axis is called: its number among all axes of the drives, of which these may be chosen ones."""
+
+    @property
     def machine(self) -> Machines | None:
         """The emulated machines' side that no bus shows."""
 
     @property
     def bus(self) -> BusDrives | None:
-        """The same drives as those of a bus: its nodes, frames and single axes."""
+        """The drives of a bus: its nodes, frames and single axes; axis k of these is its axis `axis_numbers[k]`."""
 
     @property
     def safety(self) -> Envelope | None:
@@ -96,6 +100,12 @@ class Drives(BasicDrives, Protocol):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None: ...
+
+
+def axis_number(drives: BasicDrives, axis: int) -> int:
+    """Return what an axis is called in messages and results."""
+    numbers: Sequence[int] | None = getattr(drives, "axis_numbers", None)  # BasicDrives need not have them
+    return axis if numbers is None else int(numbers[axis])
 
 
 def machine_of(drives: Drives) -> Machines:

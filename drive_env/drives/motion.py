@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import BasicDrives
+from drive_env.drives.interface import BasicDrives, axis_number
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -62,13 +62,15 @@ def wait_for(
         fault = axes & cia402.matches(status, cia402.FAULT)
         if fault.any() and pattern != cia402.FAULT:
             axis = int(np.flatnonzero(fault)[0])
+            number = axis_number(drives, axis)
             raise RuntimeError(
-                f"axis {axis} is in fault while waiting for {what}; see emergencies(), then reset_fault()"
+                f"axis {number} is in fault while waiting for {what}; see emergencies(), then reset_fault()"
             )
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
+            number = axis_number(drives, axis)
             raise TimeoutError(
-                f"axis {axis} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h"
+                f"axis {number} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h"
                 + _why_not_heard(drives, int(status[axis]))
             )
         drives.advance(STEP)
@@ -130,8 +132,9 @@ def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0
     while late.any():
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
+            number = axis_number(drives, axis)
             raise TimeoutError(
-                f"axis {axis} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
+                f"axis {number} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
                 "mode, and the axis is halted; disable it, then select the mode"
             )
         drives.advance(STEP)
@@ -282,7 +285,8 @@ def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float =
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
-            raise TimeoutError(f"axis {axis} stays in fault: the cause is still there; see emergencies()")
+            number = axis_number(drives, axis)
+            raise TimeoutError(f"axis {number} stays in fault: the cause is still there; see emergencies()")
         drives.advance(STEP)
         waited += STEP
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
@@ -390,8 +394,9 @@ def _check_can_move(drives: BasicDrives, where: Mask | None) -> None:
     for wrong, what in ((off, "is not enabled"), (other, "is not in pp")):
         if wrong.any():
             axis = int(np.flatnonzero(wrong)[0])
+            number = axis_number(drives, axis)
             raise RuntimeError(
-                f"axis {axis} {what} and cannot move: statusword {status[axis]:04X}h, mode {mode[axis]}; "
+                f"axis {number} {what} and cannot move: statusword {status[axis]:04X}h, mode {mode[axis]}; "
                 'motion.enable(drives, mode="pp") first'
             )
 
@@ -417,9 +422,10 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
         failed = axes & ~fault & (bits != cia402.HOMED) & ~np.isin(bits, cia402.HOMING_UNDER_WAY)
         if fault.any() or failed.any():
             axis = int(np.flatnonzero(fault | failed)[0])
+            number = axis_number(drives, axis)
             what = "is in fault while homing; see emergencies()" if fault[axis] else "did not complete homing"
             raise RuntimeError(
-                f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
+                f"axis {number} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
             )
         still = axes & (bits != cia402.HOMED)
         if not still.any():
@@ -430,7 +436,8 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])
-            raise TimeoutError(f"axis {axis} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
+            number = axis_number(drives, axis)
+            raise TimeoutError(f"axis {number} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)
 
 

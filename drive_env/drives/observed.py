@@ -82,6 +82,11 @@ class ObservedDrives:
         return self._drives.num_axes
 
     @property
+    def axis_numbers(self) -> Sequence[int]:
+        """What each axis is called."""
+        return self._drives.axis_numbers
+
+    @property
     def device(self) -> Device | None:
         """What the drives are."""
         return self._drives.device

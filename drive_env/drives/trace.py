@@ -61,6 +61,13 @@ class Trace:
             raise KeyError(f"{entry.label} was not recorded; there are {recorded}")
         return self._values[entry.index, entry.sub]
 
+    def of_axes(self, axes: Sequence[int]) -> Trace:
+        """Return what was recorded of some axes, in their order."""
+        values = {key: rows[:, axes] for key, rows in self._values.items()}
+        scale = self._scale
+        scales = None if scale is None else lambda: _of(scale(), axes)
+        return Trace(self.t, values, self._dictionary, scales)
+
     @classmethod
     def joined(cls, traces: Sequence[Trace], period: float) -> Trace:
         """Return as one what was recorded in parts, at least one, of the same objects at the same period [s]."""
@@ -150,3 +157,7 @@ class Trace:
         if self._scale is None or not follows_scale(entry.unit):
             return [None] * self._axes
         return self._scale()
+
+
+def _of(scales: Sequence[Scale], axes: Sequence[int]) -> Sequence[Scale]:
+    return [scales[axis] for axis in axes]

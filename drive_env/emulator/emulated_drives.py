@@ -129,6 +129,7 @@ class EmulatedDrives:
         self.load = find_load(load)
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
+        self.axis_numbers = range(self.num_axes)
         volts = checked_supply(self.device.supply_of(self.motor) if supply is None else supply, 1)
         self._firmware, self._kind = self.device.firmware, MACHINE_KINDS[self.device.firmware_name]
         self._records = self._firmware.layout.new_records(self.num_axes)

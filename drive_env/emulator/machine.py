@@ -5,7 +5,8 @@ A task may use it to make a world, never to act; `drives.machine` is None on a r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,6 +84,33 @@ class Machines:
         values = self._per_machine(value, "load torque")
         for group in self._drives._groups:
             group.load.plant.load_torque[:] = values[group.machines]
+
+    @contextmanager
+    def pushed(self) -> Iterator[Callable[[ArrayLike], None]]:
+        """Give what puts a torque on each axis by itself, beside `load_torque`, which is all there is again at the end.
+
+        It takes torques as the rotors see them [N*m], shape (num_axes,), one after the other; the load's joints that no
+        axis turns feel nothing of them.
+        """
+        from mechanics.shaft import way
+
+        groups = self._drives._groups
+        before = [(group.load.plant.disturbance.copy(), group.load.plant.load_torque.copy()) for group in groups]
+        turning = way(groups[0].load).joints
+        onto = np.linalg.pinv(turning)  # forces at the joints of a torque at each rotor
+
+        def push(torque: ArrayLike) -> None:
+            each = np.broadcast_to(np.asarray(torque, float), (self._drives.num_axes,)).reshape(-1, len(turning))
+            for group, (motion, calm) in zip(groups, before, strict=True):
+                group.load.plant.disturbance[:] = motion * calm + onto @ each[group.machines].T
+                group.load.plant.load_torque[:] = 1.0
+
+        try:
+            yield push
+        finally:
+            for group, (motion, calm) in zip(groups, before, strict=True):
+                group.load.plant.disturbance[:] = motion
+                group.load.plant.load_torque[:] = calm
 
     def load_profile(
         self,

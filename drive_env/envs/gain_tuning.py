@@ -32,6 +32,7 @@ from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Steppe
 from drive_env.gains import read_gains
 from drive_env.motors import Motor, find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost
+from drive_env.trials.load_detection import is_load_detection
 from drive_env.trials.method import check_tried, method_of, new_score
 from drive_env.trials.positioning import TRIAL, reach
 from drive_env.trials.score import RobustScore
@@ -159,10 +160,10 @@ class GainTuning(VectorEnvironment):
     With `privileged` it is a dict of "observation" and "privileged": each true parameter's difference from its default
     over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
-    The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a discount of
-    1, less `abort_cost` for a trial that was stopped. On given drives there is no robust cost; it is that of ln J by
-    measured terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be
-    cleared.
+    The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a
+    discount of 1, less `abort_cost` for a trial that was stopped. On given drives, and of the settings of a load
+    detection, there is no robust cost; it is that of ln J by measured terms. The episode is `truncated` when its
+    trials are used up, `terminated` if a given drive cannot be cleared.
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
     the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
@@ -243,9 +244,10 @@ class GainTuning(VectorEnvironment):
             laws = laws_of(c.load, self._device, known) if c.load in shipped() else {"parameters": {}}
         self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
-        self._score = new_score(
-            c.device, c.load, c.motor, num_envs, gains=c.chosen, num_threads=c.num_threads, friction=c.friction
-        )
+        if not is_load_detection(self._device, c.chosen):  # else J by measured terms is all there is
+            self._score = new_score(
+                c.device, c.load, c.motor, num_envs, gains=c.chosen, num_threads=c.num_threads, friction=c.friction
+            )
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
@@ -368,10 +370,7 @@ class GainTuning(VectorEnvironment):
     def _changed(self, action: ArrayLike) -> Integers:
         step = self.config.step
         change = np.nan_to_num(np.clip(np.asarray(action, float), -step, step)).reshape(-1, len(self._columns))
-        gains: Integers = self._best.copy()
-        chosen = gains[:, self._columns] * np.exp(change)
-        gains[:, self._columns] = np.clip(np.rint(chosen), 1, self._highest[self._columns])
-        return gains
+        return self._device.gains.changed(self._best, change, self._columns, self._highest)
 
     # --- a trial --------------------------------------------------------------------------------------------------
     def _begin_trial(self, mask: Mask) -> None:
@@ -403,7 +402,7 @@ class GainTuning(VectorEnvironment):
         fallback = np.where(self._best_is_stable[:, None], self._best, self._safe)
         direction = np.ones_like(self._direction) if self._owned else self._direction
         tried = self._trials.run(gains, fallback, self._move, self._origin, direction, axes)
-        if not self._owned:  # a trial ends where its move did, and the next one goes the other way
+        if not (self._owned or self._trials.returns):  # it ends where its move did; the next one goes the other way
             self._origin = np.where(axes, self._origin + self._direction * self._move.distance, self._origin)
             self._direction = np.where(axes, -self._direction, self._direction)
         return tried
@@ -436,8 +435,8 @@ class GainTuning(VectorEnvironment):
     # --- what is told ---------------------------------------------------------------------------------------------
     def _observe(self) -> Any:
         identified = identified_entries(self._identified, self.motor)
-        rule = np.log(self._rule[:, self._columns])
-        last, best = (np.log(gains[:, self._columns]) - rule for gains in (self._last, self._best))
+        known = self._device.gains
+        last, best = (known.change(gains, self._rule, self._columns) for gains in (self._last, self._best))
         axes = np.concatenate([identified, last, best, self._last_features, self._best_features, self._wave], axis=1)
         left = self._left[:, None] / self.config.trials
         values = np.concatenate([axes.reshape(self.num_envs, -1), left], axis=1)
@@ -454,6 +453,7 @@ class GainTuning(VectorEnvironment):
         }
         if self._score is not None:
             info["robust_cost"] = self._robust_cost.copy()
+        if self._owned:
             info["parameters"] = self._parameters
         return info
 

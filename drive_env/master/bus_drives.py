@@ -72,6 +72,7 @@ class BusDrives:
         self.device = description.device
         self.nodes = link.nodes
         self.num_axes = len(self.nodes) * description.num_axes
+        self.axis_numbers = range(self.num_axes)
         self._cycle_runner = CycleRunner(
             description, self.num_axes, link, pace, self.start, self._catch_up, self.read_entry
         )
@@ -99,13 +100,17 @@ class BusDrives:
         Raises:
             ObjectAccessError: If there is no such object or it cannot be read; NoAnswerError if a node is silent.
         """
+        return self.read_of(name, range(self.num_axes))
+
+    def read_of(self, name: ObjectName, axes: Sequence[int]) -> Integers:
+        """Return an object of some axes, in their order, as `read` does of all."""
         self._enter()
         known = self._description.dictionary
         scale = position_scale(known.roles) if name is Role.POSITION_SCALE else None
         if scale is not None and len(scale.keys) > 1:  # no object has it: several make it
-            made = scale.increments([self.read_entry(known.find(key)).astype(float) for key in scale.keys])
+            made = scale.increments([self.read_entry(known.find(key), axes).astype(float) for key in scale.keys])
             return np.asarray(np.rint(made), np.int64)
-        values: Integers = self.read_entry(known.find(name))
+        values: Integers = self.read_entry(known.find(name), axes)
         return values
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
@@ -349,11 +354,11 @@ class BusDrives:
             self._link.start()
             self._started = True
 
-    def read_entry(self, entry: Entry) -> Any:
-        """Read an object of every axis without being watched."""
+    def read_entry(self, entry: Entry, axes: Sequence[int] | None = None) -> Any:
+        """Read an object of every axis, or of some, without being watched."""
         entry = self._description.shown_by(entry)
         check_readable(entry)
-        values = [self.read_axis(entry, axis) for axis in range(self.num_axes)]
+        values = [self.read_axis(entry, axis) for axis in (range(self.num_axes) if axes is None else axes)]
         if not self._description.is_number(entry):
             return np.array(values)
         return np.array(values, np.int64 if entry.high is None or entry.high < 2**63 else np.uint64)

@@ -21,27 +21,33 @@ Key = tuple[int, int]
 CAN_KBIT = 1000  # kbit/s, where nobody says another bit rate
 
 
-def commissioned_values(drives: Drives, node: int = 0) -> dict[Key, int]:
+def commissioned_values(drives: Drives, node: int = 0, axis: int | None = None) -> dict[Key, int]:
     """Return the parameters that a node has now, by the index of each of its axes.
 
     Args:
         drives: Emulated, or on a bus.
         node: Which of a bus's nodes, from 0; emulated drives are one node from their first axis on.
+        axis: The only axis, from 0, whose parameters are told beside those of the node; all by default.
     """
     bus = drives.bus
     if bus is not None:
         known, found = bus.description, dict[Key, int]()
-        for axis in range(known.num_axes):
-            values = read_parameters(bus, node * known.num_axes + axis)
-            found |= {known.key(known.dictionary.find(key), axis): value for key, value in values.items()}
-        return found
+        for one in range(known.num_axes) if axis is None else [axis]:
+            values = read_parameters(bus, node * known.num_axes + one)
+            found |= {known.key(known.dictionary.find(key), one): value for key, value in values.items()}
+        if axis is None:
+            return found
+        further = known.of_further_axes()  # the EDS lists them all, and each is read by its own index, too
+        return {key: value for key, value in found.items() if key not in further or further[key][1] == axis}
     device = device_of(drives)
     found = {}
     for entry in device.new_dictionary():
-        axis, base = device.locate(entry.index)
+        own, base = device.locate(entry.index)
         is_parameter = entry.access in ("rw", "rwr", "rww") and entry.bits is not None
-        if is_parameter and axis < drives.num_axes and not command(base, device.master):
-            found[entry.index, entry.sub] = int(np.asarray(drives.read((base, entry.sub)))[axis])
+        if axis not in (None, own) and not device.is_shared(entry.index):
+            continue
+        if is_parameter and own < drives.num_axes and not command(base, device.master):
+            found[entry.index, entry.sub] = int(np.asarray(drives.read((base, entry.sub)))[own])
     return found
 
 

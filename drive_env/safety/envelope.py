@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -124,6 +124,10 @@ class Envelope:
         """Take other limits; those of position are places of the rotors as 6064h shows them now."""
         limits.check_axes(self._drives.num_axes)
         self._limits.change(limits)
+
+    def leave_alone(self, axes: Iterable[int]) -> None:
+        """Take note of axes that the program never moves: their drives are lent nothing."""
+        self._lending.left_alone = frozenset(axes)
 
     def enter(self) -> None:
         """Take note that the program does something; raise once what the supervisor had to do meanwhile."""

@@ -33,14 +33,23 @@ class Lending:
 
     Args:
         drives: The drives.
+
+    Attributes:
+        left_alone: Axes that nobody moves here: they keep what they have.
     """
 
     def __init__(self, drives: BusDrives) -> None:
+        self.left_alone: frozenset[int] = frozenset()
         self._drives = drives
         self._loans: dict[tuple[Key, int], Loan] = {}
 
     def lend(self, key: Key, axis: int, value: int) -> bool:
-        """Give an object of an axis a value for a while; return whether the drive, read back, has it."""
+        """Give an object of an axis a value for a while; return whether the drive, read back, has it.
+
+        An axis that is left alone needs none.
+        """
+        if axis in self.left_alone:
+            return True
         entry, loan = self._drives.description.dictionary.find(key), self._loans.get((key, axis))
         try:
             own = int(self._drives.read_raw(entry, axis)) if loan is None else loan.own

@@ -99,6 +99,11 @@ class SharedDrives:
         return self._drives.safety
 
     @property
+    def axis_numbers(self) -> Sequence[int]:
+        """What each axis is called."""
+        return self._drives.axis_numbers
+
+    @property
     def time_waits(self) -> bool:
         """Whether time stands still until it is asked to pass."""
         return self._drives.time_waits

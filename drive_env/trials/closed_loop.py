@@ -8,7 +8,8 @@ and 6077h, which is the torque current once the encoder commutates.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,11 +20,12 @@ from drive_env.devices.gain_set import ClosedLoop
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
-from drive_env.gains import write_gains
+from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
-from drive_env.phase_current import amplitude, holding_torque, rated_setting
+from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified, Mask, Trials
-from drive_env.trials.open_loop import NO_WINDOW, OPEN, TOOTH, OpenLoopTrials, with_run_current
+from drive_env.trials.open_loop import OPEN, TOOTH, OpenLoopTrials, with_run_current
+from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import (
     CYCLE,
     PROFILE,
@@ -48,6 +50,22 @@ FRICTION_SHARE = 0.5  # of the trial's torque, that friction and a constant load
 PROBE = 0.8  # run current of the probe over that of the trial: a greater overload
 CLOSING, LONGEST_CLOSING = 0.6, 3.2  # s: the rotor swings in for 0.4 s, and for 3 s at most
 LOOK = 0.05  # s
+SWINGING = 2.0  # times the change of the current in the rotor's own swing: what changes more oscillates
+
+
+def swing_change(motor: Motor, inertia: Floats, current: Floats) -> Floats:
+    """Return by how much the torque current changes in a ms [A, RMS] while a rotor swings by all of it, (num_axes,).
+
+    An overload that has been caught up with leaves the rotor swinging in its field at sqrt(n_p T / J), with the torque
+    current from limit to limit until the swing has died away: that is no oscillation of the loop.
+
+    Args:
+        motor: The motor.
+        inertia: Total inertia at the rotor [kg m^2].
+        current: Amplitude of the run current [A].
+    """
+    omega = np.sqrt(motor.n_p * holding_torque(motor, current) / inertia)
+    return np.asarray(current * omega * CYCLE / np.sqrt(2.0))
 
 
 class ClosedLoopTrial(NamedTuple):
@@ -131,6 +149,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         super().__init__(drives, motor, axes, t_0)
         self._closed = closed
         self._closes = np.zeros(drives.num_axes if drives is not None else 0, bool)
+        self._inertia = np.full(self._closes.shape, np.inf)
 
     def recover(self, where: Mask) -> None:
         """Bring axes to pp, enabled, and close the loops of those that have been identified."""
@@ -141,7 +160,6 @@ class ClosedLoopTrials(OpenLoopTrials):
     def power_up(self, where: Mask) -> None:
         """Do so with drives that were switched on just now, in as many milliseconds whatever becomes of them."""
         super().power_up(where)
-        self._watch_no_window()
         if self._closes.any():
             self._drives.write(Role.LOOP_MODE, self._closed.mode, where=where & self._closes)
             self._drives.advance(CLOSING)
@@ -154,6 +172,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         drives.advance(LOOK)
         found, origin = super().identify(reach, where)
         self._closes |= where
+        self._inertia = np.where(where, found.inertia, self._inertia)
         return found, origin
 
     def go(self, target: Integers, where: Mask) -> None:
@@ -205,15 +224,18 @@ class ClosedLoopTrials(OpenLoopTrials):
         ampere = current * ampere_per_count(self._drives)
         return move_terms(position, ampere, move, self._t_0, self._motor.rated_current, target, sign)
 
+    def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
+        """Return whose current changes more from ms to ms than that of a loop may, and of a rotor that swings."""
+        change = np.diff(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(self._drives), axis=0)
+        run, _ = run_and_standby(device_of(self._drives), read_gains(self._drives))
+        most = np.maximum(
+            OSCILLATION * self._motor.rated_current, SWINGING * swing_change(self._motor, self._inertia, run)
+        )
+        return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > most)
+
     def _following_scale(self, move: Move) -> Floats:
         """Return over what the integral of |demand - encoder| counts [inc]."""
         return np.maximum(np.abs(move.distance), 1).astype(float)
-
-    def _watch_no_window(self) -> None:
-        """Take 6065h away, which drives have again that were switched on: an axis that is overloaded falls behind."""
-        drives = self._drives
-        if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
-            drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
 
     def _close(self, where: Mask, longest: float) -> None:
         """Close loops that are open, and wait until they commutate; one that does not is stopped in its trial."""

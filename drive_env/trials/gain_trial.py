@@ -114,9 +114,11 @@ class Trials:
     Attributes:
         look: If not None, called after every cycle.
         computes_demand: Where drives do not send their demand, that of the profile does.
+        returns: Whether a trial ends where it began; else where its move did.
     """
 
     computes_demand = True
+    returns = False
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         self.look: Callable[[], None] | None = None
@@ -296,20 +298,29 @@ def _on_the_counter(position: Integers) -> Integers:
 
 
 def momentum_balance(
-    angle: Floats, speed: Floats, current: Floats, motor: Motor, inertia: Floats | None = None
+    angle: Floats,
+    speed: Floats,
+    current: Floats,
+    motor: Motor,
+    inertia: Floats | None = None,
+    moving: Mask | None = None,
 ) -> Identified:
     """Fit i = (J domega/dt) / K_t + coulomb sign(omega) + viscous omega + offset, integrated once over time.
 
     The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own.
     With an inertia that is known already [kg m^2], (num_axes,), the viscous friction is the motor's, and dry friction
-    alone is fitted: in a short move the two look alike.
+    alone is fitted: in a short move the two look alike. `moving`, as long as `speed`, tells the samples that count,
+    all by default: at rest dry friction holds what it likes up to its own, which is no constant load.
     """
     standstill = 1.0  # rad/s, one count in 1.5 ms: below it the sign is noise
     sign = np.clip(speed / standstill, -1.0, 1.0)
     samples, axes = speed.shape
-    t = np.arange(samples) * CYCLE
+    t = np.broadcast_to((np.arange(samples) * CYCLE)[:, None], (samples, axes))
+    if moving is not None:
+        sign, current = np.where(moving, sign, 0.0), np.where(moving, current, 0.0)
+        t = np.cumsum(moving, axis=0) * CYCLE
     columns = np.stack(
-        [speed, np.cumsum(sign, axis=0) * CYCLE, angle, np.broadcast_to(t[:, None], (samples, axes)),
+        [speed, np.cumsum(sign, axis=0) * CYCLE, angle, t,
          np.ones((samples, axes))],
         axis=-1,
     ).transpose(1, 0, 2)  # fmt: skip

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.devices.gain_set import PID_ALONE
+from drive_env.devices.gain_set import LOAD_DETECTION, PID_ALONE
 from drive_env.gains import (
     BASELINE_RULE,
     bandwidth_gains,
@@ -21,9 +21,11 @@ from drive_env.gains import (
 from drive_env.phase_current import currents_for, rated_setting, swing_period, with_currents
 from drive_env.trials.closed_loop import ClosedLoopTrials, plan_overload
 from drive_env.trials.gain_trial import Identified, Trials, softness
-from drive_env.trials.open_loop import OpenLoopTrials, open_loop_cost, open_loop_softness
+from drive_env.trials.load_detection import LoadDetectionTrials, is_load_detection
+from drive_env.trials.load_reading import DOWN, LOWER, UP, WIDTH, lacks_load_detection
+from drive_env.trials.open_loop import OpenLoopTrials, acceleration_share, open_loop_cost, open_loop_softness
 from drive_env.trials.position_pid import PID_I, PID_P, PidTrials, load_step_error, pid_time, plan_pid
-from drive_env.trials.positioning import highest_ramp, plan_move
+from drive_env.trials.positioning import SPEED_SHARE, highest_ramp, plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
 
 if TYPE_CHECKING:
@@ -42,6 +44,9 @@ FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
 SAFE_RULE = BASELINE_RULE._replace(
     speed=BASELINE_RULE.speed / 3.0, integration=3.0 * BASELINE_RULE.integration, position=0.3 * BASELINE_RULE.position
 )
+
+# CoolStep where a search begins: the lowest threshold, a band above it, quick up and slow down.
+FIRST_COOLSTEP = {LOWER: 1, WIDTH: 2, DOWN: 2, UP: 3}
 
 SLOW = 1.0 / 3.0  # of the gains of a stepper's closed loop, where a safe search begins
 SLOW_I = SLOW**2  # of the integral gain of a PID: as slow in time as its P
@@ -157,8 +162,11 @@ class OpenLoop(NamedTuple):
         return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return the move of trials."""
-        return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device))
+        """Return the move of trials: with what friction and a constant load leave of the torque."""
+        speed = SPEED_SHARE * self.motor.rated_speed
+        taken = self.motor.torque_constant * (found.coulomb + np.abs(found.offset) + found.viscous * speed)
+        share = acceleration_share(self.device, self.motor, taken)
+        return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device), share)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return currents with which the load takes 30 degrees of load angle in the move."""
@@ -281,13 +289,88 @@ class ClosedStepper(NamedTuple):
         return self.device.gains.columns_of_loop(self.loop)
 
 
-Method = Cascade | OpenLoop | ClosedStepper
+class LoadSettings(NamedTuple):
+    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or what a load needs."""
+
+    device: Device
+    motor: Motor
+
+    @property
+    def measures_current(self) -> bool:
+        """No torque current is measured in open loop."""
+        return False
+
+    @property
+    def caution(self) -> int:
+        """Higher thresholds of CoolStep leave more current; a threshold too low stops an axis that is not blocked."""
+        return -1
+
+    def t_0(self) -> float:
+        """Return that of the open loop."""
+        return self._open.t_0()
+
+    def highest(self) -> Integers:
+        """Return the greatest integers."""
+        return self._open.highest()
+
+    def first(self, supply: Floats) -> Integers:
+        """Return the rated current, the threshold 0, and CoolStep off."""
+        return self._open.first(supply)
+
+    def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
+        """Return the move of an open loop: that of these trials follows from the working speed."""
+        return self._open.plan(found, scaler, reach)
+
+    def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return the currents for the load, the threshold 0, and a CoolStep that takes little away."""
+        gains = self._open.rule(found, move, supply)
+        for part, value in FIRST_COOLSTEP.items():
+            column = self.device.gains.column(*part)
+            if column is not None:
+                gains[:, column] = value
+        return gains
+
+    def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return the rated current, the threshold 0, and CoolStep off."""
+        return self.first(supply)
+
+    def keep(self, gains: Integers, present: Integers) -> Integers:
+        """Return gains with those of loops that drives may close as they have them at present."""
+        kept = self._open.keep(gains, present)
+        columns = self.device.gains.columns_of(*LOAD_DETECTION)
+        kept[:, columns] = gains[:, columns]
+        return kept
+
+    def trials(self, drives: Drives, axes: int) -> LoadDetectionTrials:
+        """Return what runs trials."""
+        return LoadDetectionTrials(drives, self.motor, axes, self.t_0())
+
+    def softness(self, gains: Integers) -> Floats:
+        """Return 1: no load step is part of it."""
+        return np.ones(len(gains))
+
+    def cost(self, terms: Any) -> Floats:
+        """Return J."""
+        return np.asarray(open_loop_cost(terms))
+
+    def current(self, terms: Any) -> Floats:
+        """Return what CoolStep leaves of the rated current."""
+        return np.asarray(np.sqrt(terms.effort))
+
+    @property
+    def _open(self) -> OpenLoop:
+        return OpenLoop(self.device, self.motor)
+
+
+Method = Cascade | OpenLoop | ClosedStepper | LoadSettings
 
 
 def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Method:
     """Return how gains of a device are tried; with names of gains that act in a closed loop alone with it closed."""
     if (loop := device.gains.loop_of(names)) is not None:
         return ClosedStepper(device, motor, loop)
+    if is_load_detection(device, names):
+        return LoadSettings(device, motor)
     return OpenLoop(device, motor) if device.gains.is_open_loop else Cascade(device, motor)
 
 
@@ -307,13 +390,24 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
                 "themselves"
             )
         return
+    if is_load_detection(device, names):
+        if lacks := lacks_load_detection(device):
+            raise ValueError(f"{device.name}: the load detection of this drive cannot be set: {lacks}")
+        rows = {row.name: row.loop for row in device.gains.rows}
+        if others := [name for name in names if rows[name] not in LOAD_DETECTION]:
+            raise ValueError(
+                f"{', '.join(others)}: trials of the load detection and of CoolStep show what "
+                f"{', '.join(name for name, loop in rows.items() if loop in LOAD_DETECTION)} do; search the others by "
+                "themselves"
+            )
+        return
     closed = [name for each in device.gains.closed_loops for name in each.gains]
     if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
         shown = ", ".join(device.gains.outer)
         shown += f", and with its loop closed what {', '.join(closed)} do" if closed else ""
         raise ValueError(
             f"{', '.join(others)}: a trial of an open-loop stepper shows what the phase currents do, {shown}; "
-            "drive-tune auto finds the settings of its load detection, and drive-tune sweep varies any gain"
+            "drive-tune sweep varies any gain"
         )
 
 

@@ -13,20 +13,21 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device
 from drive_env.devices.gain_set import RUN
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import Drives, axis_number, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
-from drive_env.phase_current import holding_torque, run_and_standby
+from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified, Trials, clear, momentum_balance
 from drive_env.trials.positioning import (
+    ACCELERATION_SHARE,
     BAND,
     BAND_COUNTS,
     CYCLE,
@@ -55,7 +56,11 @@ ENCODER, NO_WINDOW = 0, 0  # of 606Ah and 6065h
 OPEN = 0  # of `Role.LOOP_MODE`
 STILL = 20  # samples at rest by which demand and encoder are compared
 REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
+STANDSTILL = 1.0  # rad/s, below which a rotor is at rest unless it swings back within as many ms
+TURNING_BACK = 10
 LEAST_WAY = 0.25  # of a move that an encoder must show
+# Total inertia in rotors for which the moves of identification are made, one after the other, until one loses no steps.
+TRIED_ROTORS = (3.0, 12.0, 48.0, 192.0)
 
 # The swing by which the inertia of a light load is found: its step and how far apart its two places are [full steps],
 # the time until the one before has died away [s], speed and ramps in full steps, as far as a drive takes them.
@@ -65,12 +70,34 @@ STEEP = {cia402.PROFILE_VELOCITY: 1e3, cia402.PROFILE_ACCELERATION: 2e7, cia402.
 _STEEPNESS = tuple(STEEP)
 HIGHEST_SHARE = 0.95  # of the highest value that a drive takes
 RAMP_ANGLE = 0.3  # sine of the load angle in the ramp, from which on that tells the inertia
+STIFF_SHARE = 0.6  # of the ramp's inertia, below which a swing is that of the rotor against an elastic load
 
 # Scales of the terms of J.
 LOAD_ANGLE = 0.5  # full steps, 45 degrees electrical: 30 % of the torque are left
 VIBRATION = 0.1  # full steps from millisecond to millisecond
 TRIP = 30.0
 OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.02, 0.1
+
+
+# Of the holding torque, that a ramp may ask for at once: a rotor that is pulled suddenly swings beyond the angle of the
+# torque, and comes back from up to 0.725 of it (equal areas under the sine of the torque). The rest is left to what the
+# current lacks at speed.
+PULLED_AT_ONCE = 0.725
+AT_SPEED = 0.9
+LEAST_ACCELERATION = 0.15  # of the rated torque, where friction takes nearly all
+
+
+def acceleration_share(device: Device, motor: Motor, taken: ArrayLike = 0.0) -> Floats:
+    """Return the share of the rated torque that may accelerate an axis in a trial without a lost step in its probe.
+
+    Args:
+        device: The drive, which may give less than the motor's rated current.
+        motor: The motor.
+        taken: Torque that friction and a constant load take [N m], (num_axes,).
+    """
+    held = holding_torque(motor, PROBE * amplitude(device, rated_setting(device, motor)))
+    free = AT_SPEED * PULLED_AT_ONCE * held - np.asarray(taken, float) - motor.cogging_torque
+    return np.asarray(np.clip(free / motor.rated_torque, LEAST_ACCELERATION, ACCELERATION_SHARE))
 
 
 class OpenLoopTerms(NamedTuple):
@@ -195,9 +222,10 @@ def with_run_current(device: Device, gains: Integers, factor: float | Floats) ->
 class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
-    606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches no
-    longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are what
-    they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
+    Nothing acts by the load reading meanwhile, unless `acts_by_load`: no stall stops an axis, no CoolStep lowers its
+    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h
+    watches no longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are
+    what they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
     counter gets.
     """
 
@@ -206,6 +234,8 @@ class OpenLoopTrials(Trials):
         self.sensor: Integers | None = None
         self.window: Integers | None = None
         self.loop: Integers | None = None
+        self.acts_by_load = False
+        self._speeds: dict[Role, Integers] = {}  # of load detection and CoolStep, as they were
         self._zero: Floats | None = None
         self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
 
@@ -218,6 +248,7 @@ class OpenLoopTrials(Trials):
             self._open_loop()
             if np.any(self.window):
                 drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
+        self._let_load_alone(where)
         blind = where & (now != ENCODER)
         if blind.any():
             on = blind & ~self.down()
@@ -236,7 +267,29 @@ class OpenLoopTrials(Trials):
     def power_up(self, where: Mask) -> None:
         """Take drives that were switched on just now to pp, enabled, by the encoder."""
         self._drives.write(cia402.SENSOR_SELECTION, ENCODER, where=where)
+        self._watch_no_window()
+        self._let_load_alone(where)
         super().power_up(where)
+
+    def _let_load_alone(self, where: Mask) -> None:
+        """Have nothing act by the load reading: stop on stall is off at 0, CoolStep beyond all speeds."""
+        drives, device = self._drives, device_of(self._drives)
+        if self.acts_by_load:
+            return
+        for role in (Role.STALL_SPEED, Role.COOLSTEP_SPEED):
+            if (key := device.roles.get(role)) is not None:
+                now = drives.read(role)
+                self._speeds.setdefault(role, now)
+                off = 0 if role is Role.STALL_SPEED else device.new_dictionary().find(key).high
+                assert off is not None, "a speed is a number"
+                if np.any(acting := where & (now != off)):
+                    drives.write(role, off, where=acting)
+
+    def _watch_no_window(self) -> None:
+        """Take 6065h away, which drives have again that were switched on: what falls behind is seen by the encoder."""
+        drives = self._drives
+        if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
+            drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
 
     def _open_loop(self) -> None:
         """Open the loops that drives have closed: with one closed the load angle says something else."""
@@ -250,6 +303,9 @@ class OpenLoopTrials(Trials):
         """Give 606Ah and the loop's mode back what they were; the axes must be disabled."""
         if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
             self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
+        for role, values in self._speeds.items():
+            if np.any(off := self._drives.read(role) != values):
+                self._drives.write(role, values, where=off)
         if self.sensor is not None:
             assert self.window is not None, "both are read at once"
             if np.any(drifted := self._drives.read(cia402.FOLLOWING_WINDOW) != self.window):
@@ -265,17 +321,48 @@ class OpenLoopTrials(Trials):
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
         """Move there and back with the currents that are; return what the load angle says, and where the axes began.
 
+        How heavy the load is nobody knows: an axis that loses steps in moves for a light one makes slower ones, while
+        the others stand.
+
         Raises:
             RuntimeError: If an encoder hardly moved.
         """
-        drives, motor = self._drives, self._motor
+        drives, motor, count = self._drives, self._motor, self._drives.num_axes
         drives.advance(STILL * CYCLE)
         self._zero = None
         self.shift()
         origin = drives.read(cia402.POSITION_ACTUAL)
         scaler = drives.read(Role.POSITION_SCALE)
-        most = highest_ramp(device_of(drives))
-        move = plan_move(motor, np.full(drives.num_axes, 3.0 * motor.inertia), scaler, reach, most)
+        most, share = highest_ramp(device_of(drives)), acceleration_share(device_of(drives), motor)
+        found = Identified(*np.zeros((4, count)))
+        left = where.copy()
+        for rotors in TRIED_ROTORS:
+            move = plan_move(motor, np.full(count, rotors * motor.inertia), scaler, reach, most, share)
+            seen, position, lost = self._identify_by(move, origin, reach, left)
+            found = Identified(*(np.where(left, a, b) for a, b in zip(seen, found, strict=True)))
+            if not np.any(again := left & lost):
+                break
+            left = again
+            self._start_anew(left, np.asarray(scaler / (TOOTH * motor.n_p), float))
+            origin = np.where(left, drives.read(cia402.POSITION_ACTUAL), origin)
+        self._check_moved(position, move, left)
+        return found, origin
+
+    def _start_anew(self, where: Mask, full_step: Floats) -> None:
+        """Have axes that lost steps stand, enabled, and count their steps from here."""
+        drives = self._drives
+        if np.any(on := where & ~self.down()):  # the steps end, and the rotor finds the field again
+            drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=on)
+        drives.advance(STILL * CYCLE)
+        self._come_to_rest(full_step)
+        self.recover(where)
+        drives.advance(STILL * CYCLE)
+        now = wrapped(drives.read(cia402.POSITION_DEMAND) - drives.read(cia402.POSITION_ACTUAL))
+        self._zero = np.where(where, now, 0.0 if self._zero is None else self._zero)
+
+    def _identify_by(self, move: Move, origin: Integers, reach: Floats, where: Mask) -> tuple[Identified, Floats, Mask]:
+        """Move there and back, and swing; return what was identified, the way of the encoder, and who lost steps."""
+        drives, motor = self._drives, self._motor
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]
         traces = []
@@ -286,9 +373,10 @@ class OpenLoopTrials(Trials):
             trace = self._record(objects, TRIAL)
             traces.append((trace[cia402.POSITION_ACTUAL], trace[cia402.POSITION_DEMAND] - shift))
         position, demand = (np.concatenate(parts) for parts in zip(*traces, strict=True))
-        self._check_moved(position, move, where)
         angle = wrapped(position - origin) / move.increments
         lag = wrapped(demand - position) / move.increments
+        tooth = 2.0 * np.pi / motor.n_p
+        lost = (np.abs(lag) > LOST / TOOTH * tooth).any(axis=0) | self.down()
         held = holding_torque(motor, run_and_standby(device_of(drives), read_gains(drives))[0])
         lag -= np.gradient(wrapped(demand - origin) / move.increments, axis=0) / CYCLE * encoder_age(device_of(drives))
         # The rotor's angle in the field is the torque that it takes; as a current of the motor's torque constant.
@@ -296,18 +384,20 @@ class OpenLoopTrials(Trials):
         # The rotor swings a hundred times a second: the impulse is summed by trapezoids, up to the speed's own sample.
         current[1:] = 0.5 * (current[1:] + current[:-1])
         speed = np.gradient(angle, CYCLE, axis=0)
-        found = momentum_balance(angle, speed, current, motor)
-        has_room = where & (np.abs(reach) > SWING_ROOM * 2.0 * np.pi / (TOOTH * motor.n_p))
+        moving = _moving(speed)
+        found = momentum_balance(angle, speed, current, motor, moving=moving)
+        has_room = where & ~lost & (np.abs(reach) > SWING_ROOM * 2.0 * np.pi / (TOOTH * motor.n_p))
         if not has_room.any():
-            return found, origin
+            return found, position, lost
         swing = self._swing(origin, move, has_room, held)
         # A heavy load's ramp says more than its swing, in which what is elastic takes no part.
         light = has_room & (swing.inertia * move.acceleration / move.increments < RAMP_ANGLE * held)
+        light &= swing.inertia > STIFF_SHARE * found.inertia
         if (trusted := light & (swing.explained > EXPLAINED)).any():
             inertia = np.where(trusted, swing.inertia, found.inertia)
-            known = momentum_balance(angle, speed, current, motor, inertia)
+            known = momentum_balance(angle, speed, current, motor, inertia, moving)
             found = Identified(*(np.where(trusted, a, b) for a, b in zip(known, found, strict=True)))
-        return found, origin
+        return found, position, lost
 
     def _swing(self, origin: Integers, move: Move, where: Mask, held: Floats) -> FreeSwing:
         """Let the rotors swing after steps of a quarter of a full step, here and half a full step from here."""
@@ -424,16 +514,27 @@ class OpenLoopTrials(Trials):
         tooth = np.asarray(drives.read(Role.POSITION_SCALE), float) / self._motor.n_p
         return np.asarray(np.rint(self._zero + tooth * np.rint((now - self._zero) / tooth)))
 
-    def _check_moved(self, position: Integers, move: Move, where: Mask) -> None:
+    def _check_moved(self, position: Floats, move: Move, where: Mask) -> None:
         way = np.abs(wrapped(position - position[0])).max(axis=0)
         still = np.flatnonzero(where & (way < LEAST_WAY * np.abs(move.distance)))
         if still.size:
             k = int(still[0])
+            number = axis_number(self._drives, k)
             raise RuntimeError(
-                f"axis {k}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
-                "rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
+                f"axis {number}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move "
+                "at rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
                 "without an encoder nothing is seen of an open-loop stepper that could be scored"
             )
+
+
+def _moving(speed: Floats) -> Mask:
+    """Return which samples of speeds [rad/s] are of a rotor that moves, or swings back in a moment, as they have it."""
+    fast = np.abs(speed) > STANDSTILL
+    found = fast.copy()
+    for k in range(1, TURNING_BACK + 1):
+        found[k:] |= fast[:-k]
+        found[:-k] |= fast[k:]
+    return found
 
 
 def open_loop_terms(

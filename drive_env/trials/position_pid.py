@@ -35,6 +35,7 @@ from drive_env.trials.positioning import (
     Move,
     plan_move,
     wrapped,
+    write_profile,
 )
 from drive_env.trials.score import LOAD_SHARE, NOISE
 
@@ -52,6 +53,9 @@ VIBRATION = 0.1  # full steps, by which the encoder changes from millisecond to 
 # RMS of the change of that in a look [full steps]: a light rotor that swings as a ramp begins makes 0.2 of it, one that
 # oscillates or rolls over its teeth 0.33 and more.
 SHAKES = 0.3
+# Steady speeds [rev/s] at which gains are looked at after a search: trials are too short to show how a rotor swings by
+# the steps of a speed. Time of it, and of a ramp before it [s], and the swing that is worth a word [full steps, RMS].
+STEADY_SPEEDS, STEADY, RAMP, SWING = (0.25, 0.5, 1.0, 2.0), 0.4, 0.15, 0.1
 LONGEST_WAY_BACK, BACK, LOOK = 2.0, 0.5, 0.05  # s, full steps, s: what slipped is made up for before the next phase
 
 
@@ -142,6 +146,41 @@ class PidTrials(ClosedLoopTrials):
 
     def _following_scale(self, move: Move) -> Floats:
         return following_scale(move, self._motor, self._closed)
+
+    def steady_swings(self, reach: Floats, where: Mask) -> Floats:
+        """Return how the rotors swing at `STEADY_SPEEDS` [full steps, RMS], (speeds, num_axes); nan where none fits.
+
+        Args:
+            reach: How far they may turn from here, with the sign [rad].
+            where: Axes that are looked at.
+        """
+        drives = self._drives
+        scale = np.asarray(drives.read(Role.POSITION_SCALE), float)
+        step = scale / (TOOTH * self._motor.n_p)
+        found = np.full((len(STEADY_SPEEDS), drives.num_axes), np.nan)
+        origin = drives.read(cia402.POSITION_ACTUAL)
+        for k, speed in enumerate(STEADY_SPEEDS):
+            way = speed * (STEADY + 2.0 * RAMP)  # rev
+            fits = where & (2.0 * np.pi * way < np.abs(reach)) & (2.0 * np.pi * speed < self._motor.rated_speed)
+            if not fits.any():
+                continue
+            velocity = np.ceil(speed * scale)
+            move = Move(
+                np.rint(np.copysign(way, reach) * scale).astype(np.int64), velocity.astype(np.int64),
+                np.ceil(velocity / RAMP).astype(np.int64), scale / (2.0 * np.pi), 1.0,
+            )  # fmt: skip
+            write_profile(drives, move, fits)
+            self.go(origin + move.distance, fits)
+            drives.advance(2.0 * RAMP)
+            seen = drives.record(cia402.POSITION_ACTUAL, STEADY - RAMP)[cia402.POSITION_ACTUAL]
+            drives.advance(4.0 * RAMP)
+            self.go(origin, fits)
+            drives.advance(STEADY + 4.0 * RAMP)
+            path = wrapped(seen - seen[0])
+            t = np.arange(len(path))
+            line = np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, path, 1)).T
+            found[k] = np.where(fits, np.std(path - line, axis=0) / step, np.nan)
+        return found
 
     def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
         """Return whose speed changes from ms to ms as no ramp makes it, or who falls behind a ramp by lost steps."""

@@ -68,7 +68,14 @@ def highest_ramp(device: Device) -> float:
     return math.inf if base != COUNTED_RAMP or high is None else high * number
 
 
-def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayLike, highest: float = math.inf) -> Move:
+def plan_move(
+    motor: Motor,
+    inertia: ArrayLike,
+    scaler: ArrayLike,
+    reach: ArrayLike,
+    highest: float = math.inf,
+    share: ArrayLike = ACCELERATION_SHARE,
+) -> Move:
     """Return a triangular move of 60 ms with 0.4 of the rated torque, or less where speed or travel end before.
 
     Args:
@@ -77,10 +84,11 @@ def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayL
         scaler: 2058h, increments per revolution.
         reach: How far the rotor may go, with its sign [rad].
         highest: Acceleration that the drive takes at most [inc/s^2], see `highest_ramp`.
+        share: Of the rated torque that accelerates, (num_axes,) or one for all.
     """
     J, to = np.asarray(inertia, float), np.asarray(reach, float)
     time = PROFILE * CYCLE
-    angle = ACCELERATION_SHARE * motor.rated_torque / J * time**2 / 4.0
+    angle = np.asarray(share, float) * motor.rated_torque / J * time**2 / 4.0
     angle = np.minimum(angle, SPEED_SHARE * motor.rated_speed * time / 2.0)
     increments = np.broadcast_to(np.asarray(scaler, float), angle.shape) / (2.0 * math.pi)
     angle = np.minimum(angle, (highest * time**2 / 4.0 - 1.0) / increments)

@@ -64,7 +64,7 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
     supply = float(target.supply[axis])
     loaded = [result.loaded[axis]] if axis in result.loaded else []
     return AxisCertificate(
-        axis=axis,
+        axis=target.axis_numbers[axis],
         accepted=outcome.accepted,
         reservations=outcome.reservations,
         reason=outcome.reason or f"{_opening(outcome)}; the gains were verified {outcome.verified}",

@@ -98,17 +98,21 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
     names = [title.replace(" ", "\n") for title in target.device.gains.titles]
     rows = [
         (str(k), name, *map(str, gains.values()))
-        for k, axis in enumerate(result.axes)
+        for k, axis in zip(target.axis_numbers, result.axes, strict=True)
         for name, gains in (("before", axis.before), ("after", axis.after))
     ]
     print_table((Column("axis"), Column("", "name"), *map(Column, names)), rows)
     lines = []
-    for k, axis in enumerate(result.axes):
+    for k, axis in zip(target.axis_numbers, result.axes, strict=True):
         if not axis.accepted:
             lines.append(f"axis {k}: rejected, and its settings from before are restored: {axis.reason}")
             continue
         lines.append(f"axis {k}: {axis.verdict}")
         lines += [f"axis {k}: {name}: {'not measured' if v is None else f'{v:g}'}" for name, v in axis.figures.items()]
+        lines += [
+            f"axis {k}: {name.replace(':', 'h:')}: {values['before']} before, {values['after']} now"
+            for name, values in axis.settings.items()
+        ]
         lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
     lines.append(
         f"not measured: current and load step ({unmeasured(target.device)}), frequency response and margins (open loop)"
@@ -153,7 +157,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         names = target.device.gains.names
         rows = [
             {
-                "axis": k,
+                "axis": target.axis_numbers[k],
                 "verdict": axis.verdict,
                 "accepted": axis.accepted,
                 "reservations": axis.reservations,
@@ -175,7 +179,8 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         Column("position\nP", "name"), Column("velocity\nloop", "name"), Column("position\nloop", "name"),
     )  # fmt: skip
     cells, cascade = [], cascade_columns(target.device)
-    for k, axis in enumerate(result.axes):
+    numbers = target.axis_numbers
+    for k, axis in zip(numbers, result.axes, strict=True):
         for name, gains in (("before", axis.before), ("after", axis.after)):
             told = name == "after" and axis.accepted
             margins = [_margins(axis, loop) if told else "" for loop in ("velocity", "position")]
@@ -184,8 +189,8 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
             cells.append((str(k), name, *pairs, str(position_p), *margins))
     print_table(columns, cells)
     lines = []
-    for k, axis in enumerate(result.axes):
-        if not axis.accepted and axis.identified is None and result.drive_seconds[k] == 0.0:  # refused at the outset
+    for k, axis, seconds in zip(numbers, result.axes, result.drive_seconds, strict=True):
+        if not axis.accepted and axis.identified is None and seconds == 0.0:  # refused at the outset
             lines.append(f"axis {k} was not tuned: {axis.reason}")
         elif not axis.accepted:
             lines.append(f"axis {k}: rejected, and its gains from before are restored: {axis.reason}")

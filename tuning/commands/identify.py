@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,13 +63,14 @@ def identify(
 
         with drive.open() as target, unchanged(target, file), progress_bar("identifying") as show:
             found = run(target, progress=lambda what, share: show(share))
-        rows = [row(one) for one in found]
+            numbers = target.axis_numbers
+        rows = [{"axis": axis} | row(one) for axis, one in zip(numbers, found, strict=True)]
         if out is not None:
             write_whole(out, json_.dumps(rows, indent=1) + "\n")
         if json:
             print_json([one | before_as_json(file) for one in rows])
         else:
-            _print(found, target.device)
+            _print(found, target.device, numbers if drive.axis or len(found) > 1 else ())
             if out is not None:
                 print(f"written to {out}")
             tell_before(file)
@@ -89,12 +91,12 @@ def row(found: Identification) -> dict[str, Any]:
     return {"drive_time": found.drive_time, "estimates": estimates, "wiring": wiring}
 
 
-def _print(found: list[Identification], device: Device) -> None:
+def _print(found: list[Identification], device: Device, numbers: Sequence[int]) -> None:
     from tuning.identify.wiring import finding
 
     columns = (Column("", "text"), Column("value"), Column("95 % interval", "text"), Column("unit", "name"))
-    for axis, one in enumerate(found):
-        head = f"axis {axis}: " if len(found) > 1 else ""
+    for k, one in enumerate(found):
+        head = f"axis {numbers[k]}: " if numbers else ""
         rows = []
         said = ""
         for name, estimate in one.estimates.items():

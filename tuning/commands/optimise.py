@@ -185,7 +185,7 @@ def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -
     before = file_before("optimise", folder)
     with drive.open() as target:
         given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
-        options = _named(drive) | given | dict(target.bus)
+        options = _named(drive) | given | {key: value for key, value in target.bus.items() if key != "axes"}
         try:
             found = _search_bus(target, settings, before, folder, options)
         except KeyboardInterrupt:
@@ -196,7 +196,8 @@ def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -
 
 def _named(drive: DriveOptions) -> dict[str, Any]:
     """Return what settings.toml tells of any drive."""
-    return {"device": drive.device, "motor": drive.motor_name, "supply": drive.supply, "travel": drive.travel}
+    named = {"device": drive.device, "motor": drive.motor_name, "supply": drive.supply, "travel": drive.travel}
+    return named | ({"axis": sorted(set(drive.axis))} if drive.axis else {})
 
 
 def _search_machine(
@@ -301,18 +302,21 @@ def _report(
             }
         )  # fmt: skip
         return
-    _print(found, settings, folder, before, where, options["device"])
+    _print(found, settings, folder, before, where, options)
 
 
-def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str, device: str) -> None:
+def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str, options: dict[str, Any]) -> None:
     import numpy as np
 
     from drive_env.devices import find_device
     from tuning.search.optimise import COST
+    from tuning.search.trials_files import axis_numbers
     from tuning.search.trials_files import titles as titles_of
 
+    device = options["device"]
     searches = sorted({row.search for row in found.rows})
     axes = len(found.gains) // max(len(searches), 1)
+    numbers = axis_numbers(options, axes)
     kind = "Axis" if before is not None else "Search"
     several = settings.objectives != (COST,)
     shown = (COST, *(name for name in settings.objectives if name != COST))
@@ -324,13 +328,14 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         own = [row for row in found.rows if row.search == search]
         rows = []
         if own:
-            rows += _cells("safe start" if settings.safe else "the rule", own[0].gains, _told(own[0], shown, found.t_0))
+            first = "safe start" if settings.safe else "the rule"
+            rows += _cells(first, numbers, own[0].gains, _told(own[0], shown, found.t_0))
         for row in found.front(settings.objectives, search)[:10] if several else []:
-            rows += _cells(f"trial {row.number}", row.gains, _told(row, shown, found.t_0))
+            rows += _cells(f"trial {row.number}", numbers, row.gains, _told(row, shown, found.t_0))
         best = found.gains[search * axes : (search + 1) * axes]
         cost = found.cost[search if len(found.cost) == len(searches) else 0]
         row = next((row for row in own if row.cost == cost and np.array_equal(row.gains, best)), None)
-        rows += _cells("best", best, [""] * len(shown) if row is None else _told(row, shown, found.t_0))
+        rows += _cells("best", numbers, best, [""] * len(shown) if row is None else _told(row, shown, found.t_0))
         title = f"{kind} {search} of {where}" if len(searches) > 1 else f"Gains of {where}"
         print_table(columns, rows, title + ", with the Pareto front of the trials" * several)
     stopped = sum(row.aborted for row in found.rows)
@@ -387,9 +392,10 @@ def _told(row: Any, objectives: Sequence[str], t_0: float) -> list[str]:
     return [f"{value:.3g}" for value in figures(row, objectives, t_0)]
 
 
-def _cells(name: str, gains: Any, told: list[str]) -> list[tuple[str, ...]]:
+def _cells(name: str, numbers: Sequence[int], gains: Any, told: list[str]) -> list[tuple[str, ...]]:
     """Return the rows of a machine's gains, one for each of its axes; what it reached stands in the first."""
+    first = name if list(numbers) == list(range(len(numbers))) else f"{name}, axis {numbers[0]}"
     return [
-        (name if axis == 0 else f"  axis {axis}", *map(str, row), *(told if axis == 0 else [""] * len(told)))
-        for axis, row in enumerate(gains)
+        (first if k == 0 else f"  axis {axis}", *map(str, row), *(told if k == 0 else [""] * len(told)))
+        for k, (axis, row) in enumerate(zip(numbers, gains, strict=True))
     ]

@@ -83,6 +83,15 @@ Axes = Annotated[
         "are moved together). Known for an emulated load.",
     ),
 ]
+ChosenAxis = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--axis",
+        help="Axis of nodes with several that is tuned, from 0; may be repeated. The others are never enabled, and "
+        "keep their parameters.",
+        show_default="all",
+    ),
+]
 Machines = Annotated[int, typer.Option("--machines", help="Number of emulated machines.")]
 Randomise = Annotated[bool, typer.Option("--randomise", help="Draw random parameters for every machine.")]
 Workers = Annotated[
@@ -119,6 +128,7 @@ class DriveOptions:
     lockstep: Lockstep = False
     supply: Supply = None
     travel: TravelRange = None
+    axis: ChosenAxis = None
     axes: Axes = APART
     yes: Yes = False
 
@@ -132,6 +142,11 @@ class DriveOptions:
     def check(self) -> None:
         """Raise ValueError for a number that cannot be, or a drive of which too little is known."""
         check_seed(self.seed)
+        if self.eds is None and self.axis and self.bus:
+            from drive_env.devices import find_device
+            from drive_env.drives.chosen_axes import chosen_parts
+
+            chosen_parts(self.axis, find_device(self.device).num_axes, self.device)
         if self.eds is not None:
             raise ValueError(
                 f"--eds {self.eds}: an EDS says neither which objects are gains nor in what units a drive counts, and "
@@ -151,13 +166,14 @@ class DriveOptions:
         self.check()
         check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
         named = {name: getattr(self, name) for name in ("device", "load", "seed", "supply")}
-        return named | {"motor": self.motor_name, "travel": None if self.travel is None else parse_travels(self.travel)}
+        named |= {"motor": self.motor_name, "travel": None if self.travel is None else parse_travels(self.travel)}
+        return named | ({"chosen": list(self.axis)} if self.axis else {})
 
     def open(self) -> Target:
         """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
         self.check()  # before anybody is asked
         if self.bus and self.travel is not None:
-            ask_to_turn(self.nodes, self.yes, self.interface)
+            ask_to_turn(self.nodes, self.yes, self.interface, self.axis)
         return open_target(self)
 
 
@@ -269,11 +285,16 @@ def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, a
         )
 
 
-def ask_to_turn(nodes: list[int] | None, yes: bool, interface: str | None = None) -> None:
+def ask_to_turn(
+    nodes: list[int] | None, yes: bool, interface: str | None = None, axes: list[int] | None = None
+) -> None:
     """Continue if the user agrees that the motors on a bus turn; raises as `ask` does."""
     from drive_env.master.open_drives import default_nodes
 
-    ask(f"The motor of node {', '.join(map(str, nodes or default_nodes(interface)))} will turn. Is its way clear?", yes)
+    which = f"node {', '.join(map(str, nodes or default_nodes(interface)))}"
+    if axes:
+        which = f"axis {', '.join(map(str, sorted(set(axes))))} of {which}"
+    ask(f"The motor of {which} will turn. Is its way clear?", yes)
 
 
 def open_target(drive: DriveOptions) -> Target:
@@ -301,6 +322,7 @@ def open_target(drive: DriveOptions) -> Target:
         supply=drive.supply,
         travel=parse_travels(drive.travel),
         axes=drive.axes,
+        chosen=drive.axis or None,
         **options,
     )
 

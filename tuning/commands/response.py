@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -75,12 +76,13 @@ def response(
         file = way_back(drive, "response", out)
         with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
             measured = measure(target, loop, signal=Signal(signal, low, high, resolution), traced=trace, progress=show)
+            numbers = target.axis_numbers
         if out is not None:
-            _write(out, measured)
+            _write(out, measured, numbers)
         if json:
-            print_json([one | before_as_json(file) for one in _as_json(measured)])
+            print_json([one | before_as_json(file) for one in _as_json(measured, numbers)])
         else:
-            _print(measured, out)
+            _print(measured, numbers, out)
             tell_before(file)
         if measured.trusted.mean(axis=0).min() < FEWEST:
             slow = "; or this computer or the emulator is too slow for real time: serve the emulator with --lockstep"
@@ -92,7 +94,7 @@ def _axes(measured: MeasuredLoop) -> range:
     return range(measured.open_loop.shape[1])
 
 
-def _write(folder: Path, measured: MeasuredLoop) -> None:
+def _write(folder: Path, measured: MeasuredLoop, numbers: Sequence[int]) -> None:
     import numpy as np
 
     from tuning.response.bode import write_bode
@@ -100,7 +102,7 @@ def _write(folder: Path, measured: MeasuredLoop) -> None:
 
     with new_folder(folder) as partial:
         for axis in _axes(measured):
-            name = f"{measured.loop}_axis{axis}"
+            name = f"{measured.loop}_axis{numbers[axis]}"
             write_bode(partial / f"{name}.png", measured, axis)
             with (partial / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
                 table = csv.writer(file)
@@ -116,13 +118,13 @@ def _write(folder: Path, measured: MeasuredLoop) -> None:
                     table.writerow((f"{f:g}", *row))
 
 
-def _as_json(measured: MeasuredLoop) -> list[dict[str, Any]]:
+def _as_json(measured: MeasuredLoop, numbers: Sequence[int]) -> list[dict[str, Any]]:
     rows = []
     for axis in _axes(measured):
         on_bus = ~measured.traced
         rows.append(
             {
-                "axis": axis,
+                "axis": numbers[axis],
                 "loop": measured.loop,
                 "gains": [int(gain) for gain in measured.gains[axis]],
                 "margins": {name: _or_none(value) for name, value in measured.margins(axis)._asdict().items()},
@@ -146,7 +148,7 @@ def _plant(measured: MeasuredLoop, axis: int) -> dict[str, Any] | None:
     }
 
 
-def _print(measured: MeasuredLoop, out: Path | None) -> None:
+def _print(measured: MeasuredLoop, numbers: Sequence[int], out: Path | None) -> None:
     titles = (
         "phase\nmargin\n[deg]", "at\n[Hz]", "gain\nmargin\n[dB]", "at\n[Hz]", "crossover\n[Hz]", "bandwidth\n[Hz]",
         "\nMs", "coherent\n[%]",
@@ -159,7 +161,7 @@ def _print(measured: MeasuredLoop, out: Path | None) -> None:
             found.phase_deg, found.phase_hz, found.gain_db, found.gain_hz, found.crossover_hz, found.bandwidth_hz,
             found.ms, coherent,
         )  # fmt: skip
-        rows.append((str(axis), *(_text(x, "{:.2f}" if x is found.ms else "{:.1f}") for x in figures)))
+        rows.append((str(numbers[axis]), *(_text(x, "{:.2f}" if x is found.ms else "{:.1f}") for x in figures)))
     print_table([Column("axis"), *map(Column, titles)], rows, f"{measured.loop} loop")
     lines = []
     for axis in _axes(measured):
@@ -169,8 +171,8 @@ def _print(measured: MeasuredLoop, out: Path | None) -> None:
                 said = f"{e.value:.4g}{unit} ({e.low:.4g} to {e.high:.4g})"
                 if e.reason:
                     said = f"not identified: {e.reason}"
-                lines.append(f"axis {axis}: {TITLES[name]} {said}")
-        lines += [f"axis {axis}: {note}" for note in measured.notes[axis]]
+                lines.append(f"axis {numbers[axis]}: {TITLES[name]} {said}")
+        lines += [f"axis {numbers[axis]}: {note}" for note in measured.notes[axis]]
     written = "" if out is None else f"; written to {out}"
     print_lines([*lines, f"{measured.drive_time:.2f} s of drive time{written}"])
 

@@ -95,10 +95,11 @@ def rules(
                 else:
                     axis.rows[MEASURED] = measured
             if json:
-                print_json([_as_json(target, axis) | before_as_json(before) for axis in axes])
+                named = zip(target.axis_numbers, axes, strict=True)
+                print_json([{"axis": k} | _as_json(target, axis) | before_as_json(before) for k, axis in named])
             else:
-                for k, axis in enumerate(axes):
-                    _print(target, axis, k if len(plants) > 1 else None)
+                for k, axis in zip(target.axis_numbers, axes, strict=True):
+                    _print(target, axis, k if drive.axis or len(plants) > 1 else None)
             if not known or (apply and len(known) < len(plants)):
                 fail("nothing was written: a rule needs the inertia of every axis" if known else
                      "no axis has an identified inertia, which every rule needs", REFUSED)  # fmt: skip

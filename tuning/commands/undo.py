@@ -55,7 +55,8 @@ def undo(
         given = {"interface": interface, "channel": channel}
         address = {**snapshot.bus, **{name: value for name, value in given.items() if value is not None}}
         nodes = ", ".join(map(str, address.get("nodes", [])))
-        ask(f"Restore node {nodes} on {address.get('channel')}?", yes)
+        which = f"axis {', '.join(map(str, address['axes']))} of node {nodes}" if "axes" in address else f"node {nodes}"
+        ask(f"Restore {which} on {address.get('channel')}?", yes)
         keep = snapshot.stored if store is None else store
         changed, verified = _restore(file, snapshot, address, keep, other_drive=other_drive)
     if json:
@@ -76,16 +77,20 @@ def _restore(
     from drive_env.master.open_drives import open_drives
     from drive_env.master.parameters import compare, list_differences, restorable
     from tuning import snapshot as snapshots
+    from tuning.target import of_nodes
 
     # Nothing turns: the envelope would only add its own limits.
+    axes = address.pop("axes", None)
     with open_drives(snapshot.device, safety=False, **address) as drives:
         snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)
-        changed = snapshots.restore(drives, snapshot)
+        chosen = drives if axes is None else of_nodes(drives, axes)
+        numbers = chosen.axis_numbers
+        changed = snapshots.restore(chosen, snapshot)
         if store:
-            snapshots.store(drives)
+            snapshots.store(chosen)
     verified = 0
     with open_drives(snapshot.device, safety=False, **address) as drives:
-        for axis, values in enumerate(snapshot.axes):
+        for axis, values in zip(numbers, snapshot.axes, strict=True):
             wanted = restorable(values, drives.description.hints)
             verified += len(wanted)
             if left := compare(drives, wanted, axis):
@@ -94,4 +99,4 @@ def _restore(
                     f"{list_differences(left)}; is another master writing to it? End it, then restore {file} again",
                     REFUSED,
                 )
-    return [(axis, change) for axis, changes in enumerate(changed) for change in changes], verified
+    return [(axis, change) for axis, changes in zip(numbers, changed, strict=True) for change in changes], verified

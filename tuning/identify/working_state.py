@@ -19,7 +19,7 @@ from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import Drives, axis_number
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import bandwidth_gains, write_gains
 from drive_env.motors import Motor
@@ -144,9 +144,8 @@ def working_state(target: Target, where: Mask | None = None) -> Iterator[Working
     status = drives.read(cia402.STATUSWORD)
     enabled = axes & cia402.matches(status, cia402.OPERATION_ENABLED)
     if enabled.any():
-        raise RuntimeError(
-            f"axis {int(np.flatnonzero(enabled)[0])} is enabled: disable it, identification begins with a drive at rest"
-        )
+        number = axis_number(drives, int(np.flatnonzero(enabled)[0]))
+        raise RuntimeError(f"axis {number} is enabled: disable it, identification begins with a drive at rest")
     before = {key: drives.read(key) for key in borrowed(target.device)}
     mode = drives.read(cia402.MODE)
     try:

@@ -16,8 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import RAW_MAX
+from drive_env import cia402
+from drive_env.gains import RAW_MAX, write_gains
 from drive_env.trials.method import check_tried
+from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
+from drive_env.trials.positioning import wrapped
 from tuning.runs.shard_log import ShardLog
 from tuning.search.samplers import SAMPLERS, Proposer, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
@@ -166,6 +169,8 @@ def optimise(
         while search.generation():
             progress(search.share())
         gains, cost = search.best()
+        if isinstance(bench.trials, PidTrials):
+            search.tell_of_swings(gains)
         bench.leave(gains)
     return Optimised(
         gains, bench.rule, cost, search.judged(), clock.seconds, bench.moves, bench.aborts, tuple(search.notes),
@@ -192,7 +197,7 @@ class _Search:
         self.rows: list[TrialRow] = []
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
-        self._columns, self._highest = columns, bench.highest[columns]
+        self._columns = columns
         # Machines of a search: they are its generation.
         self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
         self._start = self._points(bench.safe if settings.safe else bench.rule)
@@ -240,6 +245,29 @@ class _Search:
                 if row is not None:
                     gains[self._axes_of(machine)], cost[machine] = row.gains, row.cost
         return gains, cost
+
+    def tell_of_swings(self, gains: Integers) -> None:
+        """Add a reservation where the rotor swings with the best gains of a PID at a steady speed."""
+        bench = self._bench
+        drives = bench.target.drives
+        everywhere = np.ones(bench.target.num_axes, bool)
+        write_gains(drives, gains)
+        bench.trials.recover(everywhere)
+        # There and back from where the trials have left the axes, toward where they began if that is the longer way.
+        gone = wrapped(drives.read(cia402.POSITION_ACTUAL) - bench.began) / bench.target.increments()
+        left = bench.reach - gone
+        swings = bench.trials.steady_swings(left, everywhere).reshape(len(STEADY_SPEEDS), bench.num_machines, -1)
+        worst = np.nan_to_num(swings).max(axis=2)
+        for machine in range(bench.num_machines):
+            seen = [f"{worst[k, machine]:.2g} at {speed:g} rev/s"
+                    for k, speed in enumerate(STEADY_SPEEDS) if worst[k, machine] > SWING]  # fmt: skip
+            if seen:
+                said = (
+                    f"reservation: at a steady speed the rotor swings by more than {SWING:g} full steps RMS "
+                    f"({', '.join(seen)}), which the short moves of trials do not show: close the loop by the load "
+                    "angle for such speeds, or change the run current"
+                )
+                self.notes[machine] = "; ".join(filter(None, (self.notes[machine], said)))
 
     def judged(self) -> tuple[TrialRow, ...]:
         """Return every trial, those marked whose gains were found fragile later."""
@@ -378,14 +406,14 @@ class _Search:
 
     def _points(self, gains: Integers) -> Floats:
         """Return gains as points of the machines, (num_machines, dimensions)."""
-        logs = np.log(gains[:, self._columns] / self._bench.rule[:, self._columns])
+        known = self._bench.target.device.gains
+        logs = known.change(gains, self._bench.rule, self._columns)
         return np.asarray(logs.reshape(self._bench.num_machines, self._axes, len(self._columns)).mean(axis=1))
 
     def _gains(self, machine: int, point: Floats) -> Integers:
         """Return the gains of a machine's axes at a point, (axes_per_machine, count)."""
-        gains = self._bench.rule[self._axes_of(machine)].copy()
-        gains[:, self._columns] = np.clip(np.rint(gains[:, self._columns] * np.exp(point)), 1, self._highest)
-        return gains
+        known = self._bench.target.device.gains
+        return known.changed(self._bench.rule[self._axes_of(machine)], point, self._columns, self._bench.highest)
 
     def _axes_of(self, machine: int) -> slice:
         return slice(int(machine) * self._axes, (int(machine) + 1) * self._axes)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.interface import Drives, axis_number, machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
@@ -177,9 +177,9 @@ class TrialBench:
             self._trials.recover(self._where)
             drives.advance(CALM)
             self._reach = self._reach - wrapped(drives.read(cia402.POSITION_ACTUAL) - began) / scaler * 2.0 * np.pi
-        axis = int(np.flatnonzero(watch.swung)[0])
+        number = axis_number(drives, int(np.flatnonzero(watch.swung)[0]))
         raise RuntimeError(
-            f"axis {axis} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
+            f"axis {number} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
             "gains that its motor's data sheet gives; check motor and wiring"
         )
 
@@ -204,7 +204,7 @@ class TrialBench:
         # Until the next trial, and not those of the probe.
         write_gains(target.drives, np.where(self._fallback.calmed[:, None], self.safe, self.incumbent), axes)
         self._trials.recover(axes)
-        if not self._anew:  # a trial ends where its move did, and the next one goes the other way
+        if not (self._anew or self._trials.returns):  # it ends where its move did, and the next one goes the other way
             self._origin = np.where(axes, self._origin + self._direction * self.move.distance, self._origin)
             self._direction = np.where(axes, -self._direction, self._direction)
         self.moves[axes] += MOVES_OF_TRIAL

@@ -48,8 +48,8 @@ PID_MEANINGS = MEANINGS | {
 
 HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
 _SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
-_MACHINE = ("device", "motor", "load", "supply", "travel", "copies", "searches", "interface", "channel", "nodes",
-            "bitrate", "lockstep", "pace")  # fmt: skip
+_MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "copies", "searches", "interface", "channel",
+            "nodes", "bitrate", "lockstep", "pace")  # fmt: skip
 
 
 def save(
@@ -85,7 +85,7 @@ def save(
     )
     for row in found.rows:
         values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
-        for axis, gains in enumerate(row.gains.tolist()):
+        for axis, gains in zip(axis_numbers(machine, len(row.gains)), row.gains.tolist(), strict=True):
             writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile, row.cause])
     write_whole(folder / "trials.csv", table.getvalue())
     lines = _lines({name: getattr(settings, name) for name in _SEARCH})
@@ -148,6 +148,17 @@ def load_options(path: str | Path) -> dict[str, Any]:
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
     machine.pop("pace", None)  # what lockstep says
     return {name: table[name] for name in _SEARCH if name in table} | machine
+
+
+def axis_numbers(machine: Mapping[str, Any], count: int) -> list[int]:
+    """Return what results call the axes of a search: chosen ones by their number among all axes of the nodes."""
+    from drive_env.devices import find_device
+
+    parts = machine.get("axis")
+    if not parts:
+        return list(range(count))
+    total = find_device(machine["device"]).num_axes
+    return [k // len(parts) * total + parts[k % len(parts)] for k in range(count)]
 
 
 def _lines(values: Mapping[str, Any]) -> list[str]:

@@ -21,15 +21,16 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
+from drive_env.trials.load_reading import LOWER, STALL_ANGLE, has_coolstep, lacks_load_detection
 from drive_env.trials.open_loop import encoder_age
+from drive_env.trials.working_moves import WorkingMoves
 from tuning.search.optimise import Settings
 from tuning.search.samplers import load
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
-from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
-from tuning.stepper.moves import WorkingMoves
-from tuning.stepper.obstacle import REACTION, can_load, prove_with_load
+from tuning.stepper.load_detection import LoadDetection
+from tuning.stepper.obstacle import REACTION, can_load, prove_with_load, why_not_loaded
 from tuning.stepper.result import StepperAxis, StepperResult, figure
 from tuning.target import Target, timed, told_lateness
 
@@ -41,6 +42,8 @@ Files = Callable[[StepperResult], AbstractContextManager[object]]
 
 WORKING_SHARE = 0.7  # of the motor's corner speed: the current is in full force, and the back-EMF clear
 ACCELERATION_SHARE = 0.3  # of the holding torque at the run current
+# Both, one after the other for axes that fail: with much friction, or little current, a motor loses steps at the first.
+WORK = ((WORKING_SHARE, ACCELERATION_SHARE), (0.5, 0.15), (0.35, 0.2))
 MOST_ACCELERATION = 2000.0  # rad/s^2
 PROFILE_SHARE = 0.95  # of the highest acceleration that the drive takes
 REACH_SHARE, LONGEST = 0.9, 100.0  # of the travel, and at most [rad]
@@ -88,41 +91,24 @@ def commission(
         before, roles = read_gains(target.drives), _roles(target)
         bench = TrialBench(watched)
         bench.identify()
-        speed = WORKING_SHARE * min(target.speed, target.motor.rated_speed)
         say("trying the currents", 0.15)
         gains, weak = _currents(bench)
-        moves = _moves(bench, gains)
-        detection = LoadDetection(watched.drives, target.motor, moves, gains, speed)
+        detection, proof_figures = _commissioned(bench, watched, gains, weak, say)
         found = detection.found
-        found.reject(weak, "it loses steps or goes into fault in trials with the motor's rated current")
-        short = np.abs(moves.reach) < moves.least_reach(speed)
-        for k in np.flatnonzero(short):
-            found.reject(
-                np.arange(target.num_axes) == k,
-                f"the travel is too short: {abs(moves.reach[k]):.2g} rad to go, and {moves.least_reach(speed)[k]:.2g} "
-                f"rad are needed for the load reading at {speed:.3g} rad/s; allow more with --travel",
-            )
-        if found.going().any():
-            say("finding the StallGuard threshold", 0.3)
-            detection.find_threshold()
-        if found.going().any() and has_coolstep(target.device):
-            say("finding the CoolStep setting", 0.6)
-            detection.find_coolstep()
-        if found.going().any():
-            say("proving", 0.8)
-            detection.prove()
-        proof_figures = _prove(watched, detection, moves, speed)
         if target.device.gains.loop_of_kind(LOAD_ANGLE) is not None and found.going().any():
             say("tuning the closed loop", 0.9)
             proof_figures |= tune_loop(watched, detection, roles)
         say("writing", 0.95)
         accepted = found.going()
-        _leave(bench, transaction, detection.gains, accepted, roles)
+        _leave(bench, transaction, detection, accepted, roles)
         kept = keep and bool(accepted.any()) and can_store(target)
+        settings = [_settings(k, transaction, target, roles) for k in range(target.num_axes)]
         result = StepperResult(
-            tuple(_axis(k, target, bench, before, detection, proof_figures) for k in range(target.num_axes)),
-            target.device.name, target.motor.name, target.machine, speed, clock.seconds, transaction.path, kept,
-            can_load(target),
+            tuple(
+                _axis(k, target, bench, before, detection, proof_figures, settings[k]) for k in range(target.num_axes)
+            ),
+            target.device.name, target.motor.name, target.machine, float(found.speed.max()), clock.seconds,
+            transaction.path, kept, can_load(target), target.axis_numbers,
         )  # fmt: skip
         with files(result):
             if kept:
@@ -130,6 +116,61 @@ def commission(
         transaction.commit(accepted)
     say("done", 1.0)
     return result
+
+
+def _commissioned(
+    bench: TrialBench, target: Target, gains: Integers, weak: Mask, say: Progress
+) -> tuple[LoadDetection, dict[str, Floats]]:
+    """Return what was found at the working speed; of axes that fail there at a lower one, which it says."""
+    detection, figures = _found_at(bench, target, gains, ~weak, WORK[0], say)
+    for k in np.flatnonzero(weak):
+        detection.found.reasons[k] = "it loses steps or goes into fault in trials with the motor's rated current"
+    for work in WORK[1:]:
+        left = ~detection.found.going() & ~weak
+        if not left.any():
+            break
+        drives = target.drives
+        drives.advance(REACTION)  # one that was given up may be in fault, and brakes
+        bench.trials.recover(left)
+        write_gains(drives, gains, left)
+        other, measured = _found_at(bench, target, gains, left, work, say)
+        better = left & other.found.going()
+        for k in np.flatnonzero(better):
+            other.found.reservations[k].append(
+                f"the working speed is {other.found.speed[k]:.3g} rad/s, with ramps of {work[1]:g} of the holding "
+                f"torque: at {detection.found.speed[k]:.3g} rad/s {detection.found.reasons[k]}"
+            )
+        detection.take(other, better)
+        figures = {name: np.where(better, measured[name], values) for name, values in figures.items()}
+    return detection, figures
+
+
+def _found_at(
+    bench: TrialBench, target: Target, gains: Integers, where: Mask, work: tuple[float, float], say: Progress
+) -> tuple[LoadDetection, dict[str, Floats]]:
+    """Find and prove the settings of some axes at a share of the speed, by ramps of a share of the torque."""
+    speed = work[0] * min(target.speed, target.motor.rated_speed)
+    moves = _moves(bench, gains, work[1])
+    detection = LoadDetection(target.drives, target.motor, moves, gains, speed)
+    found = detection.found
+    found.reject(~where, "it takes no part in these moves")
+    short = np.abs(moves.reach) < moves.least_reach(speed)
+    for k in np.flatnonzero(short):
+        found.reject(
+            np.arange(target.num_axes) == k,
+            f"the travel is too short: {abs(moves.reach[k]):.2g} rad to go, and {moves.least_reach(speed)[k]:.2g} "
+            f"rad are needed for the load reading at {speed:.3g} rad/s; allow more with --travel",
+        )
+    if found.going().any():
+        say("finding the StallGuard threshold", 0.3)
+        detection.find_threshold()
+    if found.going().any() and has_coolstep(target.device):
+        say("finding the CoolStep setting", 0.6)
+        detection.find_coolstep()
+    if found.going().any():
+        say("proving", 0.8)
+        detection.prove()
+    return detection, _prove(target, detection, moves, speed)
 
 
 def _currents(bench: TrialBench) -> tuple[Integers, Mask]:
@@ -144,9 +185,9 @@ def _currents(bench: TrialBench) -> tuple[Integers, Mask]:
     return gains, weak
 
 
-def _moves(bench: TrialBench, gains: Integers) -> WorkingMoves:
+def _moves(bench: TrialBench, gains: Integers, share: float) -> WorkingMoves:
     target = bench.target
-    torque = ACCELERATION_SHARE * holding_torque(target.motor, run_and_standby(target.device, gains)[0])
+    torque = share * holding_torque(target.motor, run_and_standby(target.device, gains)[0])
     reach = np.clip(REACH_SHARE * np.nan_to_num(bench.reach, posinf=LONGEST, neginf=-LONGEST), -LONGEST, LONGEST)
     # The drive's profiles end somewhere, too.
     entry = target.device.new_dictionary().find(cia402.PROFILE_ACCELERATION)
@@ -168,8 +209,8 @@ def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed:
     if not can_load(target):
         for k in np.flatnonzero(found.going()):
             found.reservations[k].append(
-                "stop on stall was not proved with a load: only an emulated machine of one axis can be loaded; hold "
-                f"the shaft in a slow move and see whether it stops (above {found.stop_speed[k]:.3g} rad/s)"
+                f"stop on stall was not proved with a load and an obstacle: {why_not_loaded(target)}; hold the shaft "
+                f"in a slow move and see whether it stops (above {found.stop_speed[k]:.3g} rad/s)"
             )
         return {"lost": lost}
     going = found.going()
@@ -205,17 +246,23 @@ def _roles(target: Target) -> dict[Role, tuple[int, int]]:
 def _leave(
     bench: TrialBench,
     transaction: Transaction,
-    gains: Integers,
+    detection: LoadDetection,
     accepted: Mask,
     roles: dict[Role, tuple[int, int]],
 ) -> None:
-    """Leave the accepted axes with their settings and all else as it was, disabled."""
-    drives = bench.target.drives
+    """Leave the accepted axes with their settings and all else as it was, disabled.
+
+    A stall above the speed of 20A4h stops them from then on, as it was found; where CoolStep is off its speed is what
+    it was.
+    """
+    drives, gains = bench.target.drives, detection.gains
+    lower = bench.target.device.gains.column(*LOWER)
     everywhere = np.ones(bench.target.num_axes, bool)
     if bench.trials.down().any():  # one that was given up is in fault
         drives.advance(REACTION)
         bench.trials.recover(everywhere)
     motion.disable(drives, where=~bench.trials.down())
+    speeds = {role: drives.read(role) for role in roles}
     bench.trials.leave()
     if not accepted.any():
         return
@@ -223,7 +270,10 @@ def _leave(
     for k, values in enumerate(transaction.before.axes):
         wanted = dict(values)
         wanted |= {key: int(gains[k, column]) for column, key in enumerate(bench.target.device.gains.keys)}
-        wanted |= {key: int(drives.read(role)[k]) for role, key in roles.items()}
+        is_cooled = lower is not None and gains[k, lower] > 0
+        wanted |= {
+            key: int(speeds[role][k]) for role, key in roles.items() if role is not Role.COOLSTEP_SPEED or is_cooled
+        }
         axes.append(wanted)
     restore(drives, replace(transaction.before, axes=tuple(axes)), accepted, whole=False)
 
@@ -235,6 +285,7 @@ def _axis(
     before: Integers,
     detection: LoadDetection,
     proof: dict[str, Floats],
+    settings: dict[str, dict[str, int]],
 ) -> StepperAxis:
     found, names, constant = detection.found, target.device.gains.names, target.motor.torque_constant
     reason = found.reasons[k]
@@ -247,6 +298,7 @@ def _axis(
         "inertia [kg m^2]": figure(identified.inertia[k]),
         "dry friction [N m]": figure(identified.coulomb[k] * constant),
         "constant load [N m]": figure(identified.offset[k] * constant),
+        "working speed [rad/s]": figure(found.speed[k]),
         "run current [A]": figure(float(amplitude(target.device, after[run]))),
         "load angle at the working speed [deg electrical]": figure(float(np.degrees(found.angle[k]))),
         "load reading of the axis' own load": figure(found.margin[k]),
@@ -258,5 +310,17 @@ def _axis(
     figures |= {name: figure(values[k]) for name, values in proof.items() if name in LOOP_FIGURES}
     return StepperAxis(
         dict(zip(names, map(int, before[k]), strict=True)), dict(zip(names, map(int, after), strict=True)), reason,
-        (*found.reservations[k], *filter(None, [told_lateness(target.drives)])), figures,
+        (*found.reservations[k], *filter(None, [told_lateness(target.drives)])), figures, settings,
     )  # fmt: skip
+
+
+def _settings(
+    k: int, transaction: Transaction, target: Target, roles: dict[Role, tuple[int, int]]
+) -> dict[str, dict[str, int]]:
+    """Return what an axis had, and has now, of the objects beside the gains; one that is given up has what it had."""
+    return {
+        f"{index:04X}:{sub:02X}": {
+            "before": transaction.before.axes[k][index, sub], "after": int(target.drives.read(role)[k]),
+        }
+        for role, (index, sub) in roles.items()
+    }  # fmt: skip

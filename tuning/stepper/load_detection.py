@@ -13,12 +13,11 @@ falls to 0 there, before the motor falls out of step at 90 degrees. CoolStep low
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.devices import Device
 from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, device_of
@@ -26,40 +25,36 @@ from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import run_and_standby
-from tuning.stepper.moves import Steady, WorkingMoves
+from drive_env.trials.load_reading import (
+    DOWN,
+    FULL_READING,
+    LEAST,
+    LIFT,
+    LOWER,
+    SLOW,
+    STALL_ANGLE,
+    THRESHOLD,
+    UP,
+    WIDTH,
+    falls,
+    flux,
+    has_coolstep,
+    volts,
+)
+from drive_env.trials.working_moves import Steady, WorkingMoves
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-THRESHOLD = ("load detection", "threshold")  # loop and part of the gain
-LOWER, WIDTH, LEAST, DOWN, UP = (("CoolStep", part) for part in ("lower", "width", "least", "down", "up"))
-STALL_ANGLE = math.radians(60.0)  # of the load angle, at which the reading is to fall to 0
 COOL_ANGLE = math.radians(30.0)  # down to which CoolStep takes current away
-SLOW = 0.7  # of the working speed, at which the reading is compared
-FULL_READING = 1023.0
 CLEAR = 3.0  # standard deviations, by which a reading must be above 0
 LEAST_MARGIN = 16.0  # counts of the reading, that an axis' own load must be above 0
 SHARE_AT_STOP_SPEED = 0.5  # of the margin, that is left at the speed above which a stall stops
 LEAST_STOP_SPEED = 0.5  # of the working speed
-LIFT = 16  # steps of the threshold, by which a reading of 0 is lifted
 COOL_UNIT = 32.0  # counts of the reading of a step of CoolStep's thresholds
 COOL_WIDTH, COOL_DOWN, COOL_UP = 2, 2, 3  # width of the band, 2 readings for a step down, 8 steps up for one below it
 COOL_RAISES = 3  # of the lower threshold, where steps were lost
-
-
-def lacks_load_detection(device: Device) -> str:
-    """Return what a device lacks for its load detection to be set, "" for nothing."""
-    if device.gains.column(*THRESHOLD) is None:
-        return "its gains.toml has no threshold of a load detection"
-    missing = [role.value for role in (Role.LOAD_VALUE, Role.STALL_SPEED) if role not in device.roles]
-    return f"it has no {' and no '.join(missing)}" if missing else ""
-
-
-def has_coolstep(device: Device) -> bool:
-    """Return whether a device's current can follow the load."""
-    parts = (LOWER, WIDTH, LEAST, DOWN, UP)
-    return Role.COOLSTEP_SPEED in device.roles and all(device.gains.column(*part) is not None for part in parts)
 
 
 @dataclass
@@ -67,10 +62,12 @@ class Found:
     """What was found of the axes, (num_axes,) each; nan and 0 where nothing was.
 
     per_volt: Counts of the reading of a volt given back. margin: Reading of the axis' own load with the threshold.
-    wanted: What that was to be. angle: Load angle at the working speed [rad]. stop_speed: Above which a stall stops
-    [rad/s]. saved: Share of the current that CoolStep took away, by the load angle. reasons: Why axes were given up.
+    wanted: What that was to be. speed: The working speed [rad/s]. angle: Load angle at the working speed [rad].
+    stop_speed: Above which a stall stops [rad/s]. saved: Share of the current that CoolStep took away, by the load
+    angle. reasons: Why axes were given up.
     """
 
+    speed: Floats
     per_volt: Floats
     margin: Floats
     wanted: Floats
@@ -84,8 +81,8 @@ class Found:
     @classmethod
     def nothing(cls, count: int) -> Found:
         """Return it before anything was found."""
-        a, b, c, d, e, f, g = (np.full(count, np.nan) for _ in range(7))
-        return cls(a, b, c, d, e, f, g, [""] * count, [[] for _ in range(count)])
+        s, a, b, c, d, e, f, g = (np.full(count, np.nan) for _ in range(8))
+        return cls(s, a, b, c, d, e, f, g, [""] * count, [[] for _ in range(count)])
 
     def going(self) -> Mask:
         """Return which axes have not been given up."""
@@ -103,9 +100,22 @@ class LoadDetection:
     def __init__(self, drives: Drives, motor: Motor, moves: WorkingMoves, gains: Integers, speed: float) -> None:
         self.gains = gains.copy()
         self.found = Found.nothing(drives.num_axes)
+        self.found.speed[:] = speed
+        moves.trials.acts_by_load = True  # from now on that is what is set
         self._drives, self._motor, self._moves, self._speed = drives, motor, moves, speed
         self._known: GainSet = device_of(drives).gains
         self._run, _ = run_and_standby(device_of(drives), gains)
+
+    def take(self, other: LoadDetection, where: Mask) -> None:
+        """Take what was found of some axes in other moves."""
+        self.gains = np.where(where[:, None], other.gains, self.gains)
+        self._run = np.where(where, other._run, self._run)
+        for row in fields(Found):
+            own, new = getattr(self.found, row.name), getattr(other.found, row.name)
+            if isinstance(own, list):
+                setattr(self.found, row.name, [b if take else a for a, b, take in zip(own, new, where, strict=True)])
+            else:
+                setattr(self.found, row.name, np.where(where, new, own))
 
     # --- the threshold ------------------------------------------------------------------------------------------------
     def find_threshold(self) -> None:
@@ -118,15 +128,17 @@ class LoadDetection:
         slow = self._lifted(SLOW * self._speed)
         fast = self._run_moves(self._speed)
         found.angle = fast.angle
-        volts = self._volts(self._speed, fast.angle) - self._volts(SLOW * self._speed, slow.angle)
-        found.per_volt = (fast.reading - slow.reading) / volts
+        given = volts(self._motor, self._run, self._speed, fast.angle) - volts(
+            self._motor, self._run, SLOW * self._speed, slow.angle
+        )
+        found.per_volt = (fast.reading - slow.reading) / given
         found.reject(
             ~(found.per_volt > 0.0) | (fast.reading >= FULL_READING),
             "the load reading does not rise with the speed, as the back-EMF has it: it tells nothing of the load here; "
             "let the axis go faster, and check that the chopper is a spread cycle",
         )
-        per_angle = found.per_volt * self._flux() * self._speed
-        found.wanted = per_angle * (_falls(fast.angle) - _falls(STALL_ANGLE))
+        per_angle = found.per_volt * flux(self._motor, self._run) * self._speed
+        found.wanted = per_angle * (falls(fast.angle) - falls(STALL_ANGLE))
         self._raise_threshold(fast)
         slope = (fast.reading - slow.reading) / ((1.0 - SLOW) * self._speed)
         stop = self._speed - SHARE_AT_STOP_SPEED * found.margin / slope
@@ -179,9 +191,9 @@ class LoadDetection:
     def find_coolstep(self) -> None:
         """Set CoolStep so that it lowers the current of the axis' own load without a lost step, and prove it."""
         found = self.found
-        falls = found.per_volt * self._flux() * self._speed * (_falls(COOL_ANGLE) - _falls(STALL_ANGLE))
+        counts = found.per_volt * flux(self._motor, self._run) * self._speed * (falls(COOL_ANGLE) - falls(STALL_ANGLE))
         highest = self._known.rows[self._column(LOWER)].highest
-        lower = np.clip(np.ceil(np.nan_to_num(falls, nan=COOL_UNIT) / COOL_UNIT), 1, highest)
+        lower = np.clip(np.ceil(np.nan_to_num(counts, nan=COOL_UNIT) / COOL_UNIT), 1, highest)
         for part, value in ((WIDTH, COOL_WIDTH), (LEAST, 0), (DOWN, COOL_DOWN), (UP, COOL_UP)):
             self._set(part, np.full(len(lower), value))
         self._write_speed(Role.COOLSTEP_SPEED, np.where(found.going(), found.stop_speed, 0.0))
@@ -230,16 +242,6 @@ class LoadDetection:
             self.found.reject(failed, f"it went into fault at {speed:.3g} rad/s")
         return steady
 
-    def _volts(self, speed: float, angle: Floats) -> Floats:
-        """Return what a falling phase gives back [V], but for the resistance, which is alike at all speeds."""
-        motor, i = self._motor, self._run
-        return np.asarray(speed * (motor.L_q * i * motor.n_p + self._flux() * _falls(angle)))
-
-    def _flux(self) -> Floats:
-        """Return the back-EMF constant at the run current [V s/rad]."""
-        motor = self._motor
-        return np.asarray(motor.torque_constant / np.sqrt(1.0 + motor.saturation * self._run**2))
-
     def _column(self, part: tuple[str, str]) -> int:
         column = self._known.column(*part)
         assert column is not None, f"a device with load detection has {' '.join(part)}"
@@ -259,7 +261,3 @@ class LoadDetection:
         key = device_of(drives).roles[role]
         raw = np.ceil(speed * self._moves.increments * per_increment(drives, key)).astype(np.int64)
         drives.write(role, raw, where=self.found.going())
-
-
-def _falls(angle: Floats | float) -> Floats:
-    return np.asarray(np.cos(angle) - np.sin(angle))

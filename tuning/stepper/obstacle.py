@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +12,8 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.drives.interface import machine_of
 from drive_env.phase_current import LOAD_SHARE, holding_torque
-from tuning.stepper.moves import SETTLE, Steady, WorkingMoves
+from drive_env.trials.working_moves import SETTLE, Steady, WorkingMoves
+from tuning.identify.linked_axes import are_independent
 from tuning.stop_causes import told_causes
 from tuning.target import Target
 
@@ -38,35 +41,42 @@ class ObstacleProof:
 
 
 def can_load(target: Target) -> bool:
-    """Return whether a torque can be put on every axis by itself: emulated machines of one axis."""
-    return target.drives.machine is not None and target.axes_per_machine == 1
+    """Return whether a torque can be put on every axis by itself: emulated machines whose axes move independently."""
+    from mechanics.shaft import one
+
+    machine = target.drives.machine
+    return machine is not None and are_independent(one(machine.drives.load))
+
+
+def why_not_loaded(target: Target) -> str:
+    """Return why no torque can be put on an axis by itself."""
+    if target.drives.machine is None:
+        return "nothing puts a load on an axis here"
+    return f"the axes of {target.machine} move one another, so that no load is one axis' alone"
 
 
 def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floats, where: Mask) -> ObstacleProof:
     """Move with the acceptable load, then against an obstacle; the axes are enabled again afterwards.
 
     Args:
-        target: Emulated machines of one axis.
+        target: Emulated machines, as `can_load` has them.
         moves: Moves at the working speed.
         speed: That [rad/s].
         run: Amplitudes of the run current [A].
         where: Axes that take part.
     """
-    machine, drives, motor = machine_of(target.drives), target.drives, target.motor
-    against = -np.sign(moves.reach) / _lever(target)
-    calm = np.asarray(machine.load_torque, float).copy()
-
+    drives, motor = target.drives, target.motor
+    against = -np.sign(moves.reach)
     ramp = float((speed / moves.acceleration).max()) + SETTLE
 
     def with_torque(torque: Floats, begin: float, rise: float) -> Steady:
-        def load(leg: int, t: float) -> None:
-            share = float(np.clip((t - begin) / rise, 0.0, 1.0)) if leg == 0 else 0.0
-            machine.load_torque = calm + np.where(where, share * against * torque, 0.0)
+        with _loading(target) as push:
 
-        try:
+            def load(leg: int, t: float) -> None:
+                share = float(np.clip((t - begin) / rise, 0.0, 1.0)) if leg == 0 else 0.0
+                push(np.where(where, share * against * torque, 0.0))
+
             return moves.run(speed, where, load, until_stopped=True)
-        finally:
-            machine.load_torque = calm
 
     # A load that comes by and by: the rotor would swing in its field by a sudden one.
     loaded = with_torque(np.full(target.num_axes, LOAD_SHARE * motor.rated_torque), ramp, RISE)
@@ -84,6 +94,25 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
     lost = np.abs(moves.trials.shift() - before) / tooth
     enabled = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     return ObstacleProof(where & ~loaded.failed, where & blocked.stopped & stalled & enabled, np.rint(lost))
+
+
+@contextmanager
+def _loading(target: Target) -> Iterator[Callable[[Floats], None]]:
+    """Give what puts torques on the axes as their rotors see them: of a machine of one axis where its load is."""
+    machine = machine_of(target.drives)
+    if target.axes_per_machine > 1:
+        with machine.pushed() as push:
+            yield push
+        return
+    lever, calm = _lever(target), np.asarray(machine.load_torque, float).copy()
+
+    def load(torque: Floats) -> None:
+        machine.load_torque = calm + torque / lever
+
+    try:
+        yield load
+    finally:
+        machine.load_torque = calm
 
 
 def _lever(target: Target) -> Floats:

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class StepperAxis:
         reason: Why it was rejected; "" where it was not.
         reservations: What could not be proved, or is near a limit.
         figures: What was measured, by name with its unit.
+        settings: Objects beside the gains, by "index:sub" (hexadecimal): raw values before and after.
     """
 
     before: dict[str, int]
@@ -37,6 +38,7 @@ class StepperAxis:
     reason: str
     reservations: tuple[str, ...]
     figures: dict[str, float | None]
+    settings: dict[str, dict[str, int]] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
@@ -60,7 +62,8 @@ class StepperResult:
         drive_seconds: Time that passed on the drives [s].
         file: The state before.
         kept: Whether drives on a bus stored the settings.
-        proved_with_load: Whether load and obstacle were put on the axis: emulated machines of one axis only.
+        numbers: What each axis is called; its place by default.
+        proved_with_load: Whether load and obstacle were put on the axis: emulated machines of independent axes only.
     """
 
     axes: tuple[StepperAxis, ...]
@@ -72,6 +75,7 @@ class StepperResult:
     file: Path
     kept: bool
     proved_with_load: bool
+    numbers: tuple[int, ...] = ()
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
@@ -98,9 +102,10 @@ class StepperResult:
                     "reservations": list(axis.reservations),
                     "before": axis.before,
                     "after": axis.after,
+                    "settings": axis.settings,
                     "figures": axis.figures,
                 }
-                for k, axis in enumerate(self.axes)
+                for k, axis in zip(self.numbers or range(len(self.axes)), self.axes, strict=True)
             ],
             "versions": versions(),
         }

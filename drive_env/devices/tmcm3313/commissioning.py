@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from drive_env.devices.chopper_rule import chopper_settings
+
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
@@ -66,6 +68,7 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
         "Maximum current": run,
         "Standby current": round(STANDBY * run),
         "Setting delay": 20,
+        **chopper_settings(motor, device.current_full_scale * step / STEPS, device.supply_of(motor)),
         "Position encoder resolution.Encoder increments": motor.encoder_counts,
         "Profile velocity": round(REVOLUTIONS * scale),
         "Profile acceleration": ramp,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from drive_env.devices.chopper_rule import chopper_settings
+
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
@@ -24,13 +26,15 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
     scale = full_steps * 2**MICROSTEPS
     # The last of the settings that make a step of the current which is not above the rated one.
     share = min(motor.rated_current / device.current_full_scale, 1.0)
-    run = max(math.floor(STEPS * share), 1) * (FULL + 1) // STEPS - 1
+    step = max(math.floor(STEPS * share), 1)
+    run = step * (FULL + 1) // STEPS - 1
     return {
         "Microstep resolution": MICROSTEPS,
         "Full step resolution": full_steps,
         "Maximum current": run,
         "Standby current": round(STANDBY * run),
         "Setting delay": 20,
+        **chopper_settings(motor, device.current_full_scale * step / STEPS, device.supply_of(motor)),
         "Position encoder resolution.Encoder increments": motor.encoder_counts,
         "Profile velocity": round(REVOLUTIONS * scale),
         "Profile acceleration": round(RAMP * scale),

@@ -1,0 +1,229 @@
+"""Chosen axes of some drives as drives of their own: the others are never commanded, and their parameters stay.
+
+A module may have more axes than motors. What is done to all axes of such drives is done to the chosen ones; each keeps
+its number (`axis_numbers`), by which results and errors call it. On a bus, process data are still those of whole nodes:
+where rows are played, the axes left out get the value that they have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drive_env.drives.arguments import checked_mask
+from drive_env.drives.interface import Drives, Integers, Mask
+from drive_env.drives.trace import Trace
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.dictionary.entries import ObjectName
+    from drive_env.drives.emergency import EmergencyMessage
+    from drive_env.drives.observed import Observer
+    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.envelope import Envelope
+    from drive_env.safety.limits import Limits
+
+_PER_AXIS_LIMITS = ("velocity", "current", "following_error")
+
+
+def chosen_parts(axes: Iterable[int], count: int, name: str) -> tuple[int, ...]:
+    """Return axes of a module, each once and in order.
+
+    Args:
+        axes: Their numbers, from 0.
+        count: How many a module has.
+        name: What it is, for the message.
+
+    Raises:
+        ValueError: For an axis that it does not have, or none at all.
+    """
+    chosen = tuple(sorted(set(axes)))
+    for axis in chosen:
+        if not 0 <= axis < count:
+            there = "1 axis: 0" if count == 1 else f"{count} axes: 0 to {count - 1}"
+            raise ValueError(f"--axis {axis}: a {name} has {there}")
+    if not chosen:
+        raise ValueError(f"no axis is chosen; name one or several of a {name}, from 0")
+    return chosen
+
+
+class ChosenAxes:
+    """Chosen axes of drives, with the interface of drives.
+
+    Args:
+        drives: The drives; they are closed with these.
+        axes: Which of their axes, rising.
+
+    Raises:
+        ValueError: For an axis that they do not have.
+    """
+
+    machine = None  # the emulated machine moves by all of its axes, and is the others', too
+
+    def __init__(self, drives: Drives, axes: Sequence[int]) -> None:
+        self._drives = drives
+        self._axes = np.array(chosen_parts(axes, drives.num_axes, "set of drives"), np.int64)
+        self.num_axes = len(self._axes)
+        self.axis_numbers = tuple(drives.axis_numbers[k] for k in self._axes)
+        self._others: dict[ObjectName, Integers] = {}  # what axes left out have of objects that are played
+        self._safety = None
+        if drives.safety is not None:
+            left_out = set(range(drives.num_axes)) - set(self._axes.tolist())
+            drives.safety.leave_alone(left_out)
+            self._safety = _ChosenOfEnvelope(drives.safety, self._axes, drives.num_axes)
+
+    @property
+    def device(self) -> Device | None:
+        """What the drives are."""
+        return self._drives.device
+
+    @property
+    def bus(self) -> BusDrives | None:
+        """The drives of the bus with all axes of its nodes, of which these are `axis_numbers`."""
+        return self._drives.bus
+
+    @property
+    def safety(self) -> Envelope | None:
+        """What watches over drives that may be real; limits are those of the chosen axes."""
+        return cast("Envelope | None", self._safety)
+
+    @property
+    def time_waits(self) -> bool:
+        """Whether time stands still until it is asked to pass."""
+        return self._drives.time_waits
+
+    @property
+    def observers(self) -> tuple[Observer, ...]:
+        """Who looks at the drives, the innermost first."""
+        return self._drives.observers
+
+    def read(self, name: ObjectName) -> Integers:
+        """Return an object of every chosen axis."""
+        bus = self._drives.bus
+        if bus is not None and bus is self._drives:  # an SDO each: those of the others would only take time
+            return bus.read_of(name, self._axes.tolist())
+        return np.asarray(self._drives.read(name)[self._axes])
+
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
+        """Write an object of every chosen axis, or of some of them."""
+        mask = np.zeros(self._drives.num_axes, bool)
+        mask[self._axes[checked_mask(where, self.num_axes)]] = True
+        if isinstance(value, str) or np.ndim(value) == 0:
+            self._drives.write(name, value, where=mask)
+            return
+        given = np.asarray(value)
+        if given.shape != (self.num_axes,):
+            raise ValueError(f"{given.shape} values are given for {self.num_axes} axes; give one for all, or one each")
+        whole = np.full(self._drives.num_axes, given[0], given.dtype)  # what an axis left out has here is not written
+        whole[self._axes] = given
+        self._drives.write(name, whole, where=mask)
+
+    def advance(self, duration: float) -> None:
+        """Let time pass [s]."""
+        self._drives.advance(duration)
+
+    def record(
+        self,
+        objects: ObjectName | Sequence[ObjectName],
+        duration: float,
+        play: Mapping[Any, ArrayLike] | None = None,
+        period: float = 0.001,
+    ) -> Trace:
+        """Let time pass while objects of the chosen axes are recorded and played."""
+        rows = {name: self._rows(name, np.asarray(values)) for name, values in (play or {}).items()}
+        return self._drives.record(objects, duration, rows or None, period).of_axes(self._axes.tolist())
+
+    def _rows(self, name: ObjectName, values: Integers) -> Integers:
+        """Return rows for all axes: those left out get what they have."""
+        if name not in self._others:
+            self._others[name] = np.asarray(self._drives.read(name))
+        whole = np.tile(self._others[name], (len(values), 1))
+        whole[:, self._axes] = values if values.ndim == 2 else values[:, None]
+        return whole
+
+    def emergencies(self) -> list[EmergencyMessage]:
+        """Return what the chosen axes have said by themselves since the last call, by their place among these."""
+        place = {int(axis): k for k, axis in enumerate(self._axes)}
+        told = self._drives.emergencies()
+        return [message._replace(axis=place[message.axis]) for message in told if message.axis in place]
+
+    def reset_node(self, where: Mask | None = None) -> None:
+        """Refuse: a node restarts with all of its axes."""
+        raise ValueError("a node is reset with all its axes, and some are left out here; open it with all of them")
+
+    def close(self) -> None:
+        """Release what the drives hold."""
+        self._drives.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._drives.__exit__(kind, error, traceback)
+
+
+class _ChosenOfEnvelope:
+    """The envelope of drives, with limits of the chosen axes; axes left out have their drives' own."""
+
+    def __init__(self, envelope: Envelope, axes: Integers, count: int) -> None:
+        self._whole = envelope
+        self._axes = axes.tolist()
+        self._count = count
+        self._limits = self._chosen(envelope.limits)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._whole, name)
+
+    @property
+    def limits(self) -> Limits:
+        return self._limits
+
+    @limits.setter
+    def limits(self, limits: Limits) -> None:
+        self._whole.limits = self._of_all(limits)
+        self._limits = limits
+
+    def change(self, limits: Limits) -> None:
+        limits.check_axes(len(self._axes))
+        self._whole.change(self._of_all(limits))
+        self._limits = limits
+
+    def _chosen(self, limits: Limits) -> Limits:
+        """Return limits of all axes as those of the chosen ones."""
+        return _each(limits, lambda value: [value[axis] for axis in self._axes])
+
+    def _of_all(self, limits: Limits) -> Limits:
+        """Return limits of the chosen axes as those of all."""
+
+        def spread(value: Sequence[float | None]) -> list[float | None]:
+            whole: list[float | None] = [None] * self._count
+            for axis, one in zip(self._axes, value, strict=True):
+                whole[axis] = one
+            return whole
+
+        def one_each(value: Any) -> Any:
+            return None if value is None else spread([value] * len(self._axes) if np.ndim(value) == 0 else value)
+
+        low, high = (None, None) if limits.position is None else map(one_each, limits.position)
+        return replace(
+            limits,
+            position=None if limits.position is None else (low, high),
+            **{name: one_each(getattr(limits, name)) for name in _PER_AXIS_LIMITS},
+        )
+
+
+def _each(limits: Limits, chosen: Any) -> Limits:
+    """Return limits with those that are given for each axis replaced."""
+
+    def of(value: Any) -> Any:
+        return value if value is None or np.ndim(value) == 0 else chosen(value)
+
+    position = None if limits.position is None else (of(limits.position[0]), of(limits.position[1]))
+    return replace(limits, position=position, **{name: of(getattr(limits, name)) for name in _PER_AXIS_LIMITS})

@@ -1,0 +1,182 @@
+"""Chosen axes of drives: what is tuned of a module on which motors are wired to some axes alone.
+
+The others of such a module have no motor: a phase carries no current, and an axis that is enabled goes into fault.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from test_auto_command import drive_tune
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
+from drive_env.bus.hub import Hub
+from drive_env.bus.server import Server
+from drive_env.bus.world import World
+from drive_env.drives.chosen_axes import ChosenAxes
+from tuning.snapshot import load_snapshot
+from tuning.target import emulated
+
+AXES, WIRED = 6, (1, 3)
+LEFT_OUT = [axis for axis in range(AXES) if axis not in WIRED]
+
+
+def partly_wired(**options):
+    """Return the six axes of a TMCM-6212 of which two have a motor."""
+    no_motor = np.array([float(axis not in WIRED) for axis in range(AXES)])
+    parameters = {"motor.open_a": no_motor, "motor.open_b": no_motor}
+    return EmulatedDrives("tmcm6212", "inertia", num_machines=AXES, num_threads=1, parameters=parameters, **options)
+
+
+class Enabled:
+    """Takes note of the axes that are ever in operation enabled, in the emulator itself."""
+
+    def __init__(self, drives):
+        self.ever = np.zeros(AXES, bool)
+        self._drives, self._advance = drives, drives.advance
+        drives.advance = self._look
+
+    def _look(self, duration):
+        self._advance(duration)
+        self.ever |= cia402.matches(self._drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+
+
+def settings_of(drives, axis):
+    """Return what is set on an axis, as the emulator has it."""
+    from tuning.snapshot import take_of
+
+    return dict(take_of(drives, {}).axes[axis])
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    """The module as node 1 of a hub, in lockstep: the emulator, who was enabled, and the options that name it."""
+    monkeypatch.chdir(tmp_path)
+    world = World(lockstep=True)
+    drives = partly_wired()
+    drives.advance(0.001)  # compiles
+    enabled = Enabled(drives)
+    world.add(drives, [1])
+    hub = Hub()
+    options = ["--bus", "--device", "tmcm6212", "--interface", "slcan", "--channel", hub.channel, "--lockstep",
+               "--travel", "free", "--yes"]  # fmt: skip
+    with Server(world, hub):
+        yield drives, enabled, options
+    world.close()
+
+
+@pytest.mark.slow
+def test_auto_on_the_axes_that_have_motors_is_accepted_and_lets_the_others_alone(served, tmp_path):
+    drives, enabled, options = served
+    before = [settings_of(drives, axis) for axis in LEFT_OUT]
+    done = drive_tune("auto", *options, "--axis", "3", "--axis", "1", "--out", tmp_path / "auto", "--json")
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert [axis["axis"] for axis in told["axes"]] == list(WIRED)
+    assert all(axis["verdict"].startswith("accepted") for axis in told["axes"])
+    assert told["machine"].endswith("node 1, axis 1, 3")
+    assert np.flatnonzero(enabled.ever).tolist() == list(WIRED)
+    assert [settings_of(drives, axis) for axis in LEFT_OUT] == before
+    for axis in told["axes"]:
+        assert settings_of(drives, axis["axis"])[0x2003, 0] == axis["after"]["run_current"]
+        assert axis["after"] != axis["before"]
+    snapshot = load_snapshot(told["snapshot"])
+    assert len(snapshot.axes) == 2 and snapshot.bus["axes"] == list(WIRED)
+    undone = drive_tune("undo", told["snapshot"], "--yes", "--json")
+    assert undone.exit_code == 0, undone.output
+    assert {row["axis"] for row in json.loads(undone.stdout)["changed"]} == set(WIRED)
+    for axis in told["axes"]:
+        assert settings_of(drives, axis["axis"])[0x2003, 0] == axis["before"]["run_current"]
+
+
+@pytest.mark.parametrize("command", [("auto",), ("optimise",), ("identify",), ("response",), ("rules",)])
+def test_an_axis_that_is_not_there_names_which_there_are(command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    done = drive_tune(*command, "--device", "tmcm6212", "--node", "1", "--travel", "free", "--yes", "--axis", "6")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == "drive-tune: --axis 6: a tmcm6212 has 6 axes: 0 to 5\n"
+
+
+def test_axes_of_a_machine_that_pull_at_one_thing_are_not_parted():
+    with pytest.raises(ValueError, match=r"--axis 1: the axes of gantry pull at one thing.*leave --axis out"):
+        emulated("tmcm6212", "gantry", chosen=(1,))
+    with pytest.raises(ValueError, match=r"--axis 1: a load inertia has 1 axis: 0"):
+        emulated("tmcm6212", "inertia", chosen=(1,))
+
+
+# --- the view ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("on_bus", [False, True])
+def test_what_is_done_to_chosen_axes_is_done_to_no_other(on_bus):
+    whole = partly_wired()
+    world = World(lockstep=True)
+    bus = None
+    drives = whole
+    if on_bus:
+        world.add(whole, [1])
+        bus = WorldBus(world)
+        drives = CanDrives("tmcm6212", bus=bus, pace="lockstep", safety=Limits(silence=5.0))
+    before = [settings_of(whole, axis) for axis in LEFT_OUT]
+    with ChosenAxes(drives, WIRED) as chosen:
+        assert chosen.num_axes == 2 and list(chosen.axis_numbers) == list(WIRED)
+        chosen.write(0x2003, [100, 120])
+        assert chosen.read(0x2003).tolist() == [100, 120]
+        assert whole.read(0x2003)[list(WIRED)].tolist() == [100, 120]
+        if on_bus:
+            chosen.safety.change(Limits(velocity=[2e6, 1e6], current=None, silence=5.0))
+            assert drives.safety.limits.velocity == [None, 2e6, None, 1e6, None, None]
+            assert chosen.safety.limits.velocity == [2e6, 1e6]
+        motion.enable(chosen, mode="pv")
+        chosen.write(0x60FF, [51200, 25600])
+        trace = chosen.record([0x606C, 0x6041], 0.3)
+        assert trace[0x606C].shape == (300, 2)
+        np.testing.assert_allclose(trace[0x606C][-1], [51200, 25600], rtol=0.05)
+        assert chosen.emergencies() == []
+        only = np.array([False, True])
+        motion.quick_stop(chosen, where=only)
+        chosen.advance(0.2)
+        live = cia402.matches(whole.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+        assert np.flatnonzero(live).tolist() == [1]
+        motion.disable(chosen)
+    if on_bus:
+        bus.shutdown()
+        world.close()
+    assert [settings_of(whole, axis) for axis in LEFT_OUT] == before
+    whole.close()
+
+
+def test_errors_call_an_axis_by_its_own_number():
+    with partly_wired() as whole:
+        chosen = ChosenAxes(whole, (2, 3))  # 2 has no motor
+        with pytest.raises(RuntimeError, match=r"axis 2 "):
+            motion.enable(chosen, mode="pv")
+            chosen.write(0x60FF, 51200)
+            chosen.advance(0.3)
+            motion.move_to(chosen, 1000)
+        assert {message.axis for message in chosen.emergencies()} == {0}
+
+
+# --- drive-env export -------------------------------------------------------------------------------------------------
+def test_export_of_one_axis_has_its_values_and_the_nodes_in_process_and_on_a_bus():
+    from drive_env.master.commissioned_eds import commissioned_values
+
+    with partly_wired() as whole:
+        world = World(lockstep=True)
+        world.add(whole, [1])
+        bus = WorldBus(world)
+        whole.write(0x2003, np.arange(100, 100 + AXES))
+        every, one = commissioned_values(whole), commissioned_values(whole, axis=3)
+        with CanDrives("tmcm6212", bus=bus, pace="lockstep", safety=False) as drives:
+            read = commissioned_values(drives, axis=3)
+        bus.shutdown()
+        world.close()
+    assert (one[0x2603, 0], (0x2003, 0) in one, (0x2203, 0) in one) == (103, False, False)
+    of_node = {key: value for key, value in every.items() if key[0] >= 0x2000 and whole.device.is_shared(key[0])}
+    of_axis = {key: value for key, value in every.items() if whole.device.locate(key[0])[0] == 3}
+    assert len(of_axis) > 30 and one.items() >= (of_node | of_axis).items()
+    assert {key: value for key, value in read.items() if key[0] >= 0x2000} == {
+        key: value for key, value in one.items() if key[0] >= 0x2000
+    }
+    assert {whole.device.locate(index)[0] for index, _ in read if not whole.device.is_shared(index)} == {3}
