@@ -333,10 +333,13 @@ class Facts:
         return next((e for e in self.entries.values() if e.bits is None and e.access != "wo" and len(e.default) > 7),
                     None)  # fmt: skip
 
-    def told_of(self, event: str) -> list[str]:
-        """Return the emergencies of a lost network ("lost", "stopped"), the register of 1001h open."""
+    def told_of(self, event: str, enabled: list[int]) -> list[str]:
+        """Return the emergencies of a lost network ("lost", "stopped"), the register of 1001h open.
+
+        Where it is an error of axes, it is one of those that were in operation.
+        """
         code, extra = getattr(self.manual, event)
-        axes = self.axes if "axis" in extra else [0]
+        axes = enabled if "axis" in extra else [0]
         return [frame_of(code, "..", extra, axis) for axis in axes]
 
 

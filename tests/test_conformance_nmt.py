@@ -118,7 +118,7 @@ def test_stopped_takes_the_enabled_axis_to_fault_and_no_other(wire, facts, axis)
     wire.play("rx 000  02 05\nwait 2 ms")
     assert states(wire, facts) == others(facts, axis, FAULT, SWITCH_ON_DISABLED)
     frames = wire.receive(0, "80 05")
-    assert [without_register(frame) for frame in frames] == facts.told_of("stopped"), "once it may be told"
+    assert [without_register(frame) for frame in frames] == facts.told_of("stopped", [axis]), "once it may be told"
 
 
 @EACH_AXIS
@@ -211,7 +211,7 @@ def test_a_lost_heartbeat_does_what_1029h_says_and_is_told_once(wire, facts, raw
     """)
     wire.wait(1)
     told = wire.take()
-    assert [without_register(frame) for frame in told] == facts.told_of("lost")
+    assert [without_register(frame) for frame in told] == facts.told_of("lost", [last])
     assert {frame.data[2] & 0x7F for frame in told} == {0x11}, "generic error, and communication"
     assert wire.node.state.name == facts.manual.error_behaviour[raw]
     wire.wait(20)

@@ -160,7 +160,7 @@ def test_an_eds_whose_objects_are_of_another_kind_is_refused(index, kind, tmp_pa
     if KINDS[index, 0] == 8 and kind == "0x0005":
         pytest.skip("of this length")
     path = retyped(tmp_path / "own.eds", index, kind)
-    with pytest.raises(ValueError, match=rf"own\.eds: {index:04X}h .* is .* correct its DataType"):
+    with pytest.raises(ValueError, match=rf"own\.eds, line \d+: {index:04X}h .* is .* correct its DataType"):
         describe(None, path)
 
 
