@@ -27,10 +27,11 @@ def search_of(*, shared=False, safe=True, caution=1, **settings):
     """A search of two machines of two axes, whose trials are what a test says."""
     made = _Search.__new__(_Search)
     made.rows, made.notes, made._axes = [], [""] * 2, 2
-    made._columns, made._highest = COLUMNS, np.array([32767, 32767, 32767])
+    made._columns = COLUMNS
     made._settings = Settings(**({"sampler": "random", "trials": 4, "safe": safe} | settings))
     made._bench = SimpleNamespace(
-        rule=RULE.copy(), safe=RULE // 2, incumbent=RULE // 2, num_machines=2,
+        rule=RULE.copy(), safe=RULE // 2, incumbent=RULE // 2, num_machines=2, highest=np.full(5, 32767),
+        target=SimpleNamespace(device=find_device("tmcm1636")),
         method=SimpleNamespace(caution=caution, measures_current=caution > 0),
     )  # fmt: skip
     made._members = [np.arange(2)] if shared else [np.array([0]), np.array([1])]
@@ -402,8 +403,8 @@ def started(monkeypatch):
 
         monkeypatch.setattr(module, "new_proposer", new_proposer)
         bench = SimpleNamespace(
-            num_machines=2, target=SimpleNamespace(axes_per_machine=2), rule=RULE.copy(), safe=RULE // 4,
-            incumbent=RULE // 4, highest=np.array([9, 8, 7, 6, 5]), method=SimpleNamespace(caution=1),
+            num_machines=2, target=SimpleNamespace(axes_per_machine=2, device=find_device("tmcm1636")), rule=RULE.copy(),
+            safe=RULE // 4, incumbent=RULE // 4, highest=np.array([9, 8, 7, 6, 5]), method=SimpleNamespace(caution=1),
         )  # fmt: skip
         return _Search(bench, Settings(**settings), COLUMNS, shared, bench), made
 
@@ -420,7 +421,8 @@ def test_every_machine_has_a_sampler_and_a_seed_of_its_own(started):
     for k, (*_, more) in enumerate(made):
         assert (more["objectives"], more["trials"], more["generation"], more["journal"]) == (2, 7, 1, None)
         assert more["name"] == f"machine {k}" and [point.tolist() for point in more["first"]] == [[0.0] * 3]
-    assert search._highest.tolist() == [7, 6, 5] and search.notes == ["", ""] and search._halted == [False, False]
+    assert search._gains(0, np.full(3, 9.0))[0, 2:].tolist() == [7, 6, 5], "as high as the bench allows"
+    assert search.notes == ["", ""] and search._halted == [False, False]
 
 
 def test_copies_of_a_machine_share_one_sampler(started):
@@ -470,6 +472,7 @@ class PlayedBench:
     """A bench of two machines of one axis, where a velocity P of 1.5 times the rule's costs least."""
 
     made: ClassVar[list] = []
+    trials = None
 
     def __init__(self, target, *, anew, gains):
         self.made.append(self)
