@@ -157,7 +157,7 @@ def link(master, drive, clock):
 
 # --- opening ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("count", "said"), [
-    (1, "^there is no position 1: 1 slave answer; count from 0, or look with `drive-env scan`$"),
+    (1, "^there is no position 1: 1 slave answers; count from 0, or look with `drive-env scan`$"),
     (3, "^there is no position 3: 3 slaves answer; count from 0"),
 ])  # fmt: skip
 def test_positions_that_are_not_there_are_told_and_the_segment_let_go(drive, count, said):

@@ -13,7 +13,7 @@ from ethercat_rig import Rig, category
 
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
-from drive_env.ethercat.datagrams import DatagramCommand
+from drive_env.ethercat.datagrams import DatagramCommand, at_station
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.ethercat import frame_master
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
@@ -209,6 +209,8 @@ def test_a_look_changes_no_slave(rig, way):
     assert way.take() == split("""
         BRD 0000 0130 2
         APRD 0000 0130 6
+        APRD 0000 0500 1
+        APWR 0000 0500 00
         APWR 0000 word 08
         APRD 0000 word
         APWR 0000 word 0A
@@ -217,7 +219,10 @@ def test_a_look_changes_no_slave(rig, way):
         APRD 0000 word
         APWR 0000 word 0E
         APRD 0000 word
+        APWR 0000 0500 00
         APRD FFFF 0130 6
+        APRD FFFF 0500 1
+        APWR FFFF 0500 00
         APWR FFFF word 08
         APRD FFFF word
         APWR FFFF word 0A
@@ -226,12 +231,41 @@ def test_a_look_changes_no_slave(rig, way):
         APRD FFFF word
         APWR FFFF word 0E
         APRD FFFF word
+        APWR FFFF 0500 00
     """)
     identity = SlaveIdentity(0x1234, 0x5678, 1, 42)
     assert master.look() == [(SlaveStatus(AlState.INIT, False, 0), identity)] * 2
     rig.address()
     assert rig.request(4, 0x1002) == (0x11, AlStatusCode.INVALID_CHANGE)
     assert master.look()[1] == (SlaveStatus(AlState.INIT, True, 0x0011), identity)
+
+
+def test_a_look_reads_an_eeprom_that_was_left_to_the_device_and_leaves_it_so(rig, way, clock):
+    rig.address()
+    rig.write(0x0500, "01", station=0x1002)
+    assert FrameMaster(way).look()[1][1] == SlaveIdentity(0x1234, 0x5678, 1, 42)
+    assert rig.read(0x0500, 1, station=0x1002) == b"\1" and rig.read(0x0500, 1) == b"\0"
+    rig.write(0x0500, "01")
+    way.change = busy(10**6)
+    with pytest.raises(NoAnswerError, match="stays busy"):
+        FrameMaster(way).look()
+    assert rig.read(0x0500, 1) == b"\1", "also where it could not be read"
+
+
+def test_words_of_another_address_are_not_taken(way, clock):
+    """A slave may answer the look before it has the request: what its registers hold is of the one before."""
+    late = []
+
+    def change(asked, found):
+        rows = datagrams.read(found, 0)
+        if rows[0].address >> 16 == WORDS and len(rows[0].data) == 10 and len(late) < 2:
+            late.append(rows[0])
+            rows[0] = rows[0]._replace(data=b"\x40\0" + struct.pack("<I", 7) + b"else")
+        return [datagrams.build(rows)]
+
+    way.change = change
+    assert [identity for _, identity in FrameMaster(way).look()] == [SlaveIdentity(0x1234, 0x5678, 1, 42)] * 2
+    assert clock.slept == [0.001] * 2
 
 
 BEGIN = """
@@ -415,7 +449,8 @@ def test_an_eeprom_that_stays_busy_is_told_after_5_s(way, clock, monkeypatch):
     with pytest.raises(NoAnswerError, match=r"^the EEPROM of the slave at 0000h stays busy; check its power$"):
         FrameMaster(way).look()
     assert clock.now == 1005.5
-    way.change = lambda asked, found: [] if asked[0].address & 0xFFFF == 0xFFFF and asked[0].command == 2 else [found]
+    write_of_the_second = at_station(DatagramCommand.APWR, -1, WORDS, b"")
+    way.change = lambda asked, found: [] if asked[0][:2] == write_of_the_second[:2] else [found]
     with pytest.raises(NoAnswerError, match=f"^{SILENT.format('the EEPROM of the slave at FFFFh')}$"):
         FrameMaster(way).look()
 

@@ -308,6 +308,13 @@ def test_a_look_takes_all_that_waits(clock):
     assert list(mailbox.client.emergencies) == [(0x8611, 0x20, ()), (0, 0, (9,))] and mailbox.reads == []
 
 
+def test_a_look_lets_go_of_an_error_that_nobody_waits_for(clock):
+    error = struct.pack("<HHBBHH", 4, 0, 0, 1 << 4, 1, 6)
+    mailbox = Mailbox([error, emergency(0x11, 0x86, 0x20)])
+    mailbox.client.look(0.0)
+    assert list(mailbox.client.emergencies) == [(0x8611, 0x20, ())]
+
+
 def test_a_read_of_three_segments():
     slave = Slave(
         f"41 {KEY.hex()} 3f 00 00 00 {numbers(0, 16)}",  # 63 bytes

@@ -9,14 +9,18 @@ from types import SimpleNamespace
 
 import pytest
 
+from drive_env.ethercat.coe import CoeService, message, split
 from drive_env.master.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.ethercat import clocks, soem_master
+from drive_env.master.ethercat import clocks, mailbox_client, soem_master
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 from drive_env.master.ethercat.soem_master import SoemMaster
 
 SIZES = ImageSizes(4, 6)
 STATUS = 0x0130
+RECEIVE, ROOM, SEND, LENGTH = 0x1000, 48, 0x1080, 64  # mailboxes: what the master writes, what it reads
+SEND_STATUS, SEND_ACTIVATION, HAS_MAIL = 0x080D, 0x080E, 0x0B
+PROBE = "40 00 10 00 00 00 00 00"  # a read of 1000h
 
 
 class Clock:
@@ -72,7 +76,13 @@ class Slave:
         self.statuses, self.state = [(2, 0)], 0
         self.registers = {0x0008: b"\xcc\0", 0x0910: struct.pack("<Q", 5_000_100), 0x0984: b"\0"}
         self.output, self.input = bytes(4), b"inputs"
-        self.serial, self.mail, self.answers = struct.pack("<I", 42), [], []
+        self.registers[0x0800] = struct.pack("<HHBBBBHHBBBB", RECEIVE, ROOM, 0x26, 0, 1, 0, SEND, LENGTH, 0x22, 0, 1, 0)
+        self.registers[SEND_ACTIVATION] = b"\1"
+        self.serial, self.to_soem = struct.pack("<I", 42), []
+        # Messages that wait; what answers requests in turn, None: nothing; counters of the last request and answer.
+        self.mail, self.answers, self.counter, self.number = [], [], 0, 0
+        self.given, self.lost_answers, self.full = b"", 0, 0
+        self.probed = "43 00 10 00 92 01 02 00"  # what answers a read of 1000h
         self.silent = 0  # reads of registers that are lost
 
     def note(self, *what):
@@ -89,13 +99,57 @@ class Slave:
         if address == STATUS:
             state, code = self.statuses.pop(0) if len(self.statuses) > 1 else self.statuses[0]
             return bytearray(struct.pack("<HHH", state, 0xFFFF, code)[:size])
+        if address == SEND:
+            return self._give(size)
+        if address == SEND_STATUS:
+            return bytearray((HAS_MAIL if self.mail else 0x02,))
         return bytearray(self.registers[address][:size])
 
     def _fpwr(self, address, data, timeout):
         assert timeout == 20_000  # us
         if self.silent > 0:
             raise WkcError
+        if address == RECEIVE:
+            self._take(data)
+            return
         self.note("write", address, data)
+        if address == SEND_ACTIVATION:
+            self.registers[address] = data
+            self.mail.insert(0, self.given)
+
+    def _give(self, size):
+        """Let the master have the next message; `lost_answers`: it is gone, though nobody has it."""
+        assert size == LENGTH
+        if not self.mail:
+            raise WkcError
+        self.given = self.mail.pop(0)
+        if self.lost_answers:
+            self.lost_answers -= 1
+            raise WkcError
+        return bytearray(self.given.ljust(LENGTH, b"\0"))
+
+    def _take(self, data):
+        """Take a request, unless it has the counter of the one before: note its SDO and put what answers it."""
+        assert len(data) == ROOM
+        if self.full:
+            self.full -= 1
+            raise WkcError
+        length, _, _, kind = struct.unpack_from("<HHBB", data)
+        assert kind & 0xF == 3
+        if kind >> 4 == self.counter:
+            return
+        self.counter = kind >> 4
+        service, request = split(data[6 : 6 + length])
+        assert service == CoeService.SDO_REQUEST
+        self.note("sdo", request.hex(" "))
+        if request.hex(" ") == PROBE and self.answers[:1] != [None]:
+            self.put(message(CoeService.SDO_RESPONSE, bytes.fromhex(self.probed)))
+        elif self.answers and (answer := self.answers.pop(0)) is not None:
+            self.put(answer if isinstance(answer, bytes) else message(CoeService.SDO_RESPONSE, bytes.fromhex(answer)))
+
+    def put(self, content, kind=3):
+        self.number = self.number % 7 + 1
+        self.mail.append(struct.pack("<HHBB", len(content), 0, 0, kind | self.number << 4) + content)
 
     def eeprom_read(self, word):
         assert word == 0x0E
@@ -106,24 +160,12 @@ class Slave:
     def add_emergency_callback(self, call):
         self.emergency = call
 
-    def mbx_receive(self):
-        if self.mail:
-            raise self.mail.pop(0)
-
-    def _answer(self):
-        found = self.answers.pop(0)
-        found = found() if callable(found) else found
-        if isinstance(found, Exception):
-            raise found
-        return found
-
-    def sdo_read(self, index, sub, size, release_gil):
-        self.note("read", index, sub, size, release_gil)
-        return self._answer()
-
-    def sdo_write(self, index, sub, data, release_gil):
-        self.note("sdo", index, sub, data, release_gil)
-        return self._answer()
+    def sdo_read(self, index, sub):
+        """SOEM's own transfer, with its own counter."""
+        self.note("SOEM reads", index, sub)
+        if self.to_soem:
+            raise self.to_soem.pop(0)
+        return b""
 
 
 class Master:
@@ -132,9 +174,9 @@ class Master:
     def __init__(self):
         self.log = []
         self.slaves = [Slave(k, self.log) for k in range(2)]
-        self.count, self.error, self.state = 2, None, 0
+        self.count, self.error, self.state, self.gone = 2, None, 0, []
         self.counter, self.expected_wkc, self.dc_time = 6, 6, 0
-        self.sdo_read_timeout = self.sdo_write_timeout = 0
+        self.sdo_read_timeout = 700_000  # us, as in pysoem
 
     def open(self, interface):
         if interface != "eth0":
@@ -143,6 +185,8 @@ class Master:
 
     def config_init(self):
         self.log.append("find")
+        self.slaves = [*self.slaves, *self.gone]
+        self.slaves, self.gone = self.slaves[: max(self.count, 0)], self.slaves[max(self.count, 0) :]
         return self.count
 
     def config_dc(self):
@@ -171,6 +215,7 @@ class Master:
 def clock(monkeypatch):
     found = Clock()
     monkeypatch.setattr(soem_master, "time", found)
+    monkeypatch.setattr(mailbox_client, "time", found)
     return found
 
 
@@ -196,6 +241,15 @@ def master(pysoem):
 @pytest.fixture
 def soem(master):
     return master._master
+
+
+@pytest.fixture
+def counted(master, soem):
+    """Slaves that take the counter of our mailbox."""
+    for slave in soem.slaves:
+        master.upload(slave.position, 0x1000, 0, 1.0)
+    soem.log.clear()
+    return master
 
 
 def take(soem):
@@ -229,6 +283,22 @@ def test_nobody_there_is_told(master, soem, count):
         master.begin()
     soem.count = 1
     assert master.begin() == 1
+
+
+def test_slaves_that_are_found_no_more_do_not_answer(counted, soem):
+    """SOEM has forgotten them; they may come back."""
+    soem.count = -1
+    with pytest.raises(NoAnswerError):
+        counted.begin()
+    assert counted.status(1) == SlaveStatus(0, False, 0) and counted.take_emergencies() == []
+    for call in (lambda: counted.write_register(1, 0x0420, b"\1"), lambda: counted.identity(1)):
+        with pytest.raises(NoAnswerError, match=r"^position 1 does not answer; check cable and power$"):
+            call()
+    with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
+        counted.upload(1, 0x2005, 0, 0.01)
+    counted.post(1, 0x6040, 0, b"\6\0")
+    soem.count = 2
+    assert counted.recover(1) is True and counted.upload(1, 0x1000, 0, 1.0) == b"\x92\1\2\0"
 
 
 def test_the_end_takes_all_slaves_to_init(pysoem, master, soem):
@@ -416,58 +486,112 @@ def test_a_slave_that_has_left_op_gives_no_image_and_states_are_asked_each_5_ms(
 
 
 # --- objects ----------------------------------------------------------------------------------------------------------
-def test_an_object_is_read_in_one_call(master, soem):
-    told = []
-    master.alive = lambda: told.append(1)
-    soem.slaves[1].answers = [bytearray(b"\x34\x12")]
-    assert master.upload(1, 0x2005, 3, 1.5) == b"\x34\x12"
-    assert take(soem) == [(1, "read", 0x2005, 3, 4096, True)] and told == [1]
-    assert soem.sdo_read_timeout == soem.sdo_write_timeout == 1_500_000  # us
-    soem.slaves[1].answers = [b""]
-    master.upload(1, 0x2005, 3, 0.01)
-    assert soem.sdo_read_timeout == 300_000, "so that no room can be told from no answer"
+def test_an_object_is_read_and_written_by_datagrams_of_soem(counted, soem):
+    """In the mailbox that the sync managers tell, whose room is that of what the master writes."""
+    soem.slaves[1].answers = ["4b 05 20 03 34 12 00 00", "60 05 20 03 00 00 00 00"]
+    assert counted.upload(1, 0x2005, 3, 1.5) == b"\x34\x12"
+    assert take(soem) == [(1, "sdo", "40 05 20 03 00 00 00 00")]
+    counted.download(1, 0x2005, 3, b"\x34\x12", 1.5)
+    assert take(soem) == [(1, "sdo", "2b 05 20 03 34 12 00 00")]
+    soem.slaves[1].answers = ["60 05 20 03 00 00 00 00", "20 00 00 00 00 00 00 00"]
+    counted.download(1, 0x2005, 3, bytes(40), 1.5)  # 32 fit into 48 bytes
+    assert take(soem) == [(1, "sdo", "21 05 20 03 28 00 00 00" + " 00" * 32), (1, "sdo", "01" + " 00" * 8)]
 
 
-def test_an_object_is_written_in_one_call(master, soem):
-    soem.slaves[1].answers = [None]
-    master.download(1, 0x2005, 3, b"\x34\x12", 1.5)
-    assert take(soem) == [(1, "sdo", 0x2005, 3, b"\x34\x12", True)]
+def test_a_slave_without_a_mailbox_to_be_read_is_told(master, soem):
+    soem.slaves[1]._fprd = lambda address, size, timeout: (
+        Slave._fprd(soem.slaves[1], address, size, timeout) if address == STATUS else _lost()
+    )
+    with pytest.raises(NoAnswerError, match=r"^position 1 does not answer; check cable and power$"):
+        master.begin()
 
 
-def test_an_abort_and_a_mailbox_error_are_told(master, soem):
-    aborted, failed = SdoError(), MailboxError()
-    aborted.abort_code, failed.error_code = 0x06020000 - (1 << 32), 4  # signed, as SOEM has it
-    soem.slaves[0].answers = [aborted, failed]
+def _lost():
+    raise WkcError
+
+
+@pytest.mark.parametrize("soem_s", range(8))
+def test_the_first_message_may_have_the_counter_of_soem_s_last(master, soem, clock, soem_s):
+    """Which is not told; the slave ignores it, so it is a read of 1000h that nobody wants."""
+    soem.slaves[0].counter = soem_s
+    soem.slaves[0].answers = ["4f 61 60 00 08 00 00 00", "4f 61 60 00 08 00 00 00"]
+    assert master.upload(0, 0x6061, 0, 1.0) == b"\x08"
+    assert take(soem) == [(0, "sdo", PROBE), (0, "sdo", "40 61 60 00 00 00 00 00")]
+    assert clock.now < 1000.2 and (soem_s == 1) == (clock.now > 1000.1)
+    assert master.upload(0, 0x6061, 0, 1.0) == b"\x08"
+    assert take(soem) == [(0, "sdo", "40 61 60 00 00 00 00 00")], "once is enough"
+
+
+def test_a_slave_that_does_not_answer_is_probed_three_times(master, soem, clock):
+    soem.slaves[0].answers = [None] * 5
+    with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
+        master.upload(0, 0x6061, 0, 0.5)
+    assert [what[2] for what in take(soem)] == [PROBE] * 3 + ["40 61 60 00 00 00 00 00"]
+    assert clock.now == pytest.approx(1000.8, abs=0.003)
+
+
+def test_a_refusal_of_the_probe_is_an_answer(master, soem, clock):
+    soem.slaves[0].probed, soem.slaves[0].answers = "80 00 10 00 00 00 02 06", ["4f 61 60 00 08 00 00 00"]
+    assert master.upload(0, 0x6061, 0, 1.0) == b"\x08"
+    assert len(take(soem)) == 2 and clock.slept == []
+
+
+def test_soem_gets_the_mailbox_back_before_it_maps(counted, soem):
+    """Its first message may be ignored, so it is a read that nobody wants either."""
+    soem.slaves[0].to_soem = [WkcError()]
+    for slave in soem.slaves:
+        slave.statuses = [(4, 0)]
+    counted.map({0: SIZES, 1: SIZES})
+    assert take(soem) == [(0, "SOEM reads", 0x1000, 0), (1, "SOEM reads", 0x1000, 0), "map"]
+    assert soem.sdo_read_timeout == 100_000  # us
+    counted.map({0: SIZES})
+    assert take(soem) == ["map"], "it has had it since"
+    soem.slaves[1].answers = ["4f 61 60 00 08 00 00 00"]
+    counted.upload(1, 0x6061, 0, 1.0)
+    assert take(soem) == [(1, "sdo", PROBE), (1, "sdo", "40 61 60 00 00 00 00 00")]
+
+
+@pytest.mark.parametrize("error", [WkcError, PacketError, SdoError, MailboxError])
+def test_what_soem_makes_of_a_read_that_nobody_wants_is_let_go(counted, soem, error):
+    soem.slaves[0].to_soem, soem.slaves[0].statuses = [error()], [(4, 0)]
+    counted.map({0: SIZES})
+    assert take(soem)[-1] == "map"
+
+
+def test_an_abort_and_a_mailbox_error_are_told(counted, soem):
+    soem.slaves[0].answers = ["80 05 20 00 00 00 02 06"]
     with pytest.raises(SdoAbortError) as error:
-        master.upload(0, 0x2005, 0, 1.0)
+        counted.upload(0, 0x2005, 0, 1.0)
     assert error.value.abort_code == 0x06020000
+    soem.slaves[0].put(struct.pack("<HH", 1, 4), kind=0)
     with pytest.raises(BusError, match=r"^a mailbox error of the slave, detail 4$"):
-        master.upload(0, 0x2005, 0, 1.0)
+        counted.upload(0, 0x2005, 0, 1.0)
 
 
-def after(clock, seconds, outcome):
-    def call():
-        clock.now += seconds
-        return outcome
-
-    return call
-
-
-@pytest.mark.parametrize("error", [WkcError(), PacketError()])
-def test_a_read_that_was_not_answered_is_tried_again_until_its_time_is_over(master, soem, clock, error):
-    soem.slaves[0].answers = [after(clock, 0.5, error), after(clock, 0.5, error), b"\1"]
-    assert master.upload(0, 0x2005, 0, 1.0) == b"\1"
-    soem.slaves[0].answers = [after(clock, 0.5, error), after(clock, 0.6, error), b"\1"]
+def test_an_answer_is_waited_for_and_the_program_told(counted, soem, clock):
+    told = []
+    counted.alive = lambda: told.append(clock.now)
     with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
-        master.upload(0, 0x2005, 0, 1.0)
+        counted.upload(0, 0x2005, 0, 0.01)
+    assert len(told) > 15 and clock.now == pytest.approx(1000.01, abs=0.001)
+    assert len(take(soem)) == 1, "it is sent once"
 
 
-def test_a_write_is_tried_again_only_where_it_was_not_sent(master, soem, clock):
-    soem.slaves[0].answers = [after(clock, 0.25, WkcError()), None]
-    master.download(0, 0x2005, 0, b"\1", 1.0)
-    soem.slaves[0].answers = [after(clock, 0.26, WkcError()), None]
-    with pytest.raises(NoAnswerError, match=r"^no answer came in time$"):
-        master.download(0, 0x2005, 0, b"\1", 1.0)
+def test_a_request_for_which_there_is_no_room_is_sent_again(counted, soem):
+    soem.slaves[0].full, soem.slaves[0].answers = 3, ["60 05 20 00 00 00 00 00"]
+    counted.download(0, 0x2005, 0, b"\1", 1.0)
+    assert take(soem) == [(0, "sdo", "2f 05 20 00 01 00 00 00")]
+
+
+def test_an_answer_whose_frame_is_lost_is_asked_for_again(counted, soem):
+    """By the second bit of 080Eh, which changes; the slave repeats, and does nothing twice."""
+    soem.slaves[0].lost_answers, soem.slaves[0].answers = 2, ["4b 05 20 03 34 12 00 00"]
+    assert counted.upload(0, 0x2005, 3, 1.0) == b"\x34\x12"
+    assert take(soem) == [
+        (0, "sdo", "40 05 20 03 00 00 00 00"),
+        (0, "write", SEND_ACTIVATION, b"\3"),
+        (0, "write", SEND_ACTIVATION, b"\1"),
+    ]
 
 
 def in_another_thread(call):
@@ -477,40 +601,71 @@ def in_another_thread(call):
     assert not thread.is_alive()
 
 
-def test_a_post_waits_for_no_answer_and_for_no_transfer(master, soem):
-    soem.slaves[0].answers = [WkcError(), None]
-    master.post(0, 0x6040, 0, b"\6\0")
-    assert take(soem) == [(0, "sdo", 0x6040, 0, b"\6\0", True)]
-    assert soem.sdo_write_timeout == 1000  # us
-    with master._turns[0]:
-        in_another_thread(lambda: master.post(0, 0x6040, 0, b"\6\0"))
+def test_a_post_waits_for_no_answer_and_for_no_transfer(counted, soem, clock):
+    counted.post(0, 0x6040, 0, b"\6\0")
+    assert take(soem) == [(0, "sdo", "2b 40 60 00 06 00 00 00")] and clock.slept == []
+    with counted._mailboxes[0]._turn:
+        in_another_thread(lambda: counted.post(0, 0x6040, 0, b"\6\0"))
     assert take(soem) == [], "a transfer was under way"
-    in_another_thread(lambda: master.post(0, 0x6040, 0, b"\6\0"))
+    in_another_thread(lambda: counted.post(0, 0x6040, 0, b"\6\0"))
     assert len(take(soem)) == 1, "and the turn is free again"
 
 
-# --- emergencies ------------------------------------------------------------------------------------------------------
-def test_emergencies_come_between_transfers_and_by_a_look(master, soem):
-    soem.slaves[1].emergency(Emergency(0x7500, 0x11))
-    soem.slaves[0].mail = [Emergency()]
-    assert master.take_emergencies() == [(1, 0x7500, 0x11, (1, 2, 3, 4, 5)), (0, 0x8611, 0x20, (1, 2, 3, 4, 5))]
-    assert master.take_emergencies() == []
-
-
-@pytest.mark.parametrize("error", [MailboxError(), SdoError(), PacketError(), WkcError()])
-def test_answers_that_nobody_waits_for_are_let_go(master, soem, error):
-    soem.slaves[0].mail, soem.slaves[1].mail = [error], [Emergency()]
-    assert [one.node for one in master.take_emergencies()] == [1]
-    soem.slaves[0].answers = [None]
-    in_another_thread(lambda: master.post(0, 0x6040, 0, b"\6\0"))
-    assert take(soem) == [(0, "sdo", 0x6040, 0, b"\6\0", True)], "and its turn is free again"
-
-
-def test_a_look_leaves_a_slave_whose_transfer_is_under_way(master, soem):
-    for slave in soem.slaves:
-        slave.mail = [Emergency()]
+def test_images_go_while_an_answer_is_waited_for(in_op, soem):
+    """A transfer takes the turn of frames for each of its datagrams alone."""
     found = []
-    with master._turns[0]:
-        in_another_thread(lambda: found.extend(master.take_emergencies()))
+    in_op.upload(0, 0x1000, 0, 1.0)
+    soem.slaves[0].answers = [None]
+    in_op.alive = lambda: in_another_thread(lambda: found.append(in_op.exchange([b"abcd", b"efgh"], 0.02)))
+    with pytest.raises(NoAnswerError):
+        in_op.upload(0, 0x2005, 0, 0.001)
+    assert found and all(one == [b"inputs"] * 2 for one in found)
+
+
+# --- emergencies ------------------------------------------------------------------------------------------------------
+EMERGENCY = message(CoeService.EMERGENCY, bytes.fromhex("11 86 20 01 02 03 04 05"))
+TAKEN = (0x8611, 0x20, (1, 2, 3, 4, 5))
+
+
+def test_emergencies_come_between_transfers_and_by_a_look(counted, soem):
+    soem.slaves[0].put(EMERGENCY)
+    soem.slaves[1].put(EMERGENCY)
+    soem.slaves[1].answers = ["4b 05 20 03 34 12 00 00"]
+    assert counted.upload(1, 0x2005, 3, 1.0) == b"\x34\x12"
+    assert counted.take_emergencies() == [(0, *TAKEN), (1, *TAKEN)]
+    assert counted.take_emergencies() == []
+
+
+def test_emergencies_that_come_to_soem_are_kept(counted, soem):
+    soem.slaves[1].emergency(Emergency(0x7500, 0x11))
+    soem.slaves[0].emergency(Emergency())
+    assert counted.take_emergencies() == [(1, 0x7500, 0x11, (1, 2, 3, 4, 5)), (0, *TAKEN)]
+    assert counted.take_emergencies() == []
+
+
+def test_emergencies_are_kept_where_slaves_are_found_anew(counted, soem):
+    soem.slaves[1].put(EMERGENCY)
+    soem.slaves[1].answers = ["4b 05 20 03 34 12 00 00"]
+    counted.upload(1, 0x2005, 3, 1.0)
+    counted.begin()
+    assert counted.take_emergencies() == [(1, *TAKEN)]
+
+
+def test_answers_that_nobody_waits_for_are_let_go(counted, soem):
+    soem.slaves[0].put(struct.pack("<HH", 1, 4), kind=0)
+    soem.slaves[0].put(message(CoeService.SDO_RESPONSE, bytes.fromhex("80 05 20 00 00 00 02 06")))
+    soem.slaves[1].put(EMERGENCY)
+    assert [one.node for one in counted.take_emergencies()] == [1]
+    assert soem.slaves[0].mail == []
+    in_another_thread(lambda: counted.post(0, 0x6040, 0, b"\6\0"))
+    assert len(take(soem)) == 1, "and its turn is free again"
+
+
+def test_a_look_leaves_a_slave_whose_transfer_is_under_way(counted, soem):
+    for slave in soem.slaves:
+        slave.put(EMERGENCY)
+    found = []
+    with counted._mailboxes[0]._turn:
+        in_another_thread(lambda: found.extend(counted.take_emergencies()))
     assert [one.node for one in found] == [1]
-    assert [one.node for one in master.take_emergencies()] == [0]
+    assert [one.node for one in counted.take_emergencies()] == [0]

@@ -30,7 +30,8 @@ def check_readable(entry: Entry) -> None:
 def fits_pdo(entry: Entry, transmit: bool) -> bool:
     """Return whether a PDO of this direction can carry an entry, by PDOMapping and AccessType of its EDS (CiA 306).
 
-    `rww` is written by a process image, so RPDOs alone carry it; `rwr` is read by one, so TPDOs alone do.
+    `rww` is written by a process image, so RPDOs alone carry it; `rwr` is read by one, so TPDOs alone do. What is
+    `const` needs to be read once, so no PDO carries it.
     """
     return entry.pdo_mappable and entry.access in (("ro", "rw", "rwr") if transmit else ("wo", "rw", "rww"))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import threading
 import time
@@ -32,6 +33,10 @@ LOOK = 0.0005  # s between two looks whether an answer is there
 
 class SdoAbortError(ObjectAccessError):
     """The slave answered with an abort."""
+
+
+class SlaveMailboxError(BusError):
+    """The slave answered with an error of its mailbox."""
 
 
 class MailboxClient:
@@ -119,8 +124,10 @@ class MailboxClient:
         if not self._turn.acquire(timeout=max(timeout, 0.0)):
             return
         try:
-            while self._take() is not None:
-                pass
+            while True:
+                with contextlib.suppress(SlaveMailboxError):  # of a request that nobody waits for any more
+                    if self._take() is None:
+                        return
         finally:
             self._turn.release()
 
@@ -170,7 +177,7 @@ class MailboxClient:
             return b""
         self._came = counter
         if kind & PROTOCOL == MailboxProtocol.ERROR:
-            raise BusError(f"a mailbox error of the slave, detail {int.from_bytes(content[2:4], 'little')}")
+            raise SlaveMailboxError(f"a mailbox error of the slave, detail {int.from_bytes(content[2:4], 'little')}")
         if kind & PROTOCOL != MailboxProtocol.COE or len(content) < HEADER:
             return b""
         service, rest = split(content)

@@ -12,6 +12,7 @@ import math
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -83,6 +84,7 @@ class SoemMaster:
         self._turn = threading.RLock()  # a frame and its answer
         self._mailboxes: list[MailboxClient] = []
         self._has_counted: list[bool] = []  # whether the last message to a slave's mailbox was ours
+        self._emergencies: deque[ReceivedEmergency] = deque()  # those that came to SOEM, or to mailboxes of before
         self._mapped: dict[int, ImageSizes] = {}
         self._looked, self._states = -math.inf, dict[int, SlaveStatus]()
 
@@ -94,6 +96,10 @@ class SoemMaster:
             count = int(self._master.config_init())
             if count <= 0:
                 raise NoAnswerError(f"no slave answers on {self._interface}; check cable, power and channel")
+            self._keep_emergencies()
+            for position, slave in enumerate(self._master.slaves):
+                # What comes while SOEM itself reads an object; untaken, it would be raised there.
+                slave.add_emergency_callback(lambda one, position=position: self._take_emergency(position, one))
             for position in range(count):
                 self._await(position, AlState.PRE_OP)
             self._mailboxes = [self._mailbox(position) for position in range(count)]
@@ -124,7 +130,10 @@ class SoemMaster:
         return SlaveStatus(status & STATE, bool(status & ERROR), code)
 
     def _slave(self, position: int) -> Any:
-        return self._master.slaves[position]
+        slaves = self._master.slaves
+        if position >= len(slaves):  # SOEM has found fewer than there were, or none
+            raise NoAnswerError(f"position {position} does not answer; check cable and power")
+        return slaves[position]
 
     def _request(self, position: int, state: AlState) -> None:
         with self._turn:
@@ -164,9 +173,10 @@ class SoemMaster:
                 raise NoAnswerError(f"position {position} does not answer; check cable and power") from None
 
     def _quietly(self, call: Callable[[], Any]) -> Any:
+        soem = self._soem
         try:
             return call()
-        except (self._soem.WkcError, self._soem.EepromError, self._soem.PacketError, self._soem.SdoError):
+        except (soem.WkcError, soem.EepromError, soem.PacketError, soem.SdoError, soem.MailboxError, NoAnswerError):
             return None
 
     # --- images -----------------------------------------------------------------------------------------------------
@@ -252,12 +262,19 @@ class SoemMaster:
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
         """Return and forget the emergencies that came."""
-        found = []
-        for position, mailbox in enumerate(self._mailboxes):
+        for mailbox in self._mailboxes:
             mailbox.look(0.0)
+        self._keep_emergencies()
+        return [self._emergencies.popleft() for _ in range(len(self._emergencies))]
+
+    def _keep_emergencies(self) -> None:
+        for position, mailbox in enumerate(self._mailboxes):
             while mailbox.emergencies:
-                found.append(ReceivedEmergency(position, *mailbox.emergencies.popleft()))
-        return found
+                self._emergencies.append(ReceivedEmergency(position, *mailbox.emergencies.popleft()))
+
+    def _take_emergency(self, position: int, one: Any) -> None:
+        extra = (one.b1, one.w1 & 0xFF, one.w1 >> 8, one.w2 & 0xFF, one.w2 >> 8)
+        self._emergencies.append(ReceivedEmergency(position, one.error_code, one.error_reg, extra))
 
     def _our_mailbox(self, position: int) -> MailboxClient:
         """Return the client of a slave's mailbox, once the slave takes its counter.
@@ -267,8 +284,9 @@ class SoemMaster:
         mailbox = self._mailboxes[position]
         if not self._has_counted[position]:
             for _ in range(PROBES):
-                with contextlib.suppress(NoAnswerError, SdoAbortError):
-                    mailbox.upload(DEVICE_TYPE, 0, PROBE)
+                with contextlib.suppress(NoAnswerError):
+                    with contextlib.suppress(SdoAbortError):  # an answer, too
+                        mailbox.upload(DEVICE_TYPE, 0, PROBE)
                     break
             self._has_counted[position] = True
         return mailbox
@@ -290,8 +308,8 @@ class SoemMaster:
 
         def write(data: bytes) -> bool:
             with self._turn:
-                slave = self._slave(position)
-                return self._quietly(lambda: slave._fpwr(receive, data, REGISTER_TIMEOUT) or True) is not None
+                found = self._quietly(lambda: self._slave(position)._fpwr(receive, data, REGISTER_TIMEOUT) or True)
+                return found is not None
 
         def fetch() -> bytes | None:
             with self._turn:
