@@ -404,7 +404,8 @@ def started(monkeypatch):
         monkeypatch.setattr(module, "new_proposer", new_proposer)
         bench = SimpleNamespace(
             num_machines=2, target=SimpleNamespace(axes_per_machine=2, device=find_device("tmcm1636")),
-            rule=RULE.copy(), safe=RULE // 4, incumbent=RULE // 4, highest=np.array([9, 8, 7, 6, 5]), method=SimpleNamespace(caution=1),
+            rule=RULE.copy(), safe=RULE // 4, incumbent=RULE // 4, highest=np.array([9, 8, 7, 6, 5]),
+            method=SimpleNamespace(caution=1),
         )  # fmt: skip
         return _Search(bench, Settings(**settings), COLUMNS, shared, bench), made
 

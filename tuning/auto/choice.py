@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.calmer_gains import cost_on_twins
-from tuning.auto.measured_margins import SOUGHT, sensitivity
+from tuning.auto.measured_margins import SENSITIVITY, SOUGHT, sensitivity
 from tuning.auto.moves import shaking
 from tuning.auto.stages import RuleTried
 
@@ -81,9 +81,11 @@ def _reset(bench: AutoBench) -> Mask:
 
 
 def _far_from_the_edge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Mask:
-    """Return the machines on which the rule's gains are far enough from instability by the measured loop.
+    """Return the machines on which the rule's gains are not too near to instability by the measured loop.
 
-    Where those found are near to it themselves, they may be as near.
+    On a machine of one axis what they cost decides, so that they may be nearer than gains are sought, with a
+    reservation then. Where axes pull at each other that takes margin which no axis shows alone: there they must be as
+    far as gains are sought, or as those found.
     """
     far, response = np.ones(bench.target.num_axes, bool), recorded.response
     if response is not None:
@@ -91,7 +93,7 @@ def _far_from_the_edge(bench: AutoBench, basis: Basis, recorded: RecordedGains) 
             own, rule = (
                 sensitivity(bench.target, basis, response, gains[k], k) for gains in (recorded.gains, basis.reference)
             )
-            far[k] = rule <= max(own, SOUGHT)
+            far[k] = rule <= (SENSITIVITY if bench.target.axes_per_machine == 1 else max(own, SOUGHT))
     return bench.whole_machines(far)
 
 
