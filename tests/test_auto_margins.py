@@ -17,6 +17,7 @@ from tuning.auto import calmer_gains
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.calmer_gains import far_enough
+from tuning.auto.measured_margins import SENSITIVITY, SOUGHT
 from tuning.identify.true_plant import true_plant
 from tuning.response import frequency_response
 from tuning.response.linear_model import OPEN_LOOPS
@@ -113,9 +114,10 @@ def test_a_margin_that_was_not_seen_is_a_bound_or_a_reservation(seen, bound, res
 
 @pytest.mark.parametrize("linked", [False, True])
 @pytest.mark.parametrize(("velocity", "position", "factors"), [
-    (3.0, 3.0, (1.0, 1.0)),
-    (9.0, 3.0, (0.5, 0.5)),  # the velocity loop wants half of velocity P, and position P goes with it
-    (3.0, 9.0, (1.0, 0.5)),
+    (2.3, 2.3, (1.0, 1.0)),
+    (3.0, 2.2, (0.5, 0.5)),
+    (9.0, 2.2, (0.5, 0.5)),  # the velocity loop wants half of velocity P, and position P goes with it
+    (2.2, 9.0, (1.0, 0.5)),
     (9.0, 9.0, (0.5, 0.25)),
 ])  # fmt: skip
 def test_a_loop_that_comes_too_near_to_instability_gets_half_its_gain(velocity, position, factors, linked, monkeypatch):
@@ -170,12 +172,15 @@ def test_gains_by_twins_are_far_from_instability_by_the_measured_loop(monkeypatc
 
     monkeypatch.setattr(calmer_gains, "_twins_of", twins)
     monkeypatch.setattr(calmer_gains, "cost_on_twins", lambda bench, basis, axes, gains: 100.0 / gains[..., 2])
-    most = 4.0
+    most = SOUGHT
     monkeypatch.setattr(calmer_gains, "sensitivity", lambda target, basis, response, gains, k: most * gains[2] / 300.0)
     bench = SimpleNamespace(target=SimpleNamespace(device=find_device("tmcm1636")), rng=np.random.default_rng(1))
     start = recorded(np.array([[4000, 1500, 400, 300, 200]]), response=object())
     rule = basis([[4000, 1500, 200, 300, 200]])
     found = far_enough(bench, rule, start, 0)
     assert found is not None and 270 < found[2] <= 300
+    most = 1.2 * SENSITIVITY
+    found = far_enough(bench, rule, start, 0)
+    assert found is not None and found[2] <= 300 * SOUGHT / most, "farther than it must be"
     most = 4000.0
     assert far_enough(bench, rule, start, 0) is None, "nothing near is far enough"
