@@ -80,7 +80,7 @@ def bench_of(found=None, *, anew=False):
     made._trials = SimpleNamespace(
         run=run, recover=lambda where: done.recovered.append(where.tolist()),
         go=lambda target, where: done.went.append((target.tolist(), where.tolist())),
-        leave=lambda: done.went.append("left"),
+        leave=lambda: done.went.append("left"), returns=False,
     )  # fmt: skip
     return made
 
@@ -141,6 +141,13 @@ def test_a_machine_is_as_good_as_its_worst_axis_and_goes_the_other_way_next_time
     assert bench.moves.tolist() == [3] * 4 and bench.aborts.tolist() == [0, 1, 0, 0]
     assert bench.origin.tolist() == [1100, -900, 100, 1100] and bench._direction.tolist() == [-1] * 4
     assert written == [((GAINS // 2).tolist(), [True] * 4)]  # the incumbent, until the next trial
+    bench.run(GAINS)
+    assert bench.origin.tolist() == [100] * 4 and bench._direction.tolist() == [1] * 4
+
+
+def test_trials_that_end_where_they_began_begin_there_again(written):
+    bench = bench_of(trial())
+    bench._trials.returns = True
     bench.run(GAINS)
     assert bench.origin.tolist() == [100] * 4 and bench._direction.tolist() == [1] * 4
 
