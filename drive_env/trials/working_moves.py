@@ -1,8 +1,8 @@
 """Moves at the working speed, there and back, with load reading and load angle of their steady parts.
 
 Load readings are read by SDO, some milliseconds apart: drives of steppers do not map them into process data. How long
-that takes is not known in real time, so that where an axis is in its profile follows from its demand. An axis that loses
-steps is stopped with the next sample, and stays out.
+that takes is not known in real time, so that where an axis is in its profile follows from its demand. An axis that
+loses steps is stopped with the next sample, and stays out.
 """
 
 from __future__ import annotations
