@@ -222,12 +222,11 @@ def test_recovery_takes_the_window_away_and_closes_what_has_been_identified(monk
 
 
 def test_drives_that_were_switched_on_have_their_loops_closed_in_as_many_milliseconds(monkeypatch):
-    drives = Axes(window=(0, 7, 0, 0), initialised=(-1,) * 4)
+    drives = Axes(initialised=(-1,) * 4)
     monkeypatch.setattr(OpenLoopTrials, "power_up", lambda self, where: drives.log.append(("on", where.tolist())))
     closed(drives, closes=np.array([True, True, False, False])).power_up(np.array([False, True, True, False]))
     assert drives.log == [
-        ("on", [False, True, True, False]), (cia402.FOLLOWING_WINDOW, 0, [False, True, False, False]),
-        (Role.LOOP_MODE, 1, [False, True, False, False]), ("wait", 0.6),
+        ("on", [False, True, True, False]), (Role.LOOP_MODE, 1, [False, True, False, False]), ("wait", 0.6),
     ]  # fmt: skip
     drives.log.clear()
     closed(drives, closes=~ALL).power_up(ALL)
@@ -235,18 +234,19 @@ def test_drives_that_were_switched_on_have_their_loops_closed_in_as_many_millise
 
 
 def test_an_axis_is_identified_with_its_loop_open_and_closes_it_from_then_on(monkeypatch):
-    drives, during = Axes(mode=(1, 1, 1, 1)), []
+    drives, during, seen = Axes(mode=(1, 1, 1, 1)), [], found([1.0, 2.0, 3.0, 4.0])
     trials = closed(drives)
 
     def identify(self, reach, where):
         during.append((reach, where.tolist(), self._closes.tolist()))
-        return "identified", "origin"
+        return seen, "origin"
 
     monkeypatch.setattr(OpenLoopTrials, "identify", identify)
-    assert trials.identify(7.0, FIRST) == ("identified", "origin")
+    assert trials.identify(7.0, FIRST) == (seen, "origin")
     assert during == [(7.0, [True, False, False, False], [False, True, True, True])]
     assert drives.log == [(Role.LOOP_MODE, 0, [True, False, False, False]), ("wait", 0.05)]
     assert trials._closes.all()
+    assert trials._inertia.tolist() == [1.0, np.inf, np.inf, np.inf]  # of the others none is known yet
     fresh = ClosedLoopTrials(drives, MOTOR, 2, 0.01, LOOP)
     assert fresh._closes.tolist() == [False] * 4
     fresh.identify(7.0, FIRST)
@@ -422,6 +422,28 @@ def test_a_pid_shakes_that_changes_its_speed_as_no_ramp_does_or_falls_out_of_ste
     assert shakes.tolist() == [False, True, False, falls]
     demand[7, 3] = position[7, 3] - 513
     assert trials._shaking({cia402.POSITION_ACTUAL: position, cia402.POSITION_DEMAND: demand})[3] == falls
+
+
+def test_a_rotor_that_swings_in_its_field_is_no_oscillation(monkeypatch):
+    """From limit to limit at sqrt(n_p T / J) the current I changes by I omega dt / sqrt 2; twice that is a loop's."""
+    J, run = 3.0 * MOTOR.inertia, rated_setting(DEVICE, MOTOR)
+    current = amplitude(DEVICE, run)
+    swing = current * np.sqrt(MOTOR.n_p * float(holding_torque(MOTOR, current)) / J) * 1e-3 / np.sqrt(2.0)
+    assert module.swing_change(MOTOR, np.array([J]), current) == pytest.approx(swing)
+    servo = 0.4 * MOTOR.rated_current
+    assert servo < 0.9 * 2.0 * swing
+    monkeypatch.setattr(module, "ampere_per_count", lambda drives: 0.5)
+    monkeypatch.setattr(module, "read_gains", lambda drives: gains([run] * 4))
+    trials = closed(Axes())
+    wave = np.tile([[0.5], [-0.5]], (12, 1)) / 0.5  # changes by 1 A from ms to ms
+
+    def shakes(change):
+        return trials._shaking({cia402.TORQUE_ACTUAL: wave * change}).tolist()
+
+    known = [servo, 2.0 * swing, 2.0 * swing, servo]
+    assert shakes(np.multiply(known, [0.99, 0.99, 0.99, 1.01])) == [False, True, True, True]  # nothing is known yet
+    trials._inertia = np.array([np.inf, J, J, 1e9])
+    assert shakes(np.multiply(known, [0.99, 0.99, 1.01, 1.01])) == [False, False, True, True]
 
 
 def test_three_counts_of_a_coarse_encoder_are_no_shaking():

@@ -11,15 +11,25 @@ import pytest
 from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.motors import find_motor
-from drive_env.phase_current import amplitude, holding_torque, swing_period
+from drive_env.phase_current import amplitude, holding_torque, rated_setting, swing_period
 from drive_env.trials import open_loop as module
 from drive_env.trials.gain_trial import Identified, Trials
-from drive_env.trials.method import FIRST_HZ, SAFE_RULE, Cascade, OpenLoop, check_tried, method_of, new_score
+from drive_env.trials.method import (
+    FIRST_HZ,
+    SAFE_RULE,
+    Cascade,
+    LoadSettings,
+    OpenLoop,
+    check_tried,
+    method_of,
+    new_score,
+)
 from drive_env.trials.open_loop import (
     LONGEST_ROLL,
     OpenLoopTerms,
     OpenLoopTrial,
     OpenLoopTrials,
+    acceleration_share,
     effort,
     open_loop_cost,
     open_loop_softness,
@@ -238,7 +248,7 @@ def test_inertia_and_friction_are_what_the_load_angle_says_at_the_run_current(mo
         num_axes, time_waits = 1, True
 
         def read(self, name):
-            return np.array([scale if name is module.Role.POSITION_SCALE else 0])
+            return np.array([{module.Role.POSITION_SCALE: scale, cia402.STATUSWORD: 0x0637}.get(name, 0)])
 
         def advance(self, seconds):
             pass
@@ -280,14 +290,17 @@ def test_an_encoder_must_show_a_quarter_of_the_move(way, moved):
         trials._check_moved(0 * position, move, both)
 
 
+@pytest.mark.parametrize("acts", [False, True])
 @pytest.mark.parametrize(("window", "loop"), [((0, 0), (0, 0)), ((500, 0), (1, 0)), ((500, 500), (1, 1))])
-def test_sensor_window_and_loop_are_what_they_were_afterwards(window, loop, monkeypatch):
+def test_sensor_window_loop_and_what_acts_by_the_load_are_what_they_were_afterwards(window, loop, acts, monkeypatch):
+    """A stall stops nothing from 20A4h = 0 on, and CoolStep acts at no speed above the highest that 20A5h takes."""
     monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
     monkeypatch.setattr(Trials, "recover", lambda self, where: None)
-    first = {"sensor": [1, 0], "window": list(window), "loop": list(loop)}
+    first = {"sensor": [1, 0], "window": list(window), "loop": list(loop), "stall": [900, 0], "coolstep": [0, 700]}
     values = {name: np.array(value) for name, value in first.items()}
     log = []
-    names = {cia402.SENSOR_SELECTION: "sensor", cia402.FOLLOWING_WINDOW: "window", module.Role.LOOP_MODE: "loop"}
+    names = {cia402.SENSOR_SELECTION: "sensor", cia402.FOLLOWING_WINDOW: "window", module.Role.LOOP_MODE: "loop",
+             module.Role.STALL_SPEED: "stall", module.Role.COOLSTEP_SPEED: "coolstep"}  # fmt: skip
 
     class Drives:
         num_axes, time_waits = 2, True
@@ -301,15 +314,22 @@ def test_sensor_window_and_loop_are_what_they_were_afterwards(window, loop, monk
             values[names[name]] = np.where(mask, value, values[names[name]])
 
     trials = OpenLoopTrials(Drives(), STEPPER_MOTOR, 1, 0.01)
+    trials.acts_by_load = acts
     trials.leave()
     assert not log  # nothing was changed
+    trials.recover(np.array([False, True]))
+    assert values["stall"].tolist() == first["stall"] and ("coolstep", [0]) not in log  # the other takes no part yet
     trials.recover(np.array([True, True]))
+    load = {"stall": first["stall"], "coolstep": first["coolstep"]}
     assert {name: value.tolist() for name, value in values.items()} == {
         "sensor": [0, 0],
         "window": [0, 0],
         "loop": [0, 0],
+        **(load if acts else {"stall": [0, 0], "coolstep": [2**31 - 1] * 2}),
     }
+    log.clear()
     trials.recover(np.array([True, True]))
+    assert not log
     assert trials.sensor.tolist() == [1, 0]  # what it was at first
     trials.leave()
     assert {name: value.tolist() for name, value in values.items()} == first
@@ -575,11 +595,15 @@ class Recorded:
 
     num_axes, time_waits = 2, True
 
-    def __init__(self, records):
-        self.records, self.log = list(records), []
+    def __init__(self, records=(), down=()):
+        self.records, self.log, self.encoder = list(records), [], ORIGIN
+        self.status = np.full(2, 0x0637)
+        self.status[list(down)] = 0x0238
 
     def read(self, name):
-        return np.full(2, 51200) if name is module.Role.POSITION_SCALE else ORIGIN
+        if name == cia402.STATUSWORD:
+            return self.status
+        return np.full(2, 51200) if name is module.Role.POSITION_SCALE else self.encoder
 
     def advance(self, seconds):
         self.log.append(seconds)
@@ -589,12 +613,15 @@ class Recorded:
         return {cia402.POSITION_ACTUAL: position, cia402.POSITION_DEMAND: demand}
 
 
+RAMP = 1.5e-6  # inertia that the ramp of the move tells
+
+
 @pytest.fixture
 def identified(monkeypatch):
     """Identify two axes by records; return what is balanced, and what is found with the swing that is given."""
     calls, swings, starts = [], [], []
 
-    def run(swing, reach=(1.0, 1.0), where=(True, True)):
+    def run(swing, reach=(1.0, 1.0), where=(True, True), ramp=RAMP):
         t = np.arange(TRIAL)[:, None]
         there = np.minimum(t, 100) ** 2 * [1.0, 0.5]
         back = there[-1] - there
@@ -604,12 +631,12 @@ def identified(monkeypatch):
         monkeypatch.setattr(module, "write_profile", lambda drives, move, where: starts.append(move))
         monkeypatch.setattr(module, "start", lambda drives, target, where: starts.append(target.tolist()))
 
-        def balance(angle, speed, current, motor, inertia=None):
-            calls.append((angle, speed, current, inertia))
+        def balance(angle, speed, current, motor, inertia=None, moving=None):
+            calls.append((angle, speed, current, inertia, moving))
             one = np.ones(2)
             if inertia is not None:
                 return Identified(inertia, 5.0 * one, 6.0 * one, 7.0 * one)
-            return Identified(1e-4 * one, 1.0 * one, 2.0 * one, 3.0 * one)
+            return Identified(ramp * one, 1.0 * one, 2.0 * one, 3.0 * one)
 
         def swing_of(self, origin, move, where, held):
             swings.append((where.tolist(), move, held))
@@ -627,8 +654,9 @@ def identified(monkeypatch):
 
 def test_identification_moves_three_rotors_there_and_back(identified):
     identified(([1e-6, 1e-6], [0.0, 0.0]), reach=(50.0, -0.5))
-    most = highest_ramp(STEPPER)
-    move = plan_move(STEPPER_MOTOR, np.full(2, 3.0 * STEPPER_MOTOR.inertia), 51200, np.array([50.0, -0.5]), most)
+    most, share = highest_ramp(STEPPER), acceleration_share(STEPPER, STEPPER_MOTOR)
+    inertia = np.full(2, 3.0 * STEPPER_MOTOR.inertia)
+    move = plan_move(STEPPER_MOTOR, inertia, 51200, np.array([50.0, -0.5]), most, share)
     planned, there, back = identified.starts
     assert planned.distance.tolist() == move.distance.tolist() and planned.acceleration.tolist() == (
         move.acceleration.tolist()
@@ -636,10 +664,20 @@ def test_identification_moves_three_rotors_there_and_back(identified):
     assert (there, back) == ((ORIGIN + move.distance).tolist(), ORIGIN.tolist())
 
 
+@pytest.mark.parametrize("taken", [0.0, 0.02, 10.0])
+def test_a_trial_asks_for_what_its_probe_holds_of_a_torque_that_pulls_at_once(taken):
+    """Nine tenths of 0.725 of what 0.8 of the rated current holds, less friction, load, and detent torque."""
+    motor = STEPPER_MOTOR
+    held = float(holding_torque(motor, 0.8 * amplitude(STEPPER, rated_setting(STEPPER, motor))))
+    free = (0.9 * 0.725 * held - taken - motor.cogging_torque) / motor.rated_torque
+    share = acceleration_share(STEPPER, motor, np.array([taken]))
+    assert share == pytest.approx(min(max(free, 0.15), 0.4))
+
+
 def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identified):
     """Half a period after what the encoder says, the lag is 30 increments less the way of a period of 0.2 ms."""
     _, calls, _ = identified(([1e-6, 1e-6], [0.0, 0.0]))
-    angle, speed, current, inertia = calls[0]
+    angle, speed, current, inertia, moving = calls[0]
     to_rad = 2.0 * np.pi / 51200
     np.testing.assert_allclose(angle[40], [1600 * to_rad, 800 * to_rad])
     np.testing.assert_allclose(speed[40], [80e3 * to_rad, 40e3 * to_rad])
@@ -649,6 +687,135 @@ def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identifi
     for row, sign, rates in ((40, 1, (80e3, 78e3)), (TRIAL + 40, -1, (-80e3, -78e3))):
         torque = [held * np.sin(50 * to_rad * (sign * 30.0 - rate * np.array([1.0, 0.5]) * age)) for rate in rates]
         np.testing.assert_allclose(current[row], 0.5 * (torque[0] + torque[1]) / STEPPER_MOTOR.torque_constant)
+    # 2 n 10^3 increments/s exceed 1 rad/s, 8,149 of them, from n = 5 on; at rest friction holds what it likes.
+    assert moving[:111, 0].all() and not moving[111 : TRIAL - 5, 0].any()
+    assert moving[TRIAL - 5 : TRIAL + 111, 0].all()
+
+
+def test_a_rotor_that_turns_back_within_ten_samples_is_not_at_rest():
+    speed = np.zeros((60, 2))
+    speed[20, 0], speed[30:41, 1] = -1.1, 1.0
+    moving = module._moving(speed)
+    assert np.flatnonzero(moving[:, 0]).tolist() == list(range(10, 31)) and not moving[:, 1].any()
+
+
+# --- a load that is heavier than a rotor's own ------------------------------------------------------------------------
+@pytest.fixture
+def heavy(monkeypatch):
+    """Identify two axes that lose steps as a test says, move by move; what each told of its inertia is its number."""
+    monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
+
+    def run(lost, still=None, reach=50.0):
+        drives, moves, anew = Recorded(), [], []
+
+        def identify_by(self, move, origin, reach, where):
+            k = len(moves)
+            moves.append((move.distance.tolist(), origin.tolist(), where.tolist()))
+            way = np.stack([origin, origin + move.distance])
+            if still is not None:
+                way[1, still] = way[0, still]
+            return Identified(*np.tile([k + 1.0, k + 1.5], (4, 1))), way, np.array(lost[k], bool)
+
+        def start_anew(self, where, full_step):
+            anew.append((where.tolist(), full_step.tolist()))
+            drives.encoder = drives.encoder + 10
+
+        monkeypatch.setattr(OpenLoopTrials, "_identify_by", identify_by)
+        monkeypatch.setattr(OpenLoopTrials, "_start_anew", start_anew)
+        found, origin = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01).identify(np.full(2, reach), np.ones(2, bool))
+        return found, origin, moves, anew
+
+    return run
+
+
+def planned(rotors):
+    inertia, share = np.full(2, rotors * STEPPER_MOTOR.inertia), acceleration_share(STEPPER, STEPPER_MOTOR)
+    return plan_move(STEPPER_MOTOR, inertia, 51200, np.full(2, 50.0), highest_ramp(STEPPER), share).distance.tolist()
+
+
+def test_an_axis_that_loses_steps_makes_slower_moves_while_the_others_stand(heavy, monkeypatch):
+    monkeypatch.setattr(module, "TRIED_ROTORS", (3.0, 100.0, 400.0))
+    found, origin, moves, anew = heavy([[0, 1], [1, 1], [1, 0]])  # who stands is not asked
+    there = [[ORIGIN[0], ORIGIN[1] + k] for k in (0, 10, 20)]
+    parts = [[True, True], [False, True], [False, True]]
+    assert moves == list(zip([planned(3.0), planned(100.0), planned(400.0)], there, parts, strict=True))
+    assert planned(400.0)[0] < planned(100.0)[0] < planned(3.0)[0]
+    assert anew == [([False, True], [256.0, 256.0])] * 2
+    assert found.inertia.tolist() == [1.0, 3.5] and found.offset.tolist() == [1.0, 3.5]
+    assert origin.tolist() == there[-1]
+
+
+def test_after_the_slowest_move_identification_goes_on_with_what_that_says(heavy):
+    assert module.TRIED_ROTORS == (3.0, 12.0, 48.0, 192.0)
+    found, origin, moves, anew = heavy([[1, 1]] * 4)
+    assert [distance for distance, *_ in moves] == [planned(3.0), planned(192.0)]
+    assert len(anew) == 2 and found.inertia.tolist() == [2.0, 2.5] and origin.tolist() == (ORIGIN + 20).tolist()
+
+
+def test_a_move_that_lost_steps_is_not_made_again(heavy):
+    """At its highest speed a move for 12 and for 48 rotors is the one for 3; in a short travel all of them are."""
+    assert planned(3.0) == planned(12.0) == planned(48.0)
+    found, _, moves, anew = heavy([[0, 1], [0, 0]])
+    assert [(distance, where) for distance, _, where in moves] == [
+        (planned(3.0), [True, True]), (planned(192.0), [False, True])
+    ]  # fmt: skip
+    assert len(anew) == 1 and found.inertia.tolist() == [1.0, 2.5]
+    found, _, moves, anew = heavy([[1, 1]], reach=0.1)
+    assert len(moves) == len(anew) == 1 and found.inertia.tolist() == [1.0, 1.5]
+
+
+@pytest.mark.parametrize("lost", [[[0, 0]], [[0, 1], [0, 0]], [[1, 1]] * 4])
+def test_an_encoder_that_shows_nothing_is_told_whoever_moves_on(heavy, lost):
+    with pytest.raises(RuntimeError, match="axis 0: the encoder showed 0 of"):
+        heavy(lost, still=0)
+
+
+@pytest.mark.parametrize(
+    ("lag", "down", "lost"),
+    [([511, -511], (), [0, 0]), ([513, 511], (), [1, 0]), ([0, -513], (), [0, 1]), ([0, 0], (1,), [0, 1])],
+)
+def test_steps_are_lost_beyond_two_full_steps_or_where_an_axis_ended_in_fault(lag, down, lost, monkeypatch):
+    """Who lost steps does not swing."""
+    monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
+    monkeypatch.setattr(module, "read_gains", lambda drives: gains([100, 200], [250, 250]))
+    monkeypatch.setattr(module, "write_profile", lambda drives, move, where: None)
+    monkeypatch.setattr(module, "start", lambda drives, target, where: None)
+    swung = []
+
+    def swing(self, origin, move, where, held):
+        swung.append(where.astype(int).tolist())
+        return FreeSwing(np.zeros(2), np.zeros(2))
+
+    monkeypatch.setattr(OpenLoopTrials, "_swing", swing)
+    stands = np.tile(ORIGIN, (TRIAL, 1))
+    ahead = stands.copy()
+    ahead[40] += lag
+    drives = Recorded([(stands, stands), (stands, ahead)], down)
+    move = FOUR._replace(distance=np.array([9, 9]), acceleration=np.ones(2), increments=np.full(2, 51200 / (2 * np.pi)))
+    made = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    _, _, found = made._identify_by(move, ORIGIN, np.ones(2), np.ones(2, bool))
+    assert found.astype(int).tolist() == lost and swung == [[1 - k for k in lost]]
+
+
+def test_an_axis_that_lost_steps_is_halted_comes_to_rest_and_counts_from_there(monkeypatch):
+    """What is in fault takes no halt; the others' counts stay as they were."""
+    drives = Counters([0, 0, 0], [0, 0, 0])
+    log, status = [], np.array([0x0637, 0x0637, 0x0238])
+    read = drives.read
+    drives.read = lambda name: status if name == cia402.STATUSWORD else read(name)
+    drives.write = lambda name, value, *, where: log.append((name, value, where.tolist()))
+    drives.advance = lambda seconds: log.append(seconds)
+    monkeypatch.setattr(OpenLoopTrials, "_come_to_rest", lambda self, step: log.append(("rest", step)))
+    monkeypatch.setattr(OpenLoopTrials, "recover", lambda self, where: log.append(("recover", where.tolist())))
+    made = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
+    made.shift()
+    drives.demand, drives.encoder = np.array([700, 3000, 4000]), np.array([500, 100, 200])
+    made._start_anew(np.array([False, True, True]), "step")
+    assert log == [
+        (cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, [False, True, False]), 0.02, ("rest", "step"),
+        ("recover", [False, True, True]), 0.02,
+    ]  # fmt: skip
+    assert made._zero.tolist() == [0, 2900, 3800]
 
 
 FULL = 2.0 * np.pi / 200.0  # rad, a full step
@@ -661,13 +828,20 @@ def test_an_axis_without_room_of_one_and_a_half_full_steps_does_not_swing(identi
     found, calls, swings = identified(([1e-6, 2e-6], [0.9, 0.9]), reach=reach)
     assert [where for where, *_ in swings] == ([] if swung is None else [swung])
     # The move to the ends of such a way is so short that even a light rotor takes little of the torque.
-    assert found[0] == [1e-4, 1e-4 if swung is None else 2e-6] and len(calls) == (1 if swung is None else 2)
+    assert found[0] == [RAMP, RAMP if swung is None else 2e-6] and len(calls) == (1 if swung is None else 2)
 
 
 def test_an_axis_that_takes_no_part_does_not_swing(identified):
     found, _, swings = identified(([1e-6, 2e-6], [0.9, 0.9]), where=(True, False))
     assert [where for where, *_ in swings] == [[True, False]]
-    assert found == [[1e-6, 1e-4], [5.0, 1.0], [6.0, 2.0], [7.0, 3.0]]
+    assert found == [[1e-6, RAMP], [5.0, 1.0], [6.0, 2.0], [7.0, 3.0]]
+
+
+@pytest.mark.parametrize(("ramp", "trusted"), [(1e-6 / 0.61, True), (1e-6 / 0.59, False)])
+def test_a_swing_of_the_rotor_against_an_elastic_load_is_not_taken_for_the_inertia(identified, ramp, trusted):
+    """Below 0.6 of what the ramp told the rotor swings alone, against what is elastic."""
+    found, _, _ = identified(([1e-6, 1e-6], [0.9, 0.9]), ramp=ramp)
+    assert found[0] == ([1e-6] * 2 if trusted else [ramp] * 2)
 
 
 @pytest.mark.parametrize(
@@ -680,7 +854,7 @@ def test_the_swing_of_a_light_load_is_trusted_where_it_explains_what_was_seen(id
     _, move, held = swings[0]
     inertia = share * held * move.increments / move.acceleration
     found, calls, _ = identified((inertia.tolist(), [explained] * 2))
-    np.testing.assert_allclose(found[0], inertia if trusted else [1e-4] * 2)
+    np.testing.assert_allclose(found[0], inertia if trusted else [RAMP] * 2)
     assert found[1] == ([5.0] * 2 if trusted else [1.0] * 2)
     if trusted:
         np.testing.assert_allclose(calls[-1][3], inertia)
@@ -696,7 +870,7 @@ def test_an_axis_that_is_on_is_switched_off_before_its_sensor_is_another(monkeyp
     values = {cia402.SENSOR_SELECTION: np.array([1, 1, 0, 1]), cia402.FOLLOWING_WINDOW: np.zeros(4, int),
               cia402.STATUSWORD: np.array([0x0637, 0x0240, 0x0637, 0x0637])}  # fmt: skip
     drives = SimpleNamespace(
-        num_axes=4, read=lambda name: values[name],
+        num_axes=4, time_waits=True, read=lambda name: values[name],
         write=lambda name, value, where=None: log.append((name, value, where.tolist())),
     )  # fmt: skip
     trials = OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01)
@@ -712,8 +886,36 @@ def test_an_axis_that_is_on_is_switched_off_before_its_sensor_is_another(monkeyp
     assert log[0] == (cia402.SENSOR_SELECTION, 0, [True, False, False, False]) and len(log) == 2
     monkeypatch.setattr(Trials, "power_up", lambda self, where: log.append(("on", where.tolist())))
     log.clear()
+    values[cia402.FOLLOWING_WINDOW] = np.array([0, 9, 0, 9])  # drives that were switched on have theirs again
     trials.power_up(np.array([True, False, False, True]))
-    assert log == [(cia402.SENSOR_SELECTION, 0, [True, False, False, True]), ("on", [True, False, False, True])]
+    assert log == [
+        (cia402.SENSOR_SELECTION, 0, [True, False, False, True]),
+        (cia402.FOLLOWING_WINDOW, 0, [False, True, False, True]),
+        ("on", [True, False, False, True]),
+    ]
+
+
+@pytest.mark.parametrize(("device", "current"), [("tmcm3313", True), ("tmcm6212", False)])
+@pytest.mark.parametrize(
+    ("waits", "status", "mapped"),
+    [(False, (0x0240, 0x0238), True), (False, (0x0240, 0x0637), False), (True, (0x0240, 0x0238), False)],
+)
+def test_what_trials_record_is_mapped_in_real_time_before_any_axis_is_enabled(
+    device, current, waits, status, mapped, monkeypatch
+):
+    log = []
+    known = find_device(device)
+    monkeypatch.setattr(module, "device_of", lambda drives: known)
+    monkeypatch.setattr(Trials, "recover", lambda self, where: log.append("enable"))
+    drives = SimpleNamespace(
+        num_axes=2, time_waits=waits, record=lambda objects, seconds: log.append((objects, seconds)),
+        read=lambda name: np.array(status) if name == cia402.STATUSWORD else np.zeros(2, int),
+        write=lambda name, value, *, where: None,
+    )  # fmt: skip
+    OpenLoopTrials(drives, STEPPER_MOTOR, 1, 0.01).recover(np.array([True, True]))
+    objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
+    expected = [*objects, cia402.TORQUE_ACTUAL] if current else objects  # of its closed loop's trials
+    assert log == [*([(expected, 0.0)] if mapped else []), "enable"]
 
 
 @pytest.mark.parametrize(("way", "waits"), [(63, 1), (64, LONGEST_ROLL), (-64, LONGEST_ROLL)])
@@ -818,12 +1020,23 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
     check_tried(STEPPER, ("run_current", "standby_current"))
     with pytest.raises(ValueError, match="run_current: trials of correction_velocity_p close the loop"):
         check_tried(STEPPER, ("run_current", "correction_velocity_p"))
-    with pytest.raises(ValueError, match="coolstep_up: a trial of an open-loop stepper shows what the phase currents"):
+    with pytest.raises(
+        ValueError, match="run_current: trials of the load detection and of CoolStep show what stall_th"
+    ):
         check_tried(STEPPER, ("run_current", "coolstep_up"))
+    with pytest.raises(
+        ValueError, match="correction_tolerance: a trial of an open-loop stepper shows what the phase currents do, run"
+    ):
+        check_tried(STEPPER, ("run_current", "correction_tolerance"))
     none = SimpleNamespace(
         name="none",
         gains=SimpleNamespace(
-            outer=(), columns=lambda names: (), loop_of=lambda names: None, closed_loops=(), is_open_loop=False
+            outer=(),
+            columns=lambda names: (),
+            loop_of=lambda names: None,
+            closed_loops=(),
+            is_open_loop=False,
+            rows=(),
         ),
     )
     with pytest.raises(ValueError, match="none has no gains of a velocity or position loop and no phase currents"):
@@ -884,6 +1097,20 @@ def test_gains_of_no_loop_close_none():
     with pytest.raises(
         ValueError, match=r"shows what the phase currents do, run_current, standby_current, and with its lo"
     ):
-        check_tried(known, ("coolstep_up",))
-    with pytest.raises(ValueError, match=r"phase currents do, run_current, standby_current; drive-tune auto finds"):
-        check_tried(find_device("tmcm6212"), ("coolstep_up",))
+        check_tried(known, ("correction_tolerance",))
+
+
+@pytest.mark.parametrize("name", ["tmcm3313", "tmcm6212"])
+def test_load_detection_and_coolstep_have_a_method_of_their_own(name):
+    device = find_device(name)
+    for names in (("coolstep_up",), ("stall_threshold", "coolstep_lower")):
+        check_tried(device, names)
+        assert type(method_of(device, STEPPER_MOTOR, names)) is LoadSettings
+    with pytest.raises(ValueError, match="of the load detection and of CoolStep show what stall_threshold, coolstep_l"):
+        check_tried(device, ("coolstep_up", "standby_current"))
+
+
+def test_a_load_detection_that_cannot_be_set_is_not_tried():
+    deaf = STEPPER._replace(roles={})
+    with pytest.raises(ValueError, match="tmcm3313: the load detection of this drive cannot be set: it has no "):
+        check_tried(deaf, ("stall_threshold",))

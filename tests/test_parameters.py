@@ -229,6 +229,7 @@ def held(values, axes=2, refused=()):
     )()
     drives.description.hints = find_device("tmcm1636").master
     drives.description.is_number = lambda entry: entry.index != 0x1008
+    drives.description.of_further_axes = dict
     drives.write_axis = drives.write_raw
     return drives
 
@@ -247,6 +248,14 @@ def test_a_parameter_can_be_read_and_written(access, stays):
     entry = dataclasses.replace(drives.entries[0x6081, 0], access=access)
     drives.description.dictionary = [entry]
     assert parameters(drives) == ([entry] if stays else [])
+
+
+def test_what_a_device_counts_of_further_axes_is_no_parameter_either():
+    """210Bh of the TMCM-6212, a step counter, is 230Bh of the axis 1."""
+    drives = held({(0x210B, 1): 5, (0x230B, 1): 6, (0x2303, 0): 7})
+    drives.description.hints = find_device("tmcm6212").master
+    drives.description.of_further_axes = lambda: {(0x230B, 1): (drives.entries[0x210B, 1], 1)}
+    assert [entry.index for entry in parameters(drives)] == [0x2303]
 
 
 def test_where_an_axis_differs_and_what_it_has_not():

@@ -224,7 +224,7 @@ def test_drives_of_a_bus_that_make_no_target_are_closed(travel, message, monkeyp
     closed = []
     drives = SimpleNamespace(
         num_axes=1, device=find_device("tmcm1636"), close=lambda: closed.append(1), safety=None,
-        read=lambda name: np.array([65536]),
+        read=lambda name: np.array([65536]), axis_numbers=range(1),
     )  # fmt: skip
     monkeypatch.setattr("drive_env.master.open_drives.open_drives", lambda *arguments, **options: drives)
     with pytest.raises(ValueError, match=message):
@@ -277,12 +277,21 @@ def test_axes_that_pull_at_one_thing_move_together(linked):
 def test_limits_of_a_target(change, message):
     given = {"supply": [24.0], "low": [-1.0], "high": [1.0], "speed": 10.0, "current": 1.0} | change
     given = {name: np.array(value) if isinstance(value, list) else value for name, value in given.items()}
-    drives = SimpleNamespace(num_axes=1)
+    drives = SimpleNamespace(num_axes=1, axis_numbers=range(1))
     if message is None:
         Target(drives, find_device("tmcm1636"), find_motor("qbl4208"), **given)
         return
     with pytest.raises(ValueError, match=message):
         Target(drives, find_device("tmcm1636"), find_motor("qbl4208"), **given)
+
+
+def test_chosen_axes_are_called_by_their_number_among_all():
+    drives = SimpleNamespace(num_axes=2, axis_numbers=(1, 3))
+    given = {"supply": np.full(2, 24.0), "low": np.full(2, -1.0), "speed": 10.0, "current": 1.0}
+    target = Target(drives, find_device("tmcm1636"), find_motor("qbl4208"), high=np.ones(2), **given)
+    assert target.axis_numbers == (1, 3)
+    with pytest.raises(ValueError, match=r"axis 3: travel -1 to -0\.1 rad must contain 0"):
+        replace(target, high=np.array([1.0, -0.1]))
 
 
 # --- what is made of drives that are there already ----------------------------------------------------------------

@@ -88,12 +88,17 @@ def restorable(values: Mapping[Key, int], hints: MasterHints) -> dict[Key, int]:
 
 def parameters(drives: BusDrives) -> list[Entry]:
     """Return the entries that are parameters of a drive."""
+    known = drives.description
+    further = known.of_further_axes()  # an EDS may list them all: their commands are those of the first axis
+
+    def commands(entry: Entry) -> bool:
+        first, _ = further.get((entry.index, entry.sub), (entry, 0))
+        return bool(command(first.index, known.hints))
+
     return [
         entry
-        for entry in drives.description.dictionary
-        if entry.access in ("rw", "rwr", "rww")
-        and not command(entry.index, drives.description.hints)
-        and drives.description.is_number(entry)
+        for entry in known.dictionary
+        if entry.access in ("rw", "rwr", "rww") and not commands(entry) and known.is_number(entry)
     ]
 
 

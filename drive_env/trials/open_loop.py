@@ -334,18 +334,24 @@ class OpenLoopTrials(Trials):
         origin = drives.read(cia402.POSITION_ACTUAL)
         scaler = drives.read(Role.POSITION_SCALE)
         most, share = highest_ramp(device_of(drives)), acceleration_share(device_of(drives), motor)
-        found = Identified(*np.zeros((4, count)))
         left = where.copy()
+        found, before = None, None
         for rotors in TRIED_ROTORS:
             move = plan_move(motor, np.full(count, rotors * motor.inertia), scaler, reach, most, share)
+            if before is not None and np.all((move.distance == before)[left]):
+                continue  # speed or travel had ended it, not the load: it would lose the same steps
+            before = move.distance
             seen, position, lost = self._identify_by(move, origin, reach, left)
-            found = Identified(*(np.where(left, a, b) for a, b in zip(seen, found, strict=True)))
+            # Of an axis that takes no part the first move says what it may: an inertia of 0 no plan could divide by.
+            found = Identified(*(np.where(left, a, b) for a, b in zip(seen, found or seen, strict=True)))
+            self._check_moved(position, move, left & ~lost)
             if not np.any(again := left & lost):
                 break
             left = again
             self._start_anew(left, np.asarray(scaler / (TOOTH * motor.n_p), float))
             origin = np.where(left, drives.read(cia402.POSITION_ACTUAL), origin)
         self._check_moved(position, move, left)
+        assert found is not None, "some move is the first"
         return found, origin
 
     def _start_anew(self, where: Mask, full_step: Floats) -> None:
