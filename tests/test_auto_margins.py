@@ -114,8 +114,8 @@ def test_a_margin_that_was_not_seen_is_a_bound_or_a_reservation(seen, bound, res
 
 @pytest.mark.parametrize("linked", [False, True])
 @pytest.mark.parametrize(("velocity", "position", "factors"), [
-    (2.3, 2.3, (1.0, 1.0)),
-    (3.0, 2.2, (0.5, 0.5)),
+    (3.0, 3.0, (1.0, 1.0)),
+    (3.1, 2.2, (0.5, 0.5)),
     (9.0, 2.2, (0.5, 0.5)),  # the velocity loop wants half of velocity P, and position P goes with it
     (2.2, 9.0, (1.0, 0.5)),
     (9.0, 9.0, (0.5, 0.25)),

@@ -145,9 +145,10 @@ def test_every_axis_is_tripped_though_the_first_was(drives):
     node = NodeAxes(drives, 0)
     tripped = []
     for k, was in ((0, True), (1, False)):
-        node[k].trip = lambda k=k, was=was: tripped.append(k) or was
-    assert node.trip() is True and tripped == [0, 1]
-    node[0].trip = lambda: False
+        node[k].trip = lambda told, k=k, was=was: tripped.append((k, told)) or was
+    assert node.trip("heartbeat_lost") is True
+    assert tripped == [(0, "heartbeat_lost"), (1, "heartbeat_lost")]
+    node[0].trip = lambda told: False
     assert node.trip() is False
 
 

@@ -42,7 +42,7 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
-CLOSE = {"phase": 25.0, "gain": 5.0}  # margins that Ms as it is sought leaves at least [degrees, dB]
+CLOSE = {"phase": 19.0, "gain": 3.5}  # margins that Ms as it is sought leaves at least [degrees, dB]
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
 OVERTIME = 0.5  # s beyond the budget for a response: so near to the end margins are worth more than the time
 LONGER = 2  # times as long it is shaken where too little was seen
