@@ -7,14 +7,14 @@ import importlib
 import typer
 
 from agents.commands.options import interrupted
-from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
+from drive_env.commands.program import CONTEXT, Quiet, Verbose, Version, say_as_much
 
 app = typer.Typer(
     name="drive-agent",
     no_args_is_help=True,
     rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT,
 )
 
 PANELS = {

@@ -23,7 +23,7 @@ from drive_env.commands.names import list_names
 from drive_env.commands.new import new_from_eds
 from drive_env.commands.options import INTERRUPTED
 from drive_env.commands.parameters import backup, commission, diff, restore
-from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
+from drive_env.commands.program import CONTEXT, Quiet, Verbose, Version, say_as_much
 from drive_env.commands.render import render
 from drive_env.commands.scan import scan
 from drive_env.commands.scope import scope
@@ -36,7 +36,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT,
 )
 
 PANELS = {

@@ -48,13 +48,13 @@ FIRST_NODE = "1; position 0"
 Nodes = Annotated[
     list[int] | None,
     typer.Option(
-        "--node", "--position", "-n", help="Node-ID, on EtherCAT the position; may be repeated.",
+        "--node", "-n", help="Node-ID, on EtherCAT the position; may be repeated.",
         show_default=FIRST_NODE,
     ),
 ]  # fmt: skip
 Node = Annotated[
     int | None,
-    typer.Option("--node", "--position", "-n", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE),
+    typer.Option("--node", "-n", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE),
 ]
 AxisOfNode = Annotated[
     int | None,

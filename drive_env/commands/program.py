@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +13,16 @@ from drive_env.commands.compile_bar import show_compiling
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
 AGAIN = 10.0  # s, after which a line that was printed is printed again
+OTHER_NAMES = {"position": "node"}  # options that go by a second name: on EtherCAT a node is known by its position
+
+
+def _option_named(name: str) -> str:
+    """Return an option's own name, without hyphens, of any that it goes by."""
+    return OTHER_NAMES.get(name, name)
+
+
+# What is common to all commands of a program.
+CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "token_normalize_func": _option_named}
 
 
 class RepeatedLines(logging.Filter):

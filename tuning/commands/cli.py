@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
+from drive_env.commands.program import CONTEXT, Quiet, Verbose, Version, say_as_much
 from tuning.commands.auto import auto
 from tuning.commands.identify import identify
 from tuning.commands.optimise import optimise
@@ -21,7 +21,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT,
 )
 
 PANELS = {
