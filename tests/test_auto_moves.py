@@ -26,6 +26,7 @@ from tuning.auto.bench import Journal
 from tuning.auto.calmer_gains import calmer, standing
 from tuning.auto.certify import certificate
 from tuning.auto.load_step import NOISE, SWING, load_step
+from tuning.auto.measured_margins import SOUGHT
 from tuning.auto.moves import ease, keep_what_is_better
 from tuning.auto.one_button import auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown, without_noise
@@ -565,7 +566,7 @@ def test_gains_that_stand_are_far_from_instability_by_the_measured_loop(monkeypa
     bench, start = bench_of(time_waits=True), identified_basis()
     bench.rng, found = np.random.default_rng(0), recorded([FOUND], response=object())
     others = np.array([[*FOUND[:2], p, *FOUND[3:]] for p in range(20, 1000, 20)])
-    assert standing(bench, start, found, 0, 0.1, 0.1, others)[2] == pytest.approx(160, rel=0.2)  # at 4
+    assert standing(bench, start, found, 0, 0.1, 0.1, others)[2] == pytest.approx(40 * SOUGHT, rel=0.2)
 
 
 # --- what is accepted stands still ------------------------------------------------------------------------------------
