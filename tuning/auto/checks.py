@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with
 LOOKED_AT = 400  # frequencies of the model
-# By how much position P is lowered at a time, and how often at most: what 0.06 of it does not help lies in another loop.
+# By how much position P is lowered at a time, and how often at most: what 0.06 of it does not help lies elsewhere.
 STEP, STEPS = 0.85, 18
 
 
