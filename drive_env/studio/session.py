@@ -321,7 +321,9 @@ class Session:
             if self._real.bus is not None:
                 self.description = self._real.bus.description  # which knows the time between two SYNCs
             self.recorder = ScopeRecorder(self._real.num_axes, self.description.cycle)
-            self._drives = SharedDrives(self._real, self.recorder, self._look, self._hear, self.presence.moves)
+            self._drives = SharedDrives(
+                self._real, self.recorder, self._look, self._hear, self.presence.moves, self._why_stopped
+            )
             self._states = AxisStates(self._real, self.description)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
@@ -439,6 +441,10 @@ class Session:
             job.is_told = True
             self._await_rest()
             raise JobStoppedError(job.stopped)
+
+    def _why_stopped(self) -> str:
+        """Return why the present job was stopped, "" if it was not."""
+        return "" if self._current is None else self._current.stopped
 
     def _await_rest(self) -> None:
         """Let emulated axes come to rest: what a stopped job puts back takes their voltage away, and they would coast.

@@ -9,16 +9,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.arguments import object_names, whole_cycles
 from drive_env.drives.interface import Drives, Integers, Mask
 from drive_env.drives.trace import Trace
+from drive_env.safety.errors import SafetyError
+from drive_env.studio.errors import JobStoppedError
 from drive_env.studio.recorder import ScopeRecorder
 
 if TYPE_CHECKING:
@@ -37,6 +41,18 @@ MOST_BEHIND = 0.1  # s; a computer that was slower does not catch up
 
 Key = tuple[int, int]
 
+T = TypeVar("T")
+
+CONTROLWORDS = (cia402.CONTROLWORD, (cia402.CONTROLWORD, 0), "Controlword")  # as they may be called
+
+
+def _operates(value: ArrayLike) -> bool:
+    """Return whether a controlword has an axis operate, and not halt."""
+    words = np.asarray(value)
+    if words.dtype.kind not in "iu":
+        return True  # a text, whose meaning the drives know
+    return bool(np.any((words & 0x0F == cia402.ENABLE_OPERATION) & (words & cia402.HALT == 0)))
+
 
 class SharedDrives:
     """Drives whose calls end when their job is stopped.
@@ -47,6 +63,9 @@ class SharedDrives:
         look: Called between two pieces of time, by the thread whose calls these are; it may raise, which ends them.
         hear: Called with emergencies, whoever asked for them.
         moves: Returns whether a page moves an axis by a button that it holds, or as long as it is there.
+        stopped: Returns why the job under way was stopped, "" if it was not. It hears of that once, by `look`, so that
+            it can put back what it changed. Until it has ended it has no axis operate any more, and the envelope's own
+            error of the same stop, which would take the place of that, is not raised.
 
     Attributes:
         lock: Held while emulated drives are called: a stop from another thread waits for a piece at most.
@@ -60,6 +79,7 @@ class SharedDrives:
         look: Callable[[], None],
         hear: Callable[[Sequence[EmergencyMessage]], None],
         moves: Callable[[], bool],
+        stopped: Callable[[], str],
     ) -> None:
         self.lock = threading.RLock()
         self.paced = True
@@ -68,6 +88,7 @@ class SharedDrives:
         self._look = look
         self._hear = hear
         self._moves = moves
+        self._stopped = stopped
         self._refused: set[tuple[Key, ...]] = set()  # what cannot be sampled at once
         self._due = time.perf_counter()
         self._start = time.monotonic()
@@ -117,13 +138,15 @@ class SharedDrives:
         """Return an object of every axis."""
         self._look()
         with self.lock:
-            return self._drives.read(name)
+            return self._calling(lambda: self._drives.read(name))
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object of every axis, or of some."""
         self._look()
+        if name in CONTROLWORDS and _operates(value) and (reason := self._stopped()):
+            raise JobStoppedError(reason)
         with self.lock:
-            self._drives.write(name, value, where=where)
+            self._calling(lambda: self._drives.write(name, value, where=where))
 
     def advance(self, duration: float) -> None:
         """Let time pass [s], whole communication cycles; it is recorded."""
@@ -175,6 +198,15 @@ class SharedDrives:
         self.close()
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _calling(self, call: Callable[[], T]) -> T:
+        """Return what a call of the drives returns; it is made again if the envelope tells what a job knows already."""
+        try:
+            return call()
+        except SafetyError:
+            if not self._stopped():
+                raise
+            return call()
+
     def _in_pieces(
         self,
         asked: tuple[ObjectName, ...],
@@ -214,7 +246,7 @@ class SharedDrives:
         while True:
             try:
                 with self.lock:
-                    trace = self._drives.record((*asked, *wanted), span, play, period)
+                    trace = self._calling(partial(self._drives.record, (*asked, *wanted), span, play, period))
                 break
             except ObjectAccessError:
                 if not wanted:
