@@ -38,6 +38,14 @@ def test_the_draws_are_those_of_the_figures_that_are_published():
     assert (low, high) == (4.0, 36.0)
 
 
+def test_every_value_of_a_sample_is_drawn_its_first_and_its_last_too():
+    seen = []
+    bootstrap_interval(lambda x: seen.append(np.unique(x)) or mean(x), np.arange(5.0))
+    bootstrap_interval(lambda x, y: seen.extend([np.unique(x), np.unique(y)]) or difference(x, y), np.arange(5.0),
+                       np.arange(5.0), paired=True)  # fmt: skip
+    assert [one.tolist() for one in seen] == [[0.0, 1.0, 2.0, 3.0, 4.0]] * 3
+
+
 def test_an_interval_is_of_2000_draws_from_their_40th_to_their_1960th_part():
     """2.5 and 97.5 % of the values, in order."""
     shapes = []

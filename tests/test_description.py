@@ -9,7 +9,7 @@ import pytest
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import CIA_402, LONGEST_TIMEOUT, check_timeout, describe
+from drive_env.master.description import CIA_402, LONGEST_TIMEOUT, NODE_CODES, check_timeout, describe
 
 SERVO = describe("tmcm1636", None)
 SERVO_EDS = find_device("tmcm1636").eds
@@ -161,6 +161,12 @@ def test_a_time_out_ends(timeout, holds):
         return
     with pytest.raises(ValueError, match=r"is impossible; give one above 0 s, e.g. 0.5, up to an hour"):
         check_timeout(timeout)
+
+
+def test_errors_of_a_node_are_those_of_its_software_and_of_its_communication():
+    """CiA 301, table 26: 60xxh to 6Fxxh, and 80xxh to 82xxh."""
+    codes = [code for code in range(0x100) if any(code in group for group in NODE_CODES)]
+    assert codes == [*range(0x60, 0x70), 0x80, 0x81, 0x82]
 
 
 def test_emergencies_have_the_devices_name_or_cia_301s_or_their_code(tmp_path):

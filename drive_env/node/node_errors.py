@@ -95,7 +95,7 @@ class NodeErrors:
             if axis is not without:
                 register |= self._of_axis(number, axis.error_register)
         for key, condition in self.conditions.items():
-            register |= self._of_axis(self._last_of.get(key, 0), condition.error_register)
+            register |= self._of_axis(self._last_of[key], condition.error_register)
         return register
 
     def _of_axis(self, number: int, register: int) -> int:
