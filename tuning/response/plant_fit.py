@@ -102,7 +102,9 @@ class PlantFit(NamedTuple):
                 if math.isfinite(estimate.value) and math.isfinite(estimate.high - estimate.low):
                     at = rng.normal(estimate.value, (estimate.high - estimate.low) / (2.0 * NORMAL_95))
                     values[_FIELDS.get(name, name)] = max(at, 0.1 * estimate.value)
-            if values.get("anti_resonance", 0.0) < values.get("resonance", math.inf):
+            # One of the two may have been refused: it stays as it is, and the other is not to pass it.
+            ends = [values.get(name, getattr(self.plant, name)) for name in ("anti_resonance", "resonance")]
+            if not self.plant.is_elastic or ends[0] < ends[1]:
                 yield self._replace(plant=replace(self.plant, **values))  # type: ignore[arg-type]  # none of them is counts
 
 
