@@ -12,12 +12,13 @@ from thinning import part
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.motors import find_motor
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
-from tuning.auto import choice
+from tuning.auto import choice, refinement
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
@@ -30,6 +31,7 @@ from tuning.auto.moves import OVERTIME
 from tuning.auto.one_button import BUDGET, auto
 from tuning.auto.proving import ProvingGround
 from tuning.compare.suite import load_suite, open_machines
+from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.true_plant import true_plant
@@ -336,9 +338,9 @@ def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, mon
     tried = []
     run = ProvingGround.run
 
-    def seen(self, gains, where):
+    def seen(self, gains, where, heavier=False):
         tried.append(gains[0].copy())
-        return run(self, gains, where)
+        return run(self, gains, where, heavier)
 
     monkeypatch.setattr(ProvingGround, "run", seen)
     monkeypatch.setattr(proving_module, "RESTLESS", 1.0)  # or it would be slowed before
@@ -445,6 +447,18 @@ def test_one_shaking_axis_of_a_bus_does_not_fail_its_neighbour():
         motion.disable(drives)
 
 
+def test_an_axis_that_shakes_on_with_safe_gains_gets_slower_ones_within_100_ms():
+    """What was stopped may ring on, and feed gains that are safe at rest: an audit counts it after four windows."""
+    with emulated(load="inertia", num_threads=1) as target:
+        audit = DriveAudit(target)
+        watched = replace(target, drives=ObservedDrives(target.drives, audit))
+        wild = np.array([(4021, 1573, 6000, 4000, 2000)])
+        ground = ProvingGround(watched, [true_plant(target.drives)], (target.low, target.high), wild, wild)
+        assert not ground.run(wild, np.ones(1, bool)).passed[0]
+        np.testing.assert_array_equal(gains(target.drives), [(4021, 1573, 1500, 1000, 500)])
+        assert audit.violations[KINDS.index("oscillated")].tolist() == [0]
+
+
 def test_when_the_envelope_stops_all_axes_it_is_found_out_which_one_it_was(monkeypatch):
     with emulated(load="inertia", num_machines=3, num_threads=1) as target:
         plants = [true_plant(target.drives, axis) for axis in range(3)]
@@ -452,10 +466,10 @@ def test_when_the_envelope_stops_all_axes_it_is_found_out_which_one_it_was(monke
         ground = ProvingGround(target, plants, (target.low, target.high), safe, safe)
         run = ground._trials.run
 
-        def stopped(gains, incumbent, move, origin, direction, where):
+        def stopped(gains, incumbent, move, origin, direction, where, heavier):
             if where[1]:
                 raise SafetyError("axis 1 oscillates")
-            return run(gains, incumbent, move, origin, direction, where)
+            return run(gains, incumbent, move, origin, direction, where, heavier)
 
         monkeypatch.setattr(ground._trials, "run", stopped)
         proof = ground.run(safe, np.ones(3, bool))
@@ -555,7 +569,7 @@ def test_on_the_public_machines_it_is_far_better_than_the_baseline_rule_and_stay
     assert len(ratios) == len(machines) and sum(accepted) >= len(machines) - 1
     assert np.median(ratios) <= 0.6
     assert violations == 0
-    assert np.median(seconds) < 1.2 * BUDGET and max(seconds) < BUDGET + choice.OVERTIME + OVERTIME
+    assert np.median(seconds) < 2.5 * BUDGET and max(seconds) < BUDGET + refinement.OVERTIME + OVERTIME
 
 
 def test_brief_identification_is_right_and_quick():

@@ -53,6 +53,32 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
 
 
 # --- both loops, by a measured velocity loop --------------------------------------------------------------------------
+@pytest.mark.parametrize(("limit", "share"), [(9.0, 1.0), (4.0, 0.85), (3.0, 0.6), (0.1, 1.0)])
+def test_gains_are_lowered_until_both_loops_are_as_far_from_instability_as_is_asked(limit, share, monkeypatch):
+    """P of the loop that is too near, and of those above it; what does not help is left alone."""
+    names = find_device("tmcm1636").gains.names
+
+    def ms(basis, response, gains, k):
+        near = {
+            "velocity": 1e-3 * gains[names.index("velocity_p")],
+            "position": 1e-3 * gains[names.index("position_p")],
+        }
+        return {loop: SimpleNamespace(ms=value) for loop, value in near.items()}
+
+    monkeypatch.setattr(auto_margins, "margins_with", ms)
+    bench = SimpleNamespace(target=SimpleNamespace(device=find_device("tmcm1636"), linked=False))
+    given = np.array([4000, 1500, 2000, 700, 4600])
+    seen = recorded([given], response=object())
+    found = auto_margins.not_beyond(bench, basis([given]), seen, given, 0, limit)
+    assert found.tolist() == [*given[:4], round(share * 4600)]
+    both = np.array([4000, 1500, 4600, 700, 4600])
+    found = auto_margins.not_beyond(bench, basis([given]), seen, both, 0, limit)
+    assert found.tolist() == [4000, 1500, round(share * 4600), 700, round(share * 4600)]
+    unseen = recorded([given], response=object(), unseen=np.ones(1, bool))
+    for nothing in (unseen, recorded([given], response=None)):
+        assert auto_margins.not_beyond(bench, basis([given]), nothing, given, 0, 1.0).tolist() == given.tolist()
+
+
 GAINS = np.array([8009, 9699, 847, 1112, 1420])
 OTHERS = np.array([[4021, 1573, 445, 329, 118], [8009, 9699, 500, 600, 700], [6000, 4000, 900, 1000, 1400]])
 

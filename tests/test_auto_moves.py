@@ -23,7 +23,7 @@ from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
 from tuning.auto import search as auto_search
 from tuning.auto.bench import Journal
-from tuning.auto.calmer_gains import calmer, standing
+from tuning.auto.calmer_gains import calmer, nearby, standing
 from tuning.auto.certify import certificate
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.measured_margins import SOUGHT
@@ -123,8 +123,8 @@ def test_where_one_more_move_fails_lesser_gains_are_taken_not_the_same_of_anothe
     finds(monkeypatch, np.stack([faster(target.device.gains, good, 0.8), good]))
     run, show, tried, shown = ProvingGround.run, ProvingGround.show, [], []
 
-    def seen(self, gains, where):
-        proof = run(self, gains, where)
+    def seen(self, gains, where, heavier=False):
+        proof = run(self, gains, where, heavier)
         tried.append((gains[0].tolist(), bool(proof.passed[0] and where[0])))
         return proof
 
@@ -308,9 +308,9 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
         finds(monkeypatch, wanted)
         run, holding = ProvingGround.run, []
 
-        def noted(self, tried, where):
+        def noted(self, tried, where, heavier=False):
             holding.append((~where, gains(self.target.drives)))
-            return run(self, tried, where)
+            return run(self, tried, where, heavier)
 
         monkeypatch.setattr(ProvingGround, "run", noted)
         result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
@@ -529,44 +529,58 @@ def test_where_time_does_not_wait_no_twin_is_asked_while_an_axis_is_enabled(monk
     assert found.tolist() == [4000, 1000, 1000, 2400, 1000]
 
 
+def test_gains_near_to_others_have_some_of_velocity_p_velocity_i_position_p_and_torque_p_lowered():
+    rows = nearby(SimpleNamespace(device=find_device("tmcm1636")), np.array(FOUND))
+    assert rows.shape == (47, 5) and len(np.unique(rows, axis=0)) == 47
+    share = rows / FOUND
+    assert np.all(share[:, 1] == 1.0) and np.all(share <= 1.0) and not np.any((share == 1.0).all(axis=1))
+    assert [sorted(set(share[:, column].round(3))) for column in (0, 2, 3, 4)] == [
+        [0.6, 1.0], [0.45, 0.6, 0.8, 1.0], [0.5, 1.0], [0.6, 0.8, 1.0]
+    ]  # fmt: skip
+
+
 @contextmanager
 def twins_that_swing(swing, bench, basis, k, sets, repeats, *, slippery=False):
-    """Twins on which more velocity P costs less and swings more, `swing` of it with that of FOUND."""
-    assert slippery, "what shakes is held by less friction than was found"
+    """Twins on which more velocity P costs less; slippery ones swing more by it, `swing` with that of FOUND."""
 
     def cost_and_rest(gains):
+        assert slippery, "what shakes is held by less friction than was found"
         share = gains[..., 2] / FOUND[2]
-        return 1.0 / share, swing * share
+        return 0.0 * share, swing * share
 
-    yield SimpleNamespace(device=find_device("tmcm1636"), num_axes=1, sets=sets, cost_and_rest=cost_and_rest)
+    def score(gains):
+        assert not slippery, "what it costs is that of the axis as it is"
+        return FOUND[2] / gains[..., 2] + 0.1 * (np.array(FOUND)[[0, 3, 4]] / gains[..., [0, 3, 4]]).sum(axis=-1)
+
+    yield SimpleNamespace(cost_and_rest=cost_and_rest, score=score)
 
 
-@pytest.mark.parametrize(("swing", "most"), [
-    (0.10, 0.5),  # of FOUND's velocity P: the twins swing as the axis does
-    (0.05, 0.5),  # half as much: so will they with other gains
-    (0.20, 0.5),
-    (0.01, 2.5),  # so unlike the axis that they are no measure of it
-    (0.90, 1.0 / 9.0),
-])  # fmt: skip
-def test_gains_with_which_an_axis_is_to_stand_swing_less_on_twins_by_as_much_as_it_is_to(swing, most, monkeypatch):
-    monkeypatch.setattr("tuning.auto.calmer_gains._twins_of", partial(twins_that_swing, swing))
+@pytest.mark.parametrize("twins_swing", [0.10, 0.01, 0.9])  # as the axis does, and by how much less or more
+@pytest.mark.parametrize(("swing", "share"), [(0.05, 0.8), (0.07, 0.6), (0.09, 0.45), (0.5, 0.45)])
+def test_gains_with_which_an_axis_is_to_stand_swing_less_on_twins_by_as_much_as_it_is_to(
+    swing, share, twins_swing, monkeypatch
+):
+    """By what share twins swing less is what is asked of them; where none does by enough, the calmest are taken."""
+    monkeypatch.setattr("tuning.auto.calmer_gains._twins_of", partial(twins_that_swing, twins_swing))
     monkeypatch.setattr("tuning.auto.calmer_gains.sensitivity", lambda *given: 2.0)
-    bench, start = bench_of(time_waits=True), identified_basis()
-    bench.rng, found = np.random.default_rng(0), recorded([FOUND], response=object())
-    others = np.array([[*FOUND[:2], round(share * FOUND[2]), *FOUND[3:]] for share in np.linspace(0.02, 1.0, 99)])
-    gains = standing(bench, start, found, 0, 0.10, 0.05, others)
-    assert gains[2] / FOUND[2] == pytest.approx(most, rel=0.2)
+    found = recorded([FOUND], response=object())
+    bench = bench_of(time_waits=True)
+    gains = standing(bench, identified_basis(), found, 0, swing, 0.045, np.array([FOUND])[:0])
+    assert gains[2] / FOUND[2] == pytest.approx(share, rel=0.01)
+    assert swing == 0.5 or gains.tolist() == [*FOUND[:2], gains[2], *FOUND[3:]], "nothing is lowered that need not be"
 
 
 def test_gains_that_stand_are_far_from_instability_by_the_measured_loop(monkeypatch):
     monkeypatch.setattr("tuning.auto.calmer_gains._twins_of", partial(twins_that_swing, 0.1))
     monkeypatch.setattr(
-        "tuning.auto.calmer_gains.sensitivity", lambda target, basis, response, gains, k: gains[2] / 40.0
+        "tuning.auto.calmer_gains.sensitivity",
+        lambda target, basis, response, gains, k: SOUGHT * gains[4] / (0.7 * FOUND[4]),
     )
-    bench, start = bench_of(time_waits=True), identified_basis()
-    bench.rng, found = np.random.default_rng(0), recorded([FOUND], response=object())
-    others = np.array([[*FOUND[:2], p, *FOUND[3:]] for p in range(20, 1000, 20)])
-    assert standing(bench, start, found, 0, 0.1, 0.1, others)[2] == pytest.approx(40 * SOUGHT, rel=0.2)
+    found = recorded([FOUND], response=object())
+    near = np.array([[*FOUND[:4], p] for p in range(20, FOUND[4], 20)])
+    gains = standing(bench_of(time_waits=True), identified_basis(), found, 0, 0.1, 0.11, near)
+    # It costs as the square of how much too near they are, more than slower gains do.
+    assert gains[4] == pytest.approx(0.7 * FOUND[4], rel=0.02)
 
 
 # --- what is accepted stands still ------------------------------------------------------------------------------------

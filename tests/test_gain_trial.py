@@ -19,6 +19,7 @@ from drive_env.trials.gain_trial import (
     clear,
     measured_cost,
     momentum_balance,
+    samples_in_motion,
     softness,
 )
 from drive_env.trials.oscillation import shakes
@@ -30,6 +31,7 @@ from drive_env.trials.positioning import (
     TRIAL,
     WATCH,
     highest_ramp,
+    longer_way,
     plan_move,
     power_up,
     resting_swing,
@@ -55,7 +57,8 @@ def test_a_trial_takes_250_ms_and_its_move_60_whatever_it_turns():
     """It has settled by 150 ms, when the load comes; the ripple is that of its last 45 ms; watched every 25 ms."""
     assert (CYCLE, PROFILE, QUIET, SETTLED, TRIAL, WATCH) == (0.001, 60, 105, 150, 250, 25)
     assert PHASES == ("move", "reversal", "probe")
-    assert PHASE_TITLES == ("move", "reversal", "move with 1.5 times velocity P")
+    assert PHASE_TITLES[:3] == ("move", "reversal", "move with 1.5 times velocity P")
+    assert PHASE_TITLES[3:] == ("move with velocity P over 1.3",)
 
 
 def test_the_least_error_of_a_load_step_is_half_a_count_all_the_time():
@@ -64,6 +67,15 @@ def test_the_least_error_of_a_load_step_is_half_a_count_all_the_time():
     counts_of_a_turn = 2.0 * np.pi * move.counts
     assert counts_of_a_turn == pytest.approx(MOTOR.encoder_counts)
     assert move.least_error == pytest.approx(0.5 * 2.0 * np.pi / MOTOR.encoder_counts * 0.1)
+
+
+@pytest.mark.parametrize(("low", "high", "way"), [
+    (-1.0, 2.0, 2.0), (-2.0, 1.0, -2.0),
+    (-1.0, 1.0, 1.0), (-1.1, 1.0, 1.0), (-1.2, 1.0, -1.2),  # about as long: forwards, as all axes of a machine go then
+    (-np.inf, np.inf, np.inf), (-1.0, np.inf, np.inf), (-np.inf, 1.0, -np.inf), (0.0, 1.0, 1.0), (-1.0, 0.0, -1.0),
+])  # fmt: skip
+def test_the_longer_way_is_forwards_where_both_are_about_as_long(low, high, way):
+    assert longer_way(low, high) == way
 
 
 # --- cost -------------------------------------------------------------------------------------------------------------
@@ -181,18 +193,42 @@ def test_identification_moves_three_rotors_there_and_back_from_where_the_axes_st
     monkeypatch.setattr(gain_trial, "per_increment", lambda drives, name: scale)
     monkeypatch.setattr(gain_trial, "write_profile", lambda drives, move, where: setattr(drives, "profile", move))
     monkeypatch.setattr(gain_trial, "start", lambda drives, target, where: drives.targets.append(target.tolist()))
-    monkeypatch.setattr(gain_trial, "momentum_balance", lambda *arguments: balanced.append(arguments) or "found")
+    monkeypatch.setattr(gain_trial, "momentum_balance",
+                        lambda *arguments, moving: balanced.append((*arguments, moving)) or "found")  # fmt: skip
     reach, where = np.array([50.0, -0.5]), np.array([True, True])
     assert Trials(drives, MOTOR, 1, 0.004).identify(reach, where)[0] == "found"
     move = plan_move(MOTOR, np.full(2, 3.0 * MOTOR.inertia), np.array([65_536, 32_768]), reach)
     assert drives.profile.distance.tolist() == move.distance.tolist()
     assert drives.targets == [(np.array([1000, -500]) + move.distance).tolist(), [1000, -500]]
-    ((angle, speed, current, motor),) = balanced
+    ((angle, speed, current, motor, moving),) = balanced
     turn = 2.0 * np.pi
     np.testing.assert_allclose(angle[100], [1e4 / 65_536 * turn, -2e4 / 32_768 * turn])
     np.testing.assert_allclose(speed[100], ratio * 200.0 * turn / np.array([65_536, 32_768]))
     np.testing.assert_allclose(current[[100, TRIAL + 100]], [[0.1, 0.3], [-0.1, -0.3]])
     assert motor is MOTOR and len(angle) == 2 * TRIAL and angle[-1].tolist() == [0.0, 0.0]
+    np.testing.assert_array_equal(moving, samples_in_motion(speed, 3))
+
+
+def test_what_dry_friction_holds_at_rest_is_no_part_of_the_motion():
+    """An integrator leaves it the current that the move ended with, up to its own: taken for a load it was 1.4 J."""
+    angle, speed = there_and_back()
+    J, coulomb = 4.0 * MOTOR.inertia, 0.5
+    acceleration = np.diff(speed, axis=0, prepend=0.0) / CYCLE
+    current = J / MOTOR.torque_constant * acceleration + coulomb * np.clip(speed, -1, 1)
+    current[100:TRIAL] -= 0.3
+    current[TRIAL + 100 :] += 0.25
+    held = momentum_balance(angle, speed, current, MOTOR, moving=samples_in_motion(speed, 3))
+    np.testing.assert_allclose([held.inertia[0] / J, 1.0 + held.offset[0]], 1.0, atol=0.02)
+    assert held.coulomb[0] == pytest.approx(coulomb, rel=0.06)
+    assert abs(momentum_balance(angle, speed, current, MOTOR).inertia[0] / J - 1.0) > 0.1, "which it is without"
+
+
+def test_a_rotor_is_in_motion_from_some_samples_before_it_turns_until_some_after():
+    speed = np.zeros((60, 2))
+    speed[20, 0], speed[30:41, 1] = -1.1, 1.0
+    moving = samples_in_motion(speed, 10)
+    assert np.flatnonzero(moving[:, 0]).tolist() == list(range(10, 31)) and not moving[:, 1].any()
+    assert np.flatnonzero(samples_in_motion(speed, 0)[:, 0]).tolist() == [20]
 
 
 # --- trials -----------------------------------------------------------------------------------------------------------
@@ -284,6 +320,23 @@ def test_a_trial_moves_there_back_and_there_again_with_more_velocity_p(trials, d
     assert len(PHASES) == 3
 
 
+def test_a_heavier_load_is_a_last_move_back_with_less_velocity_p_that_costs_as_the_integrators_are(trials):
+    """1.3 times the inertia takes of the loop gain what P over 1.3 does; a load step is held by the integrators."""
+    drives = Played(shaking={(3, 2): [0]})
+    targets = []
+    record = drives.record
+    drives.record = lambda *arguments: targets.append(drives.target.copy()) or record(*arguments)
+    every = np.ones(4, bool)
+    found = trials(drives).run(GAINS, SAFE, MOVE, np.full(4, 500), np.ones(4, int), every, heavier=True)
+    away = 500 + MOVE.distance
+    assert [t.tolist() for t in targets[:: TRIAL // WATCH]] == [away.tolist(), [500] * 4, away.tolist(), [500] * 4]
+    assert drives.recorded[3 * TRIAL // WATCH][1][2].tolist() == [1000, 200, round(800 / 1.3), 100, 50]
+    assert found.aborted.tolist() == [[False] * 4] * 3 + [[True, True, False, False]]
+    costs = found.costs(np.full(4, 2.0))
+    np.testing.assert_allclose(costs[:, 3], [2.0**0.4, 2.0**0.4, (2.0 / 1.5) ** 0.4, 2.0**0.4])
+    np.testing.assert_allclose(measured_cost(costs)[0], 0.5 * 2.0**0.4 + 15.0)
+
+
 def test_a_machine_with_an_axis_that_oscillates_gets_its_gains_back_at_once_and_for_the_rest(trials):
     drives = Played(shaking={(1, 3): [2]})
     found = run(trials, drives)
@@ -356,6 +409,16 @@ def test_a_position_beyond_the_counters_end_is_where_it_goes_on(trials, monkeypa
     made.power_up("there")
     assert went == [([-(2**31) + 3, 2**31 - 3, 5, 2**31 - 1], "here"), "there"]
     assert made.leave() is None and made.look is None
+
+
+def test_where_a_demand_is_not_recorded_it_is_computed_and_not_asked_for(trials, monkeypatch):
+    monkeypatch.setattr(gain_trial, "is_recorded", lambda drives: False)
+    drives, asked = Played(), []
+    record = drives.record
+    drives.record = lambda objects, seconds: asked.append(list(objects)) or record(objects, seconds)
+    found = run(trials, drives)
+    assert all(DEMAND not in objects for objects in asked)
+    assert np.abs(found.error[20]).max() > 0.5, "the profile has hardly begun where the axis is at its end already"
 
 
 def test_whoever_looks_is_called_after_every_cycle(trials):

@@ -25,6 +25,7 @@ from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group, open_machines
 from tuning.identify.estimate import NAMES, refused
 from tuning.identify.identification import identify
+from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.true_plant import true_plant
 from tuning.identify.working_state import borrowed
@@ -202,7 +203,7 @@ def test_what_is_told_briefly_is_inside_its_interval_and_the_rest_has_its_reason
     assert not outside(found), "axes, told, inside"
     assert not few_told(found, dict.fromkeys(TOLD_BRIEFLY, 0.4) | {"resistance": 0.9, "inductance": 0.9})
     # Intervals that are too narrow do not pass, of any quantity.
-    assert set(outside(found, share=1e-3)) == set(TOLD_BRIEFLY)
+    assert set(outside(found, share=2e-4)) == set(TOLD_BRIEFLY)
 
 
 @pytest.mark.slow
@@ -489,13 +490,22 @@ def test_axes_that_pull_at_one_thing_move_together():
 
 @pytest.mark.slow
 def test_the_joints_of_an_arm_are_identified_briefly_one_after_the_other():
-    """Each by its own inertia: moved at once they pull at each other, and one seems to have a fifth of it."""
+    """Each by its own inertia; and together, which a rule for moves of all needs: twice as much for some of them."""
     with emulated(load="robot", num_machines=2, randomise=["load"], seed=0, num_threads=2) as target:
         load = target.drives.inside.groups[0].load
         turning = way(load).joints
         alone = np.einsum("ad,cde,ae->ca", turning, load.mass_matrix(), turning)
-        found = np.array([axis.value("inertia") for axis in identify_briefly(target)]).reshape(alone.shape)
+        whole = moved_inertia(load)
+        axes = identify_briefly(target)
+    found, together = (
+        np.array(values).reshape(alone.shape)
+        for values in ([axis.value("inertia") for axis in axes], [axis.together for axis in axes])
+    )
     assert found == pytest.approx(alone, rel=0.25)
+    # The base turns all of the arm, which leaves its upright pose on the way: that needs more.
+    assert together[:, 1:] == pytest.approx(whole[:, 1:], rel=0.2)
+    assert together[:, 0] == pytest.approx(whole[:, 0], rel=0.4)
+    assert np.all(together[:, 1:3] > 1.5 * found[:, 1:3])
 
 
 def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own_inertia():

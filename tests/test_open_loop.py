@@ -692,13 +692,6 @@ def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identifi
     assert moving[TRIAL - 5 : TRIAL + 111, 0].all()
 
 
-def test_a_rotor_that_turns_back_within_ten_samples_is_not_at_rest():
-    speed = np.zeros((60, 2))
-    speed[20, 0], speed[30:41, 1] = -1.1, 1.0
-    moving = module._moving(speed)
-    assert np.flatnonzero(moving[:, 0]).tolist() == list(range(10, 31)) and not moving[:, 1].any()
-
-
 # --- a load that is heavier than a rotor's own ------------------------------------------------------------------------
 @pytest.fixture
 def heavy(monkeypatch):

@@ -14,15 +14,19 @@ from typer.testing import CliRunner
 from drive_env.gains import rule_gains, write_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
+from tuning.auto.measured_margins import SENSITIVITY
 from tuning.commands.cli import app
 from tuning.compare import comparison as compare_module
-from tuning.compare import tuners
+from tuning.compare import rule_check, tuners
 from tuning.compare.comparison import REPEATS, compare
 from tuning.compare.comparison_files import save
 from tuning.compare.rule_check import rule_passes
 from tuning.compare.suite import load_suite, open_group
 from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
+from tuning.identify.true_plant import true_plant
 from tuning.outcome import Outcome
+from tuning.response.linear_model import position_open_loop
+from tuning.response.margins import margins
 from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
 from tuning.search.optimise import Optimised, Settings, TrialRow
@@ -263,11 +267,19 @@ def test_a_rule_identifies_once_for_all_rules(monkeypatch):
 
 
 def test_a_rule_that_fails_the_checks_of_auto_is_no_peer_there():
-    """The first of four like machines has wild gains, which shake; on the others the rule passes and stands."""
+    """The first of four like machines has wild gains, which shake; the second is too near to instability by Ms only."""
     gains, inertia = true_rule()
     gains[0] = [4021, 1573, 30_000, 3000, 30_000]
+    gains[1, 4] *= 3
     with open_group(RIGID) as target:
-        assert rule_passes(target, gains, inertia).tolist() == [False, True, True, True]
+        plants = [true_plant(target.drives, axis) for axis in range(4)]
+        f = np.geomspace(1.0, 2400.0, 2000)
+        ms = [margins(f, position_open_loop(target.device, plants[k], gains[k], f)).ms for k in range(4)]
+        assert ms[1] > SENSITIVITY > max(ms[2:])
+        assert rule_passes(target, gains, inertia).tolist() == [False, False, True, True]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(rule_check, "_far_from_instability", lambda target, plants, gains, where, origin: where)
+            assert rule_passes(target, gains, inertia).tolist() == [False, True, True, True]
 
 
 def test_figures_are_of_all_machines_and_of_those_where_the_rule_passes(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,9 +16,11 @@ from tuning.auto import moves as auto_moves
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.calmer_gains import calmer
 from tuning.auto.choice import PeerFigures, choose_set, keep_the_better, try_rule
+from tuning.auto.measured_margins import SENSITIVITY, SOUGHT
 from tuning.auto.moves import stand
 from tuning.auto.proving import Proof, Shown
 from tuning.auto.stages import IdentifiedAxes, RuleTried
+from tuning.auto.trials import faster
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.true_plant import true_plant
 from tuning.target import emulated
@@ -32,6 +35,8 @@ NAN = float("nan")
     ((2.0, 1.0), (1.0, 2.0), 0),  # the twins have variants that no drive has
     ((1.0, 2.0), (2.0, 1.0), 0),  # the drive knows more than its twins
     ((1.0, 1.0), (2.0, 1.0), 0),  # no better is not better
+    ((1.0, 0.91), (2.0, 1.0), 0),  # nor is what may be so by chance
+    ((1.0, 0.89), (2.0, 1.0), 1),
     ((2.0, 1.0), (NAN, NAN), 1),  # no twin that could be trusted: the drive decides
     ((1.0, 2.0), (NAN, NAN), 0),
     ((2.0, NAN), (2.0, 1.0), 0),  # its trial was not made, or failed
@@ -43,11 +48,11 @@ def test_what_was_found_is_kept_where_it_is_better_on_the_drive_and_on_the_twins
 
 
 @pytest.mark.parametrize(("rule", "own", "mixed", "twin_own", "chosen"), [
-    ((2.0, 2.0), (1.0, 5.0), (1.0, 1.9), (1.0, 1.0), 2),  # one axis is worse with its own: the others keep theirs
+    ((2.0, 2.0), (1.0, 5.0), (1.0, 1.7), (1.0, 1.0), 2),  # one axis is worse with its own: the others keep theirs
     ((2.0, 2.0), (1.0, 5.0), (1.0, 2.5), (1.0, 1.0), 0),  # what is mixed is judged as a whole, and may be worse
     ((2.0, 2.0), (1.0, 1.2), (1.0, 1.9), (1.0, 1.0), 1),
-    ((2.0, 1.0), (1.5, 1.4), (1.9, 1.0), (1.0, 1.0), 1),  # a machine is as good as its worst axis
-    ((2.0, 1.0), (1.5, 1.4), (1.9, 1.0), (9.0, 1.0), 2),  # by the twins the axis 0 is not
+    ((2.0, 1.0), (1.5, 1.4), (1.7, 1.0), (1.0, 1.0), 1),  # a machine is as good as its worst axis
+    ((2.0, 1.0), (1.5, 1.4), (1.7, 1.0), (9.0, 1.0), 2),  # by the twins the axis 0 is not
     ((2.0, 2.0), (1.0, 1.0), (2.0, 2.0), (np.inf, np.inf), 0),  # linked axes, of which no twin tells
 ])  # fmt: skip
 def test_a_machine_of_several_axes_is_judged_as_a_whole(rule, own, mixed, twin_own, chosen):
@@ -62,8 +67,10 @@ class Ground:
 
     def __init__(self, cost, swing=lambda gains: np.zeros(len(gains))):
         self.cost, self.swing, self.tried, self.moved = cost, swing, [], []
+        self.asks_heavier = True
 
-    def run(self, gains, where):
+    def run(self, gains, where, heavier=False):
+        assert heavier or not self.asks_heavier, "what is compared is tried as with a heavier load, too"
         self.tried.append(gains.tolist())
         zero, no = np.zeros(len(gains)), np.zeros(len(gains), bool)
         return Proof(self.cost(gains), no, no, ("",) * len(gains), zero, zero, zero)
@@ -119,19 +126,43 @@ def test_the_rule_makes_the_same_trial_and_what_is_worse_than_it_by_either_gives
     found = try_rule(bench, start, of([OWN], ground, None))
     assert ground.tried == ground.moved == [[RULE]]
     found = keep_the_better(bench, start, found, bench.target)
+    assert ground.tried == [[RULE], [OWN]]
     assert found.gains.tolist() == [kept]
     assert bool(bench.journals[0].notes) == (kept == RULE)
     assert found.shown.cost.tolist() == [rule if kept == RULE else own], "the move on record is that of the gains"
+    assert found.proof.tolist() == [rule if kept == RULE else own] and found.won.tolist() == [kept == OWN]
+    assert not any("linked" in note for note in bench.journals[0].notes)
 
 
 def test_a_rule_that_shakes_at_rest_is_no_peer(monkeypatch):
-    """It would have to be slowed, as the gains found were: a swing of 6 % is refused with any gains."""
+    """A swing of 6 % is refused with any gains, and none calmer are looked for on machines of several axes."""
     twins(monkeypatch, 1.0, 2.0)
-    ground = Ground(lambda gains: np.ones(1), lambda gains: np.where((gains == RULE).all(axis=1), 0.06, 0.0))
-    bench, start = bench_on(ground, 1), basis([RULE])
-    found = try_rule(bench, start, of([OWN], ground, None))
+    ground = Ground(lambda gains: np.ones(2), lambda gains: np.where((gains == RULE).all(axis=1), 0.06, 0.0))
+    bench, start = bench_on(ground, 2), basis([RULE, RULE])
+    found = try_rule(bench, start, of([OWN, OWN], ground, None))
     assert not found.rule.passed.any()
-    assert keep_the_better(bench, start, found, bench.target).gains.tolist() == [OWN]
+    assert keep_the_better(bench, start, found, bench.target).gains.tolist() == [OWN, OWN]
+
+
+@pytest.mark.parametrize(("stands", "tries"), [(650, [700, 650]), (600, [700, 650, 600]), (500, [700, 650, 600])])
+def test_a_rule_that_shakes_at_rest_is_lowered_until_it_stands_and_compared_then(stands, tries, monkeypatch):
+    """As the gains found are: what else would tell that these are better? Twice at the most."""
+    monkeypatch.setattr(choice, "cost_on_twins", lambda bench, basis, axes, sets: np.array([[1.0, 2.0]]))
+    told = []
+
+    def lower(bench, basis, recorded, k, swing, allowed, near):
+        assert allowed == pytest.approx(0.045) and len(near) == 0
+        told.append(swing)
+        return recorded.gains[k] - [0, 0, 50, 0, 0]
+
+    monkeypatch.setattr(choice, "standing", lower)
+    ground = Ground(lambda gains: np.ones(1), lambda gains: np.where(gains[:, 2] > stands, 0.06, 0.0))
+    bench, start = bench_on(ground, 1), basis([RULE])
+    found = try_rule(bench, start, of([[4000, 1000, 400, 4800, 2000]], ground, None))
+    assert [row[0][2] for row in ground.tried] == [row[0][2] for row in ground.moved] == tries
+    assert found.rule.passed.tolist() == [stands != 500] and told == [0.06] * (len(tries) - 1)
+    kept = keep_the_better(bench, start, found, bench.target)
+    assert kept.gains[0, 2] == (400 if stands == 500 else stands)
 
 
 def test_gains_that_were_changed_since_their_trial_make_it_again(monkeypatch):
@@ -149,7 +180,7 @@ def test_gains_that_were_changed_since_their_trial_make_it_again(monkeypatch):
 def test_on_several_axes_the_rule_is_tried_on_all_and_what_is_mixed_as_a_whole(monkeypatch):
     """Axis 1 is worse with its own gains; axis 0 is better, and stays so beside the rule's on axis 1."""
     twins(monkeypatch, 2.0, 1.0)
-    costs = {"RR": (2.0, 2.0), "OO": (1.0, 5.0), "OR": (1.1, 1.9)}
+    costs = {"RR": (2.0, 2.0), "OO": (1.0, 5.0), "OR": (1.1, 1.7)}
 
     def cost(gains):
         return np.array(costs["".join("R" if row == RULE else "O" for row in gains.tolist())])
@@ -157,16 +188,75 @@ def test_on_several_axes_the_rule_is_tried_on_all_and_what_is_mixed_as_a_whole(m
     ground = Ground(cost)
     bench, start = bench_on(ground, 2), basis([RULE, RULE])
     found = keep_the_better(bench, start, try_rule(bench, start, of([OWN, OWN], ground, None)), bench.target)
-    assert ground.tried == [[RULE, RULE], [OWN, RULE]]
-    assert found.gains.tolist() == [OWN, RULE]
+    assert ground.tried == [[RULE, RULE], [OWN, OWN], [OWN, RULE]]
+    assert found.gains.tolist() == [OWN, RULE] and found.proof.tolist() == [1.1, 1.7]
+    assert [bool(journal.notes) for journal in bench.journals] == [False, True], "whose gains are the rule's hears why"
     costs["OR"] = (1.1, 2.5)  # which no axis by itself would say
     found = keep_the_better(bench, start, try_rule(bench, start, of([OWN, OWN], ground, None)), bench.target)
     assert found.gains.tolist() == [RULE, RULE]
 
 
+@pytest.mark.parametrize(("most", "tries", "passed"), [(700, [700], True), (500, [700, 560, 448], True),
+                                                      (400, [700, 560, 448], False)])  # fmt: skip
+def test_a_rule_that_fails_its_trial_is_lowered_by_a_fifth_at_a_time(most, tries, passed, monkeypatch):
+    """What the identified inertia makes of it may be at its edge, where what is found is not to win by that alone."""
+    twins(monkeypatch, 2.0, 1.0)
+    ground = Refusing(most)
+    bench, start = bench_on(ground, 1), basis([RULE])
+    found = try_rule(bench, start, of([OWN], ground, None)).rule
+    assert [row[0][2] for row in ground.tried] == tries
+    assert found.passed.tolist() == [passed] and found.lowered.tolist() == [len(tries) > 1]
+    assert found.gains[0].tolist() == faster(find_device("tmcm1636").gains, np.array(RULE), tries[-1] / 700).tolist()
+
+
+def test_of_linked_axes_what_was_found_is_never_better_and_the_reason_is_told(monkeypatch):
+    monkeypatch.setattr(choice, "cost_on_twins", lambda *given: pytest.fail("twins"))
+    ground = Ground(lambda gains: np.where((gains == RULE).all(axis=1), 3.0, 1.0))
+    bench, start = bench_on(ground, 2), basis([RULE, RULE])
+    bench.target.linked = True
+    found = keep_the_better(bench, start, try_rule(bench, start, of([OWN, OWN], ground, None)), bench.target)
+    assert found.gains.tolist() == [RULE, RULE]
+    assert all(j.notes[0].endswith("how robust gains are on linked axes no digital twin tells") for j in bench.journals)
+
+
+@pytest.mark.parametrize(("ms", "passed"), [(SENSITIVITY, True), (SENSITIVITY + 0.1, False)])
+def test_a_rule_that_stays_too_near_to_instability_is_no_peer(ms, passed, monkeypatch):
+    """Where no less P helps it is as near as it was, though it passes its trial and stands."""
+    monkeypatch.setattr(choice, "not_beyond", lambda bench, basis, recorded, gains, k, limit: gains)
+    monkeypatch.setattr(choice, "sensitivity", lambda target, basis, response, gains, k: ms)
+    ground = Ground(lambda gains: np.ones(len(gains)))
+    bench, start = bench_on(ground, 1), basis([RULE])
+    seen = replace(of([OWN], ground, None), response=object(), unseen=np.zeros(1, bool))
+    assert try_rule(bench, start, seen).rule.passed.tolist() == [passed]
+    assert try_rule(bench, start, replace(seen, unseen=np.ones(1, bool))).rule.passed.tolist() == [True]
+
+
+@pytest.mark.parametrize(("axes", "own", "limit"), [(1, 3.5, SENSITIVITY), (2, 2.0, SOUGHT), (2, 3.5, 3.5)])
+def test_a_rule_that_is_too_near_to_instability_as_measured_is_lowered_before_it_is_tried(
+    axes, own, limit, monkeypatch
+):
+    """Up to what is allowed of an axis alone on its machine; where axes take margin from each other less, as found."""
+    asked = []
+
+    def lower(bench, basis, recorded, gains, k, most):
+        asked.append(most)
+        return gains - [0, 0, 0, 0, 100]
+
+    monkeypatch.setattr(choice, "not_beyond", lower)
+    monkeypatch.setattr(
+        choice, "sensitivity", lambda target, basis, response, gains, k: own if gains[2] == OWN[2] else 1.0
+    )
+    ground = Ground(lambda gains: np.ones(len(gains)))
+    bench, start = bench_on(ground, axes), basis([RULE] * axes)
+    seen = replace(of([OWN] * axes, ground, None), response=object(), unseen=np.zeros(axes, bool))
+    found = try_rule(bench, start, seen).rule
+    assert asked == [limit] * axes and ground.tried == [[[*RULE[:4], RULE[4] - 100]] * axes]
+    assert found.passed.all() and found.title(0) == "the gains of the baseline rule, lowered,"
+
+
 # --- axes that shake at rest --------------------------------------------------------------------------------------
 def peer(passed):
-    return RuleTried(np.ones(1, bool), np.array([passed]), np.ones(1))
+    return RuleTried(np.array([RULE]), np.zeros(1, bool), np.ones(1, bool), np.array([passed]), np.ones(1))
 
 
 @pytest.mark.parametrize("passed", [True, False])
@@ -177,19 +267,17 @@ def test_easing_looks_at_the_rule_as_it_is_where_the_axis_stood_with_it(passed, 
     def twins(bench, basis, k, sets, repeats, *, slippery=False):
         def cost_and_rest(gains):
             is_rule = (gains == RULE).all(axis=-1)
-            return np.where(is_rule, 1.0, 9.0), np.where(is_rule, 0.5, gains[..., 2] / 2000.0)
+            return np.where(is_rule, 1.0, 9.0), np.where(is_rule, 5.0, gains[..., 2] / 2000.0)
 
-        yield SimpleNamespace(device=find_device("tmcm1636"), num_axes=1, sets=sets, cost_and_rest=cost_and_rest)
+        yield SimpleNamespace(cost_and_rest=cost_and_rest, score=lambda gains: cost_and_rest(gains)[0])
 
     monkeypatch.setattr("tuning.auto.calmer_gains._twins_of", twins)
     monkeypatch.setattr("tuning.auto.calmer_gains.sensitivity", lambda *given: 2.0)
     start = basis([RULE], plant=object(), found=object())
     shakes = recorded([OWN], response=object(), rule=peer(passed))
-    bench = bench_on(None, 1)
-    bench.rng = np.random.default_rng(0)
-    found = calmer(bench, start, shakes, 0, 0.5, 1.0, 0.1).tolist()
+    found = calmer(bench_on(None, 1), start, shakes, 0, 0.5, 0.2, 0.1).tolist()
     assert (found == RULE) == passed
-    assert passed or found[2] <= 200  # a tenth of the swing is allowed
+    assert passed or found[2] <= 1000  # half of the swing is allowed
 
 
 class Refusing(Ground):
@@ -197,9 +285,9 @@ class Refusing(Ground):
 
     def __init__(self, most):
         super().__init__(lambda gains: np.ones(len(gains)))
-        self.most = most
+        self.most, self.asks_heavier = most, False
 
-    def run(self, gains, where):
+    def run(self, gains, where, heavier=False):
         why = tuple("it oscillated" if row[2] > self.most else "" for row in gains.tolist())
         return super().run(gains, where)._replace(reason=why)
 
@@ -234,14 +322,14 @@ LOOSE = {
     "motor.R_s": 0.2996, "motor.L_d": 0.0002285, "motor.L_q": 0.0002122, "motor.psi_m": 0.002528,
     "motor.inertia": 1.914e-05, "motor.cogging_torque": 0.00397, "motor.coulomb": 0.002084, "motor.viscous": 1.953e-05,
     "stage.adc_noise": 0.03061, "stage.velocity_filter": 313.6, "load.inertia": 0.05085, "load.stiffness": 5411.0,
-    "load.damping": 0.2619, "load.backlash": 0.005671, "load.efficiency": 0.8892, "load.coulomb": 0.1326,
+    "load.damping": 0.2619, "load.backlash": 0.004, "load.efficiency": 0.8892, "load.coulomb": 0.1326,
     "load.breakaway": 0.1284, "load.viscous": 0.03574,
 }  # fmt: skip
 
 
 @pytest.mark.slow
 def test_a_response_within_the_play_of_a_gear_is_no_identification_of_the_axis():
-    """It gave 0.42 of the inertia; the two moves, which drive through the play, give 0.8."""
+    """It gives half of the inertia; the two moves, which drive through the play, 0.9."""
     with emulated(load="geared_joint", motor="ec_45_flat", parameters=LOOSE, num_threads=1) as target:
         (found,) = identify_briefly(target)
         true = true_plant(target.drives).inertia

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from agents.policies.policy import load_policy
 from agents.shipped import TUNER, shipped
+from drive_env.trials.positioning import longer_way
 
 if TYPE_CHECKING:
     from agents.policies.guard import GuardedPolicy, GuardLimits
@@ -141,7 +142,7 @@ def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], tri
     return GainTuning(
         target.num_axes // target.axes_per_machine,
         drives=drives,
-        reach=np.where(target.high >= -target.low, target.high, target.low),
+        reach=longer_way(target.low, target.high),
         device=target.device.name,
         motor=target.motor,
         **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},

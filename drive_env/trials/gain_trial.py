@@ -44,10 +44,15 @@ Mask = NDArray[np.bool_]
 
 PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial
-PHASE_TITLES = ("move", "reversal", f"move with {PROBE:g} times velocity P")  # as messages name them
+HEAVIER = 1.3  # inertia that a last phase stands for, where one is asked for, over that of the machine
+PHASE_TITLES = (  # as messages name them
+    "move", "reversal", f"move with {PROBE:g} times velocity P", f"move with velocity P over {HEAVIER:g}"
+)  # fmt: skip
 
 # The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
 RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]
+STANDSTILL = 1.0  # rad/s, one count in 1.5 ms: below it the sign of a speed is noise
+LAG = 3  # ms by which a filtered speed may lag behind its rotor: a move has begun, or goes on, so long beside it
 
 
 class Identified(NamedTuple):
@@ -64,6 +69,8 @@ class Identified(NamedTuple):
 
 class Trial(NamedTuple):
     """What a trial showed; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
+
+    The phases are those of `PHASES`, and where it was asked for one as with a heavier load.
 
     following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
     error: demand less actual of the move over its size, shape (TRIAL, num_axes).
@@ -83,7 +90,8 @@ class Trial(NamedTuple):
         Args:
             softness: `softness` of the trial's gains over that of the rule's, (num_axes,), for E_d/E_0.
         """
-        disturbance = np.stack([softness, softness, softness / PROBE])
+        # A heavier load leaves the integrators as they are.
+        disturbance = np.stack([softness, softness, softness / PROBE, softness][: len(self.aborted)])
         return cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
 
 
@@ -154,10 +162,18 @@ class Trials:
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
         speed = velocity / (scaler * per_increment(drives, cia402.VELOCITY_ACTUAL)) * 2.0 * np.pi
-        return momentum_balance(angle, speed, current * ampere_per_count(drives), self._motor), origin
+        moving = samples_in_motion(speed, LAG)
+        return momentum_balance(angle, speed, current * ampere_per_count(drives), self._motor, moving=moving), origin
 
     def run(
-        self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
+        self,
+        gains: Integers,
+        incumbent: Integers,
+        move: Move,
+        origin: Integers,
+        direction: Integers,
+        where: Mask,
+        heavier: bool = False,
     ) -> Trial:
         """Try gains, raw integers of shape (num_axes, count), in a move from the origin [inc], back, and there again.
 
@@ -171,29 +187,33 @@ class Trials:
             origin: Where the axes are [inc].
             direction: 1 to move as planned, -1 the other way, shape (num_axes,).
             where: Axes that take part; the others' figures mean nothing.
+            heavier: Whether a last phase back to the origin shows what a heavier load would make of the gains: its
+                loop gain is that of a lower velocity P.
         """
         drives = self._drives
         away = origin + direction * move.distance
         count = drives.num_axes
-        aborted = np.zeros((len(PHASES), count), bool)
+        shape = (len(PHASES) + heavier, count)
+        aborted = np.zeros(shape, bool)
         stopped, culprit = np.zeros((2, count), bool)
-        shape = (len(PHASES), count)
         settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
         first_error = np.zeros((TRIAL, count))
         write_profile(drives, move, where)
-        probe = device_of(drives).gains.with_velocity_p(gains, PROBE)
-        for phase, (target, tried) in enumerate(((away, gains), (origin, gains), (away, probe))):
+        probe, weaker = (device_of(drives).gains.with_velocity_p(gains, factor) for factor in (PROBE, 1.0 / HEAVIER))
+        phases = ((away, gains), (origin, gains), (away, probe), (origin, weaker))[: shape[0]]
+        for phase, (target, tried) in enumerate(phases):
             write_gains(drives, np.where(stopped[:, None], incumbent, tried), where)
             position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)
             culprit |= new
             aborted[phase] = stopped
-            sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
+            back = phase % 2 == 1
+            sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if back else 1)
             settling[phase], noise[phase], overshoot[phase] = move_terms(
                 position, current * ampere_per_count(drives), move, self._t_0, self._motor.rated_current, target, sign
             )
             size = np.maximum(np.abs(move.distance), 1)
             if demand is None:
-                demand = computed(away if phase == 1 else origin, target, move, TRIAL)
+                demand = computed(away if back else origin, target, move, TRIAL)
             error = wrapped(demand - position) / size
             following[phase] = np.maximum(np.abs(error).sum(axis=0), 0.5) * CYCLE
             if phase == 0:
@@ -297,6 +317,21 @@ def _on_the_counter(position: Integers) -> Integers:
     return wrapped(position).astype(np.int64)
 
 
+def samples_in_motion(speed: Floats, around: int) -> Mask:
+    """Return which samples of speeds [rad/s] are of a rotor in motion, or within so many milliseconds of one that is.
+
+    Args:
+        speed: Shape (samples, num_axes).
+        around: In milliseconds.
+    """
+    fast = np.abs(speed) > STANDSTILL
+    found = fast.copy()
+    for k in range(1, around + 1):
+        found[k:] |= fast[:-k]
+        found[:-k] |= fast[k:]
+    return found
+
+
 def momentum_balance(
     angle: Floats,
     speed: Floats,
@@ -312,8 +347,7 @@ def momentum_balance(
     alone is fitted: in a short move the two look alike. `moving`, as long as `speed`, tells the samples that count,
     all by default: at rest dry friction holds what it likes up to its own, which is no constant load.
     """
-    standstill = 1.0  # rad/s, one count in 1.5 ms: below it the sign is noise
-    sign = np.clip(speed / standstill, -1.0, 1.0)
+    sign = np.clip(speed / STANDSTILL, -1.0, 1.0)
     samples, axes = speed.shape
     t = np.broadcast_to((np.arange(samples) * CYCLE)[:, None], (samples, axes))
     if moving is not None:

@@ -25,7 +25,7 @@ from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
-from drive_env.trials.gain_trial import PHASES, Identified, Trials, clear, momentum_balance
+from drive_env.trials.gain_trial import PHASES, Identified, Trials, clear, momentum_balance, samples_in_motion
 from drive_env.trials.positioning import (
     ACCELERATION_SHARE,
     BAND,
@@ -56,8 +56,7 @@ ENCODER, NO_WINDOW = 0, 0  # of 606Ah and 6065h
 OPEN = 0  # of `Role.LOOP_MODE`
 STILL = 20  # samples at rest by which demand and encoder are compared
 REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
-STANDSTILL = 1.0  # rad/s, below which a rotor is at rest unless it swings back within as many ms
-TURNING_BACK = 10
+TURNING_BACK = 10  # ms within which a rotor that swings comes back
 LEAST_WAY = 0.25  # of a move that an encoder must show
 # Total inertia in rotors for which the moves of identification are made, one after the other, until one loses no steps.
 TRIED_ROTORS = (3.0, 12.0, 48.0, 192.0)
@@ -390,7 +389,7 @@ class OpenLoopTrials(Trials):
         # The rotor swings a hundred times a second: the impulse is summed by trapezoids, up to the speed's own sample.
         current[1:] = 0.5 * (current[1:] + current[:-1])
         speed = np.gradient(angle, CYCLE, axis=0)
-        moving = _moving(speed)
+        moving = samples_in_motion(speed, TURNING_BACK)
         found = momentum_balance(angle, speed, current, motor, moving=moving)
         has_room = where & ~lost & (np.abs(reach) > SWING_ROOM * 2.0 * np.pi / (TOOTH * motor.n_p))
         if not has_room.any():
@@ -531,16 +530,6 @@ class OpenLoopTrials(Trials):
                 "at rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
                 "without an encoder nothing is seen of an open-loop stepper that could be scored"
             )
-
-
-def _moving(speed: Floats) -> Mask:
-    """Return which samples of speeds [rad/s] are of a rotor that moves, or swings back in a moment, as they have it."""
-    fast = np.abs(speed) > STANDSTILL
-    found = fast.copy()
-    for k in range(1, TURNING_BACK + 1):
-        found[k:] |= fast[:-k]
-        found[:-k] |= fast[k:]
-    return found
 
 
 def open_loop_terms(

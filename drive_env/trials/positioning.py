@@ -35,6 +35,7 @@ COUNTED_RAMP = "pps^2"  # unit of ramps in increments per second squared
 WATCH = 25  # how often a trial looks whether the current swings
 ACCELERATION_SHARE = 0.4  # of the rated torque
 SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
+ABOUT_AS_LONG = 0.9  # of the way backwards: from there on the way forwards is taken
 BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is what counts as settled
 
 
@@ -100,13 +101,27 @@ def plan_move(
     return Move(distance, velocity, acceleration, increments, motor.encoder_counts / (2.0 * math.pi))
 
 
+def longer_way(low: ArrayLike, high: ArrayLike) -> Floats:
+    """Return how far rotors may turn the longer way, with its sign [rad]; forwards where both ways are about as long.
+
+    So axes of a machine that stand somewhere near the middle of their travel go the same way each time: what a joint
+    pushes depends on which way the others of its arm go.
+
+    Args:
+        low: How far they may turn backwards, 0 or less.
+        high: How far forwards.
+    """
+    down, up = np.asarray(low, float), np.asarray(high, float)
+    return np.where(up >= ABOUT_AS_LONG * -down, up, down)
+
+
 def reach(load: str | Path | Load) -> Floats:
     """Return how far each rotor of a load may turn from the start, the longer way, with its sign [rad]."""
     from mechanics.loads import find_load
     from mechanics.shaft import one, way
 
     found = way(one(find_load(load)))
-    return np.where(found.high >= -found.low, found.high, found.low)
+    return longer_way(found.low, found.high)
 
 
 def power_up(drives: Drives, where: Mask | None = None) -> None:

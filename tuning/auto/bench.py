@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.gains import read_gains
-from drive_env.trials.positioning import wrapped
+from drive_env.trials.positioning import longer_way, wrapped
 from tuning.identify.wiring import Key, write_wiring
 from tuning.stop_causes import UNTOLD, stop_causes
 
@@ -127,7 +127,7 @@ class AutoBench:
     def reach(self) -> Floats:
         """Return how far the rotors may turn the longer way, with the sign [rad], (num_axes,)."""
         low, high = self.room()
-        return np.where(high >= -low, high, low)
+        return longer_way(low, high)
 
     def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
         """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""

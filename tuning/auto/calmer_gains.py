@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,15 +28,16 @@ Integers = NDArray[np.int64]
 INTEGRAL, POSITION = (0.0, 0.5, 1.0), (0.0, 0.5, 1.0, 1.5, 2.0, 4.0)
 # Twins know less of an axis that shakes than of others: what was found by search on them must be better by this.
 WELL = 0.95
-# A search for calm gains: sets at once, generations, how wide it begins, and runs of each set with noises of their own.
+# What velocity P, velocity I, position P and torque P are lowered to, in all combinations but that of none.
+LOWERED = np.array(list(product((1.0, 0.8, 0.6, 0.45), (1.0, 0.5), (1.0, 0.8, 0.6), (1.0, 0.6)))[1:])
+# A search for gains far from instability: sets at once, generations, how wide it begins, and runs of each set with
+# noises of their own.
 SETS, GENERATIONS, WIDTH, RUNS = 16, 12, 0.5, 2
-# By which power of the sensitivity peak over the one sought, and of the swing at rest over the allowed one, gains cost
-# more that are too near to instability by the measured response, or that shake at rest.
-NEAR, SHAKING = 2.0, 4.0
-# How far the swing of twins at rest may be from that of their axis, either way, to be taken for its measure.
-ALIKE = 2.0
-# One run on a twin says partly what its noise did: the best of it are run again so often, each time with another noise.
-FEW, REPEATS = 8, 8
+# By which power of the sensitivity peak over the one sought gains cost more that are too near to instability by the
+# measured response.
+NEAR = 2.0
+# One run on a twin says partly what its noise did: the best of it is run again so often, each time with another noise.
+REPEATS = 8
 
 Score = Callable[[Integers], Floats]  # costs (n, sets) of raw gains (n, sets, count)
 
@@ -95,13 +97,23 @@ def far_enough(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) 
     return np.asarray(found[int(cost_on_twins(bench, basis, [k], found[None])[0].argmin())])
 
 
-def standing(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, swing: float, allowed: float, others: Integers
-) -> Integers:
-    """Return gains for an axis that shook at rest: the best by its twins of those with which these swing less.
+def nearby(target: Target, gains: Integers) -> Integers:
+    """Return gains with some of those of an axis lowered, shape (sets, count); as they are is not among them."""
+    torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(target.device)
+    rows = np.tile(gains.astype(float), (len(LOWERED), 1))
+    rows[:, [velocity_p, velocity_i, position_p, torque_p]] *= LOWERED
+    return np.asarray(np.maximum(np.rint(rows), 1), np.int64)
 
-    An axis that shakes is held by less friction than was found, so these are twins with hardly any. How much more or
-    less than they the axis itself swings is known of its present gains, and taken to hold for others.
+
+def standing(
+    bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, swing: float, allowed: float, near: Integers
+) -> Integers:
+    """Return gains for an axis that shook at rest: near to some known, the best by its twins of those that swing less.
+
+    What makes an axis swing twins know too little of for a search: noise and the counts of the encoder, which velocity
+    P passes on, a fast current loop, or friction that sticks. By how much less gain each of these becomes less they
+    tell well, and what it costs. An axis that shakes is held by less friction than was found, so twins with hardly any
+    tell how much it swings.
 
     Args:
         bench: The drives.
@@ -110,36 +122,26 @@ def standing(
         k: The axis.
         swing: Of its current at rest with the present gains, over the rated one (RMS).
         allowed: What it may be.
-        others: Gains that are looked at, too, (sets, count).
+        near: Gains that are looked at, beside those near the present ones, (sets, count).
     """
-    target, own, rule = bench.target, recorded.gains[k], basis.reference[k]
-    stands = recorded.rule is not None and bool(recorded.rule.passed[k])
-    peaks = _peaks(bench, basis, recorded, k)
-
-    def worth(twins: Twins, limit: float, gains: Integers) -> Floats:
-        cost, rest = twins.cost_and_rest(gains)
-        shaking = np.maximum(rest / limit, 1.0)
-        if stands:  # of the rule's as they are the axis itself has shown it
-            shaking[(gains == rule).all(axis=-1)] = 1.0
-        cost = cost * shaking**SHAKING * np.maximum(peaks(gains[0])[None] / SOUGHT, 1.0) ** NEAR
-        return np.where((gains == own).all(axis=-1), np.inf, cost)
-
-    with _twins_of(bench, basis, k, 1, REPEATS, slippery=True) as twins:
-        seen = float(twins.cost_and_rest(own[None, None])[1][0, 0])
-    limit = allowed * float(np.clip(seen / swing, 1.0 / ALIKE, ALIKE))
-    with _twins_of(bench, basis, k, SETS, RUNS, slippery=True) as twins:
-        found = search(
-            twins, np.array([[own, rule]]), bench.rng, generations=GENERATIONS, width=WIDTH,
-            score=lambda gains: worth(twins, limit, gains),
-        ).gains[0]  # fmt: skip
+    target, own = bench.target, recorded.gains[k]
+    every = np.concatenate([nearby(target, own), near])
+    every = every[(every != own).any(axis=1)]
     if recorded.unseen[k] or recorded.response is None:  # the model tells what is far enough from instability
         plant, _ = basis.identified.known(k)
-        found = np.array([sound_gains(target.device, plant, tuple(map(int, row))) for row in found], np.int64)
-    every = np.concatenate([found, others])
-    with _twins_of(bench, basis, k, len(every), RUNS, slippery=True) as twins:
-        few = every[worth(twins, limit, every[None])[0].argsort(kind="stable")[:FEW]]
-    with _twins_of(bench, basis, k, len(few), REPEATS, slippery=True) as twins:
-        return np.asarray(few[int(worth(twins, limit, few[None])[0].argmin())])
+        every = np.array([sound_gains(target.device, plant, tuple(map(int, row))) for row in every], np.int64)
+    with _twins_of(bench, basis, k, len(every) + 1, RUNS, slippery=True) as twins:
+        rest = twins.cost_and_rest(np.concatenate([own[None], every])[None])[1][0]
+    with _twins_of(bench, basis, k, len(every), RUNS) as twins:
+        cost: Floats = twins.score(every[None])[0]
+    cost = cost * np.maximum(_peaks(bench, basis, recorded, k)(every) / SOUGHT, 1.0) ** NEAR
+    swings = swing * rest[1:] / max(float(rest[0]), 1e-6)
+    if recorded.rule is not None and recorded.rule.passed[k]:  # the axis itself has stood with them
+        swings[(every == recorded.rule.gains[k]).all(axis=1)] = 0.0
+    if (swings <= allowed).any():
+        cost = np.where(swings <= allowed, cost, np.inf)
+        return np.asarray(every[int(cost.argmin())])
+    return np.asarray(every[int(swings.argmin())])
 
 
 def _twins_of(bench: AutoBench, basis: Basis, k: int, sets: int, repeats: int, *, slippery: bool = False) -> Twins:
@@ -179,6 +181,8 @@ def calmer(
     own, rule = recorded.gains[k], basis.reference[k]
     if not target.drives.time_waits:
         return faster(device.gains, own, factor)
+    if searches_all(target):
+        return standing(bench, basis, recorded, k, swing, allowed, np.concatenate([rule[None], nearby(target, rule)]))
     torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
     response = None if recorded.unseen[k] else recorded.response
     rows = []
@@ -193,10 +197,8 @@ def calmer(
                 rows.append(gains if response is not None else sound_gains(device, plant, gains))
     # With those of the rule as they are the axis itself has stood, whatever their velocity P.
     if recorded.rule is not None and recorded.rule.passed[k]:
-        rows.append(tuple(map(int, rule)))
+        rows.append(tuple(map(int, recorded.rule.gains[k])))
     candidates = np.array(rows, np.int64)
-    if searches_all(target):
-        return standing(bench, basis, recorded, k, swing, allowed, candidates)
     cost = cost_on_twins(bench, basis, [k], candidates[None])[0]
     if response is not None:  # it knows more than the model
         far = _peaks(bench, basis, recorded, k)(candidates)

@@ -33,6 +33,7 @@ from tuning.response.measured_loop import merged
 from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.response.margins import Margins
@@ -143,6 +144,31 @@ def _others_instead(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: 
     return recorded.with_gains(k, gains)
 
 
+def not_beyond(
+    bench: AutoBench, basis: Basis, recorded: RecordedGains, gains: Integers, k: int, limit: float
+) -> Integers:
+    """Return gains of an axis with the P of its outer loops lowered until Ms, as measured, is at most this.
+
+    Where nothing was measured, or nothing is low enough, they are as they were.
+    """
+    response, known = recorded.response, bench.target.device.gains
+    if response is None or recorded.unseen[k]:
+        return gains
+    lowered = gains
+    for loop in judged_loops(bench.target):
+        softer = (known.scaled(lowered, factor, _p_columns(known, loop)) for factor in SOFTER)
+        near = (one for one in softer if margins_with(basis, response, one, k)[loop].ms <= limit)
+        if (found := next(near, None)) is None:
+            return gains
+        lowered = found
+    return lowered
+
+
+def _p_columns(known: GainSet, loop: str) -> list[int]:
+    """Return the P gains that are lowered where a loop is too near to instability."""
+    return [column for column in known.columns_of(*CALMED[loop]) if known.rows[column].part == "P"]
+
+
 def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, response: MeasuredLoop) -> RecordedGains:
     """Lower the gains of an axis one of whose loops comes too near to instability."""
     seen = _seen(response, k)
@@ -152,7 +178,7 @@ def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, respon
         return _without_response(bench, recorded, here, "; ".join([why, *response.notes[k]]))
     gains, known = recorded.gains[k], bench.target.device.gains
     for loop in judged_loops(bench.target):
-        calmed = [column for column in known.columns_of(*CALMED[loop]) if known.rows[column].part == "P"]
+        calmed = _p_columns(known, loop)
         softer = [known.scaled(gains, factor, calmed) for factor in SOFTER]
         peaks = [margins_with(basis, response, one, k)[loop].ms for one in softer]
         if (chosen := first_far_enough(peaks)) is None:

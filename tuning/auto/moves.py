@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 
 SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
 CALMING = 0.5  # s after a load step that did not end, with gains that hold
-OVERTIME = 2.5  # s beyond the budget for axes that still shake: so near to the end they are not given up
+OVERTIME = 5.0  # s beyond the budget for axes that still shake: so near to the end they are not given up
 # How often the gains of an axis that shook at rest are eased, and the least and greatest factor of its bandwidth. The
 # noise of the encoder goes into the current by velocity P, so that it falls as the bandwidth does.
 # What swings by more than LIMIT_CYCLE is no noise, and may swing more with less gain.
@@ -146,9 +146,10 @@ def stand(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Targe
         again = np.zeros(bench.target.num_axes, bool)
         for k, (swing, why) in restless.items():
             last = attempt >= EASINGS or recorded.kept[k] or not bench.affordable(MOVE_TIME - OVERTIME)[k]
-            if last and attempt <= EASINGS and rule_stands(recorded, k) and not is_rule(basis, recorded, k):
-                recorded = with_rule(bench, basis, recorded, k)
-                bench.journals[k].note(f"the gains of the baseline rule are kept: with faster ones {why}")
+            if last and attempt <= EASINGS and rule_stands(recorded, k) and not is_rule(recorded, k):
+                recorded = with_rule(bench, recorded, k)
+                assert recorded.rule is not None, "it stands"
+                bench.journals[k].note(f"{recorded.rule.title(k)} are kept: with faster ones {why}")
                 again[k] = True
             elif last:
                 bench.journals[k].stop(f"it does not come to rest: {why}")
@@ -166,21 +167,22 @@ def stand(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Targe
 
 
 def rule_stands(recorded: RecordedGains, k: int) -> bool:
-    """Return whether the baseline rule's gains have passed, and stood at rest, on the machine of an axis."""
+    """Return whether the baseline rule's gains, or those lowered, have passed and stood on the machine of an axis."""
     return recorded.rule is not None and bool(recorded.rule.passed[k])
 
 
-def is_rule(basis: Basis, recorded: RecordedGains, k: int) -> bool:
-    """Return whether an axis has the baseline rule's gains."""
-    return np.array_equal(recorded.gains[k], basis.reference[k])
+def is_rule(recorded: RecordedGains, k: int) -> bool:
+    """Return whether an axis has the baseline rule's gains as they were tried."""
+    return recorded.rule is not None and np.array_equal(recorded.gains[k], recorded.rule.gains[k])
 
 
-def with_rule(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) -> RecordedGains:
+def with_rule(bench: AutoBench, recorded: RecordedGains, k: int) -> RecordedGains:
     """Return the baseline rule's gains on all axes of a machine, as they have stood there, of which one is given."""
+    assert recorded.rule is not None, "it was tried"
     lanes = bench.target.axes_per_machine
     first = k - k % lanes
     for axis in range(first, first + lanes):
-        recorded = recorded.with_gains(axis, basis.reference[axis])
+        recorded = recorded.with_gains(axis, recorded.rule.gains[axis])
     here = np.arange(len(recorded.gains)) // lanes == k // lanes
     return replace(recorded, kept=recorded.kept & ~here)
 

@@ -21,6 +21,7 @@ from tuning.auto.bench import AutoBench
 from tuning.auto.choice import keep_the_better, try_rule
 from tuning.auto.loop_margins import judge, measure
 from tuning.auto.moves import look_back, show, stand
+from tuning.auto.refinement import refine, to_refine
 from tuning.auto.result import collect
 from tuning.auto.search import compute, identify, prepare
 from tuning.auto.settings import begin, commission, write
@@ -135,6 +136,9 @@ def prove_found(
         recorded = look_back(bench, basis, recorded)
         recorded = stand(bench, basis, try_rule(bench, basis, recorded), target)
         recorded = keep_the_better(bench, basis, recorded, target)
+        if to_refine(bench, recorded).any():
+            say("refining gains on the drives", 0.93)
+        recorded = refine(bench, basis, recorded, target)
         verdict = judge(bench, basis, recorded)
         tell_of_lateness(bench)
         if not is_recorded(target.drives):

@@ -8,6 +8,7 @@ the safety envelope may be faster: it quick-stops all drives, and the trial is r
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
@@ -28,6 +30,7 @@ from drive_env.trials.positioning import (
     WATCH,
     Move,
     highest_ramp,
+    longer_way,
     move_terms,
     plan_move,
     start,
@@ -35,6 +38,8 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import TRIP, Terms, cost
+from tuning.auto.fallback_gains import FallbackGains
+from tuning.oscillation_watch import SOFTER
 from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
@@ -54,6 +59,7 @@ SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axi
 STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
 HOLDING, PATIENCE = 400, 2  # before a move for the record: cycles to wait for rest, windows for which an axis may shake
 STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
+STILL_SHAKING = 2  # windows in a row: in the first one an axis is stopped
 RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
 OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
@@ -147,11 +153,14 @@ class ProvingGround:
         safe: Integers,
         reference: Integers,
     ) -> None:
-        self.target = target
+        # What a stop leaves swinging may feed safe gains as well; those that follow let the load ring down.
+        self._fallback = FallbackGains(target.num_axes, target.motor.rated_current, STILL_SHAKING)
+        self._fallback.calm = target.device.gains.softened(safe, SOFTER, "velocity", "position")
+        self.target = target = replace(target, drives=ObservedDrives(target.drives, self._fallback))
         self.safe = safe
         self._reference = reference
         low, high = room
-        self.reach: Floats = np.where(high >= -low, high, low)
+        self.reach: Floats = longer_way(low, high)
         motor, drives = target.motor, target.drives
         self._ampere = ampere_per_count(drives)
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
@@ -204,15 +213,20 @@ class ProvingGround:
             self.target.drives.advance(RETURN_LOOK)
         self._shaken |= where
 
-    def run(self, gains: Integers, where: Mask) -> Proof:
+    def run(self, gains: Integers, where: Mask, heavier: bool = False) -> Proof:
         """Try gains, raw integers of shape (num_axes, count), on some axes; the others' figures are undefined.
 
         Linked axes move together, all of them with these gains.
+
+        Args:
+            gains: What is tried.
+            where: Axes, (num_axes,).
+            heavier: Whether to look at what a heavier load would make of them, too.
         """
         where = self.target.together(where)
         count, lanes = self.target.num_axes, self.target.axes_per_machine
         try:
-            return self._proof(gains, self._run(gains, where), where)
+            return self._proof(gains, self._run(gains, where, heavier), where)
         except SafetyError as error:
             if where.sum() <= lanes:
                 return self._refused(str(error), where)
@@ -221,7 +235,7 @@ class ProvingGround:
             one = where & (np.arange(count) // lanes == lane)
             if one.any():
                 try:
-                    proofs.append((one, self._proof(gains, self._run(gains, one), one)))
+                    proofs.append((one, self._proof(gains, self._run(gains, one, heavier), one)))
                 except SafetyError as error:
                     proofs.append((one, self._refused(str(error), one)))
         return _merged(proofs)
@@ -233,6 +247,7 @@ class ProvingGround:
         """
         drives, rated = self.target.drives, self.target.motor.rated_current
         where = self.target.together(where)
+        self._fallback.begin()
         self._begin(where)
         self._hold_still(where)
         write_gains(drives, gains, where)
@@ -359,11 +374,14 @@ class ProvingGround:
         """Return which axes were at rest in a recording of their positions, (cycles, num_axes)."""
         return np.asarray(np.abs(wrapped(positions - positions[-1])).max(axis=0) <= STEP_COUNTS * self._count)
 
-    def _run(self, gains: Integers, where: Mask) -> Trial:
+    def _run(self, gains: Integers, where: Mask, heavier: bool) -> Trial:
+        self._fallback.begin()
         self._begin(where)
-        self.moves[where] += len(PHASES)
+        self.moves[where] += len(PHASES) + heavier
         stop_causes(self.target.drives)  # of before
-        tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
+        tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where, heavier)
+        if heavier:  # it has come back
+            return tried
         # A trial ends where its move did, and the next one goes the other way.
         self._origin = np.where(where, self._origin + self._direction * self.move.distance, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
@@ -449,10 +467,12 @@ class ProvingGround:
         terms: Terms = tried.terms
         known = self.target.device.gains
         costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._reference)))
-        stopped: Mask = np.asarray(tried.aborted.any(axis=0))
+        # What a heavier load makes of gains costs, and is no reason against them on this one.
+        aborted = tried.aborted[: len(PHASES)]
+        stopped: Mask = np.asarray(aborted.any(axis=0))
         self.causes = stop_causes(self.target.drives)
-        self.aborts[where & stopped] += 1
-        self._shaken |= where & stopped
+        self.aborts[where & tried.aborted.any(axis=0)] += 1
+        self._shaken |= where & tried.aborted.any(axis=0)
         overshoot = terms.overshoot[:2].max(axis=0)
         # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
         now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / np.maximum(
@@ -463,8 +483,8 @@ class ProvingGround:
             costs,
             stopped,
             tried.culprit,
-            self._reasons(tried.aborted, overshoot, left, self.causes),
-            terms.noise.max(axis=0),
+            self._reasons(aborted, overshoot, left, self.causes),
+            terms.noise[: len(PHASES)].max(axis=0),
             overshoot,
             terms.settling[:2].mean(axis=0),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -79,8 +80,9 @@ def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
     reference = np.ones_like(bench.before)
     fallbacks, unsafe = np.tile(reference, (3, 1, 1)), ["not checked"] * target.num_axes
     for axis in map(int, np.flatnonzero(bench.going)):
-        (plant, _), before = identified.known(axis), bench.before[axis]
-        reference[axis] = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
+        (plant, found), before = identified.known(axis), bench.before[axis]
+        inertia = found.together if math.isfinite(found.together) else plant.inertia
+        reference[axis] = rule_gains(target.device, target.motor, inertia, supply=plant.supply)[0]
         unsafe[axis] = unsafe_gains(target.device, plant, before)
         # What the drive had may be better than what is only soft.
         soft = propose(SOFT, target.device, target.motor, plant).gains if unsafe[axis] else before

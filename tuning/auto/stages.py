@@ -129,14 +129,22 @@ class RuleTried:
     """What the baseline rule's gains have shown in the same trial and move as those found.
 
     Attributes:
+        gains: The rule's, or lower ones where an axis did not pass with these, (num_axes, count).
+        lowered: Where that is so, (num_axes,).
         where: Axes on which they were tried, (num_axes,).
         passed: Axes on whose machines they passed, stood at rest and are not too near to instability, (num_axes,).
         cost: J by measured terms of the trial, (num_axes,).
     """
 
+    gains: Integers
+    lowered: Mask
     where: Mask
     passed: Mask
     cost: Floats
+
+    def title(self, axis: int) -> str:
+        """Return what messages call the gains of an axis."""
+        return f"the gains of the baseline rule{', lowered,' if self.lowered[axis] else ''}"
 
 
 @dataclass(frozen=True)
@@ -152,6 +160,7 @@ class RecordedGains(TriedGains):
         rule: What the baseline rule's gains have shown, None where they were not tried.
         earlier: A recorded move with the gains before, None if none was made.
         kept: Axes that keep the gains before, which were better, (num_axes,).
+        won: Axes whose gains, found on twins, were better than the rule's on the drive and on the twins, (num_axes,).
         loaded: Response to a load step, of emulated machines, by axis.
     """
 
@@ -163,6 +172,7 @@ class RecordedGains(TriedGains):
     rule: RuleTried | None = None
     earlier: Shown | None = None
     kept: Mask = field(default_factory=lambda: np.zeros(0, bool))
+    won: Mask = field(default_factory=lambda: np.zeros(0, bool))
     loaded: Mapping[int, StepResponse] = field(default_factory=dict)
 
     @classmethod
@@ -172,7 +182,9 @@ class RecordedGains(TriedGains):
         n = len(tried.gains)
         none = np.zeros(n, bool)
         eased = np.zeros(n, np.int64)
-        return cls(**known, shown=None, eased=eased, response=None, unseen=none, proven=tried.gains, kept=none)
+        return cls(
+            **known, shown=None, eased=eased, response=None, unseen=none, proven=tried.gains, kept=none, won=none
+        )
 
     def with_move(self, shown: Shown) -> RecordedGains:
         """Return this with a later move of some axes in place of theirs."""

@@ -208,8 +208,8 @@ def _where_the_rule_passes(comparison: Comparison) -> list[str]:
     if not refused:
         return []
     lines = [
-        "The baseline rule's own gains fail the checks of drive-tune auto (they shake at rest, or fail a trial) "
-        f"on {len(refused)} of {first.machines} machines: {', '.join(refused)}."
+        "The baseline rule's own gains fail the checks of drive-tune auto (they shake at rest, fail a trial, or are "
+        f"too near to instability) on {len(refused)} of {first.machines} machines: {', '.join(refused)}."
     ]
     for row in comparison.tuners:
         median, p95, worse = row.median_there, row.p95_there, row.worse_there

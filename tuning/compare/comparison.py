@@ -23,7 +23,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import rule_gains
-from drive_env.trials.positioning import highest_ramp, plan_move
+from drive_env.trials.positioning import highest_ramp, longer_way, plan_move
 from drive_env.trials.score import RobustScore
 from mechanics.untrusted import parse_json
 from tuning.compare.rule_check import rule_passes
@@ -256,7 +256,7 @@ class Yardstick:
         with open_group(group, num_threads) as target:
             drives = target.drives
             inertia = _true_inertia(target)
-            reach = np.where(target.high >= -target.low, target.high, target.low)
+            reach = longer_way(target.low, target.high)
             supply = target.supply.reshape(len(group), -1)[:, 0]
             self._score.set_machines(machine_of(drives).parameters, supply)
             self._score.set_moves(

@@ -76,6 +76,8 @@ class Identification:
         wiring: The settings that encoder and halls need, by object, and those of the drive. With wrong ones the motor
             runs away or locks.
         fit: The linear model fitted to the frequency response, None where none was measured or it is another axis's.
+        together: Total inertia at the rotor that the axis pushes while all axes of its machine accelerate alike, as
+            "inertia" [kg*m^2]; nan where it was not measured.
         doubt: Why a model made of this is not to be relied on beside what the drive itself shows; "" where it is.
     """
 
@@ -84,6 +86,7 @@ class Identification:
     told: Mapping[str, Estimate] | None = None
     wiring: Settings = field(default_factory=dict)
     fit: PlantFit | None = None
+    together: float = math.nan
     doubt: str = ""
 
     def value(self, name: str) -> float:

@@ -20,6 +20,8 @@ from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
+from drive_env.trials.method import method_of
+from drive_env.trials.positioning import longer_way
 from tuning.identify.encoder_check import PULSED
 from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
@@ -84,13 +86,16 @@ class _Brief(Experiments):
         super().__init__(target, where, progress)
         # What is told of each axis where `found` has a guess.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
+        self._together = np.full(target.num_axes, math.nan)
         self._doubt = [""] * target.num_axes
 
     def run(self) -> list[Identification]:
-        every = zip(super().run(), self._told, self._doubt, strict=True)
+        every = zip(super().run(), self._told, self._together.tolist(), self._doubt, strict=True)
         return [
-            replace(one, told={name: told.get(name, one.estimates[name]) for name in NAMES}, doubt=doubt)
-            for one, told, doubt in every
+            replace(
+                one, told={name: told.get(name, one.estimates[name]) for name in NAMES}, together=together, doubt=doubt
+            )
+            for one, told, together, doubt in every
         ]
 
     def turn(self, working: Working) -> None:
@@ -115,13 +120,27 @@ class _Brief(Experiments):
         trials = Trials(drives, target.motor, target.axes_per_machine, 1.0)
         inertia = np.full(target.num_axes, GUESS * target.motor.inertia)
         for moving in _turns(working):
-            found, _ = trials.identify(np.where(up >= -down, up, down), moving)
+            found, _ = trials.identify(longer_way(down, up), moving)
             self._take_moved(found, moving)
             inertia[moving] = found.inertia[moving]
         working = self.calm(working)
+        working = self._move_together(working, trials)
         self.begin("resonance, delay, filter", 0.55, RESPONSE)
         switch_off(drives, working.where)
         self.respond(working, inertia)
+
+    def _move_together(self, working: Working, trials: Trials) -> Working:
+        """Find what axes of one machine push while all of them move; return those that did not oscillate."""
+        target, lanes = working.target, working.target.axes_per_machine
+        whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
+        if lanes == 1 or target.linked or not whole.any():  # which have moved together as it is
+            return working
+        # With the slow gains no axis follows a move that the others shake.
+        write_gains(target.drives, method_of(target.device, target.motor).first(target.supply), whole)
+        down, up = working.room()
+        found, _ = trials.identify(longer_way(down, up), whole)
+        self._together[whole] = found.inertia[whole]
+        return self.calm(working)
 
     def _take_moved(self, found: Identified, where: NDArray[np.bool_]) -> None:
         for k in map(int, np.flatnonzero(where)):

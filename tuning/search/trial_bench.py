@@ -22,7 +22,7 @@ from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import Identified, Trial, measured_cost
 from drive_env.trials.method import method_of
-from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, wrapped, write_profile
+from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, longer_way, wrapped, write_profile
 from drive_env.trials.score import TRIP
 from tuning.auto.fallback_gains import FallbackGains
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
@@ -100,7 +100,7 @@ class TrialBench:
         self._fallback = FallbackGains(target.num_axes, motor.rated_current)
         self._drives = ObservedDrives(target.drives, self._fallback)
         self._trials = self.method.trials(self._drives, target.axes_per_machine)
-        self._reach = np.where(target.high >= -target.low, target.high, target.low)
+        self._reach = longer_way(target.low, target.high)
         self._where = np.ones(target.num_axes, bool)
         self._direction = np.ones(target.num_axes, np.int64)
         self._was_enabled = ~self._trials.down()
