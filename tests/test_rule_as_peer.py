@@ -11,6 +11,7 @@ import pytest
 from auto_stages import basis, recorded
 
 from drive_env.devices import find_device
+from drive_env.safety.envelope import SafetyError
 from tuning.auto import choice, loop_margins
 from tuning.auto import moves as auto_moves
 from tuning.auto.bench import AutoBench, Journal
@@ -207,6 +208,21 @@ def test_a_rule_that_fails_its_trial_is_lowered_by_a_fifth_at_a_time(most, tries
     assert [row[0][2] for row in ground.tried] == tries
     assert found.passed.tolist() == [passed] and found.lowered.tolist() == [len(tries) > 1]
     assert found.gains[0].tolist() == faster(find_device("tmcm1636").gains, np.array(RULE), tries[-1] / 700).tolist()
+
+
+def test_a_rule_that_the_envelope_stops_is_no_peer_and_what_was_found_stays(monkeypatch):
+    class Stopped(Ground):
+        def run(self, gains, where, heavier=False):
+            raise SafetyError("axis 0 oscillates")
+
+    ground = Stopped(lambda gains: np.ones(1))
+    bench, start = bench_on(ground, 1), basis([RULE])
+    found = try_rule(bench, start, of([OWN], ground, None))
+    assert not found.rule.passed.any() and np.isnan(found.rule.cost).all()
+    assert bench.journals[0].notes == [
+        "the envelope stopped the move with the baseline rule's gains: axis 0 oscillates"
+    ]
+    assert keep_the_better(bench, start, found, bench.target).gains.tolist() == [OWN]
 
 
 def test_of_linked_axes_what_was_found_is_never_better_and_the_reason_is_told(monkeypatch):
