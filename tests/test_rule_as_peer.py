@@ -16,7 +16,7 @@ from tuning.auto import choice, loop_margins
 from tuning.auto import moves as auto_moves
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.calmer_gains import calmer
-from tuning.auto.choice import PeerFigures, choose_set, keep_the_better, try_rule
+from tuning.auto.choice import PeerFigures, choose_set, keep_the_better, try_rule, try_what_changed
 from tuning.auto.measured_margins import SENSITIVITY, SOUGHT
 from tuning.auto.moves import stand
 from tuning.auto.proving import Proof, Shown
@@ -268,6 +268,51 @@ def test_a_rule_that_is_too_near_to_instability_as_measured_is_lowered_before_it
     found = try_rule(bench, start, seen).rule
     assert asked == [limit] * axes and ground.tried == [[[*RULE[:4], RULE[4] - 100]] * axes]
     assert found.passed.all() and found.title(0) == "the gains of the baseline rule, lowered,"
+
+
+# --- what is claimed of the gains that are left ---------------------------------------------------------------------
+class Failing(Ground):
+    """A ground on which a trial fails, and moves do not."""
+
+    def __init__(self, why):
+        super().__init__(lambda gains: np.ones(len(gains)))
+        self.why, self.asks_heavier = why, False
+
+    def run(self, gains, where, heavier=False):
+        return super().run(gains, where)._replace(reason=(self.why,) * len(gains))
+
+
+@pytest.mark.parametrize(("why", "reservations"), [
+    ("", []), ("it oscillated", ["the lowered gains fail their trial: it oscillated"]),
+])  # fmt: skip
+def test_gains_that_were_lowered_at_rest_make_their_trial_and_what_fails_it_is_no_plain_accept(why, reservations):
+    """The certificate says that they made a move, its reversal and one with more velocity P: a move alone is less."""
+    ground = Failing(why)
+    bench, eased = bench_on(ground, 1), recorded([OWN], proof=np.ones(1)).with_gains(0, np.array(RULE))
+    found = try_what_changed(bench, eased)
+    assert ground.tried == [[RULE]] and bench.journals[0].reservations == reservations
+    assert found.proven.tolist() == [RULE] and found.proof.tolist() == [np.inf if why else 1.0]
+    again = try_what_changed(bench, found)
+    assert len(ground.tried) == (2 if why else 1), "what has passed makes no other"
+    assert again.gains.tolist() == [RULE]
+
+
+@pytest.mark.parametrize("known", [{}, {"kept": np.ones(1, bool)}])
+def test_gains_as_they_were_tried_make_no_other_trial(known):
+    ground = Failing("it oscillated")
+    same = recorded([OWN], proof=np.ones(1), **known)
+    if known:  # those before, which were better by a move: the verdict says so
+        same = same.with_gains(0, np.array(RULE))
+    assert try_what_changed(bench_on(ground, 1), same) is same and ground.tried == []
+
+
+def test_lowered_gains_without_drive_time_for_a_trial_are_a_reservation():
+    ground = Failing("")
+    bench, eased = bench_on(ground, 1), recorded([OWN], proof=np.ones(1)).with_gains(0, np.array(RULE))
+    bench.spent[:] = bench._budget + choice.LAST_OVERTIME
+    try_what_changed(bench, eased)
+    (reservation,) = bench.journals[0].reservations
+    assert ground.tried == [] and reservation.startswith("the lowered gains were tried by one move only")
 
 
 # --- axes that shake at rest --------------------------------------------------------------------------------------

@@ -37,6 +37,7 @@ Mask = NDArray[np.bool_]
 
 BAD = 8.0  # measured cost J of a move, above which the rule is tried, too, with gains that no twin has scored
 OVERTIME = 8.0  # s beyond the budget: without the rule's trial nobody knows whether the gains found are better
+LAST_OVERTIME = 25.0  # s beyond the budget: what was changed after its trial is to make another in any case
 CLEARLY = 0.9  # of the rule's: what a trial shows to be better by less may be so by chance
 LOWERED, SLOWER = 2, 0.8  # how often the rule's gains are lowered where an axis fails with them, and by what factor
 RULE = 0  # of the sets of gains that are compared: the rule's, those found, and those mixed of both
@@ -249,6 +250,38 @@ def _trial(bench: AutoBench, gains: Integers, where: Mask) -> Floats | None:
         return None
     faulted = reset(bench)
     return np.where(bench.whole_machines(proof.passed & ~faulted | ~where), proof.cost, np.inf)
+
+
+def try_what_changed(bench: AutoBench, recorded: RecordedGains) -> RecordedGains:
+    """Try gains that were changed since their trial, as those of an axis that shook are: a move alone is no trial.
+
+    What fails it, or cannot be tried any more, is a reservation.
+    """
+    changed = (recorded.gains != recorded.proven).any(axis=1) | np.isposinf(recorded.proof)
+    where = bench.whole_machines(_machines(bench, changed & ~recorded.kept) & bench.going)
+    if bench.ground is None or not where.any():
+        return recorded
+    able = bench.whole_machines(where & bench.affordable(TRIAL_TIME - LAST_OVERTIME))
+    bench.reserve(where & ~able, "the lowered gains were tried by one move only: the drive time of the run was used up")
+    if not able.any():
+        return recorded
+    try:
+        with bench.spending(bench.target.together(able)):
+            proof = bench.ground.run(recorded.gains, able)
+    except SafetyError as error:
+        bench.reserve(able, f"the envelope stopped the trial of the lowered gains: {error}")
+        return recorded
+    faulted = reset(bench, "the lowered gains were tried, and the fault cannot be reset")
+    for k in map(int, np.flatnonzero(able & bench.going)):
+        if not proof.passed[k] or faulted[k]:
+            why = proof.reason[k] or "the drive went into fault"
+            bench.journals[k].reserve(f"the lowered gains fail their trial: {why}")
+    cost = np.where(proof.passed & ~faulted, proof.cost, np.inf)
+    return replace(
+        recorded,
+        proof=np.where(able, cost, recorded.proof),
+        proven=np.where(able[:, None], recorded.gains, recorded.proven),
+    )
 
 
 def _figures(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> PeerFigures:

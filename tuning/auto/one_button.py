@@ -18,7 +18,7 @@ import numpy as np
 from drive_env.gains import check_linear_model
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
-from tuning.auto.choice import keep_the_better, try_rule
+from tuning.auto.choice import keep_the_better, try_rule, try_what_changed
 from tuning.auto.loop_margins import judge, measure
 from tuning.auto.moves import look_back, show, stand
 from tuning.auto.refinement import refine, to_refine
@@ -139,6 +139,7 @@ def prove_found(
         if to_refine(bench, recorded).any():
             say("refining gains on the drives", 0.93)
         recorded = refine(bench, basis, recorded, target)
+        recorded = try_what_changed(bench, recorded)
         verdict = judge(bench, basis, recorded)
         tell_of_lateness(bench)
         if not is_recorded(target.drives):

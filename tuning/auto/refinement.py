@@ -8,6 +8,7 @@ computed meanwhile, so that it is the same on a bus.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,6 +59,12 @@ def refine(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Targ
     except SafetyError as error:
         bench.note(where, f"the envelope stopped a trial of refined gains: {error}")
         return recorded
+    # What they began with has made its trial once more, whatever became of it.
+    recorded = replace(
+        recorded,
+        proof=np.where(where, climb.first, recorded.proof),
+        proven=np.where(where[:, None], recorded.gains, recorded.proven),
+    )
     better = bench.going & where & (climb.cost < CLEARLY * climb.first)
     if not better.any():
         return recorded
