@@ -235,6 +235,32 @@ def test_bounds_are_close_where_what_is_sought_leaves_less():
     assert 20.0 * np.log10(SOUGHT / (SOUGHT - 1.0)) == pytest.approx(auto_margins.CLOSE["gain"], abs=0.1)
 
 
+@pytest.mark.slow
+def test_gains_that_a_last_stage_has_changed_are_tried_before_they_are_certified(quick, monkeypatch, tmp_path):
+    """A trial that they fail takes the plain accept away, whatever the faster ones before have shown."""
+    run, tried = ProvingGround.run, []
+
+    def changed(bench, basis, recorded, target):
+        return recorded.with_gains(0, np.maximum(recorded.gains[0] * 9 // 10, 1))
+
+    def fails(self, wanted, where, heavier=False):
+        tried.append(wanted[0].tolist())
+        proof = run(self, wanted, where, heavier)
+        return proof._replace(reason=("it oscillated",)) if len(tried) > 1 and wanted[0].tolist() == last else proof
+
+    monkeypatch.setattr(auto_module, "refine", changed)
+    monkeypatch.setattr(ProvingGround, "run", fails)
+    with emulated(load="inertia", num_threads=1) as target:
+        last = None
+        (axis,) = auto(target, tmp_path / "first.toml", experiments=standing_in).axes
+        assert tried[-1] == list(axis.after) and axis.verdict == "accepted", axis
+        last = list(axis.after)
+    with emulated(load="inertia", num_threads=1) as target:
+        (axis,) = auto(target, tmp_path / "second.toml", experiments=standing_in).axes
+    assert list(axis.after) == last and axis.verdict == "accepted with reservations"
+    assert axis.reservations == ("the lowered gains fail their trial: it oscillated",)
+
+
 # --- rolling back -----------------------------------------------------------------------------------------------------
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
@@ -262,7 +288,10 @@ def quick(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["compute", "prove", "show", "measure", "look_back"])
+@pytest.mark.parametrize(
+    "stage", ["compute", "prove", "show", "measure", "look_back", "try_rule", "keep_the_better", "refine",
+              "try_what_changed"]
+)  # fmt: skip
 def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path, stage):
     def interrupted(bench, *handed):
         write_gains(bench.target.drives, np.full((1, 5), 77))

@@ -44,7 +44,7 @@ def auto(
     Of an open-loop stepper it sets the phase currents, the StallGuard threshold and CoolStep, and writes
     stepper-certificate.json in place of certificate.json and report.html.
 
-    The motor turns, for 10 to 35 s in all. The verdict is accepted, accepted with reservations, which are listed, or
+    The motor turns, for 10 to 40 s an axis. The verdict is accepted, accepted with reservations, which are listed, or
     rejected. Writes before.toml, with which `drive-tune undo` restores the state before, certificate.json and
     report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
