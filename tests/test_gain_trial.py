@@ -190,6 +190,7 @@ def test_identification_moves_three_rotors_there_and_back_from_where_the_axes_st
     drives, balanced = Moving(), []
     monkeypatch.setattr(gain_trial, "device_of", lambda drives: DEVICE)
     monkeypatch.setattr(gain_trial, "ampere_per_count", lambda drives: 1e-3)
+    monkeypatch.setattr(gain_trial, "STANDSTILL", 2e-3)  # these turn slowly
     monkeypatch.setattr(gain_trial, "per_increment", lambda drives, name: scale)
     monkeypatch.setattr(gain_trial, "write_profile", lambda drives, move, where: setattr(drives, "profile", move))
     monkeypatch.setattr(gain_trial, "start", lambda drives, target, where: drives.targets.append(target.tolist()))
@@ -207,6 +208,7 @@ def test_identification_moves_three_rotors_there_and_back_from_where_the_axes_st
     np.testing.assert_allclose(current[[100, TRIAL + 100]], [[0.1, 0.3], [-0.1, -0.3]])
     assert motor is MOTOR and len(angle) == 2 * TRIAL and angle[-1].tolist() == [0.0, 0.0]
     np.testing.assert_array_equal(moving, samples_in_motion(speed, 3))
+    assert not np.array_equal(moving, samples_in_motion(speed, 2)) and not moving[0].any() and moving[-1].all()
 
 
 def test_what_dry_friction_holds_at_rest_is_no_part_of_the_motion():
