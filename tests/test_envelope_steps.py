@@ -69,7 +69,7 @@ class Bench:
         made._stops, made._watch, made._commands = self.stops, self.watch, self.commands
         made._lending, made._watchdogs, made._limits = self.lending, self.watchdogs, self.limits
         made._checked_stop, made._is_closing, made._disabling = None, False, np.zeros(2, bool)
-        made._of_further_axes = {}
+        made._of_further_axes, made._played = {}, {}
 
     def entry(self, key):
         return self.drives.entries[key]
@@ -384,7 +384,8 @@ def test_after_an_enabling_controlword_a_signal_is_forgotten_and_a_hold_ended():
     before = bench.axes.epoch
     bench.after(WORD, [ENABLE, STOP], BOTH)
     assert bench.axes.epoch == before + 1 and not bench.axes.in_flight.any()
-    assert bench.done == [("note_start", [ENABLE, STOP], [True, True]), ("forget_signal",), ("end_hold", 0)]
+    assert bench.done == [("note_start", [ENABLE, STOP], [True, True]), ("forget_signal",),
+                          ("note_running", [True, False]), ("end_hold", 0)]  # fmt: skip
     assert bench.stops.current is None
 
 

@@ -10,9 +10,10 @@ from held_objects import HeldObjects
 
 from drive_env import Limits, SafetyError
 from drive_env.safety.bounds import Bounds
-from drive_env.safety.judging import CURRENT_CYCLES, LATENCY, Judging
+from drive_env.safety.judging import CURRENT_CYCLES, Judging
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.oscillation import SWINGS
+from drive_env.safety.stop_ends import LATENCY
 
 CSP, CSV, PP, PV, HM, TQ = 8, 9, 1, 3, 6, 4
 POSITION, DEMAND, VELOCITY, CURRENT = (0x6064, 0), (0x6062, 0), (0x606C, 0), (0x6077, 0)
@@ -28,15 +29,19 @@ class Bench:
 
         free = {"low": -NO_LIMIT, "high": NO_LIMIT, "velocity": NO_LIMIT, "current": NO_LIMIT, "following": NO_LIMIT}
         whole = {name: each(limits.get(name, value), np.int64) for name, value in free.items()}
-        parts = {"settled": SETTLED, "slack": SLACK, "count": 1.0, "braking": 1000.0, "profile": 2000.0, "rest": 10.0,
-                 "speed": np.inf}  # fmt: skip
+        parts = {"settled": SETTLED, "slack": SLACK, "count": 1.0, "braking": 1000.0, "profile": 2000.0, "slowing": 0.0,
+                 "rest": 10.0, "speed": np.inf, "lag": 0.0, "windup": 0.0}  # fmt: skip
         floats = {name: each(limits.get(name, value), float) for name, value in parts.items()}
         masks = {name: each(limits.get(name, True), bool) for name in ("given", "default_speed")}
         self.bounds = Bounds(**whole, **floats, **masks)
         self.axes = SimpleNamespace(
             everywhere=np.ones(axes, bool), speed=np.zeros(axes), velocity=np.zeros(axes),
-            outside=np.zeros(axes, np.int64), mode=each(mode, np.int64),
+            outside=np.zeros(axes, np.int64), mode=each(mode, np.int64), mode_written=np.zeros(axes),
+            demand=np.zeros(axes, np.int64), demand_seen=np.full(axes, -np.inf), led=np.full(axes, np.nan),
+            aim=dict.fromkeys(range(axes), 0), moves=np.ones(axes, bool), asked_speed=np.zeros(axes),
+            asked_current=np.zeros(axes), position=np.zeros(axes, np.int64), clock=1.0,
         )  # fmt: skip
+        self.axes.now, self.axes.newest_speed = lambda: self.axes.clock, lambda: self.axes.velocity
         self.user = user or Limits()
         in_force = SimpleNamespace(
             bounds=lambda: self.bounds, user=self.user, origin=lambda value, name, own: f"{name} or {own}"
@@ -148,6 +153,36 @@ def test_where_the_ramp_is_not_known_a_stop_takes_as_long_as_it_may():
     bench = Bench(high=1000, profile=0.0, mode=CSP)
     bench.axes.velocity[:] = 1000.0
     bench.see(position=[1000])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_axis_in_csp_that_its_set_point_holds_within_its_limits_is_left_to_it(sign):
+    """A stop would end 1400 increments outside; the loops brake it before."""
+    bench = Bench(mode=CSP, low=-1000, high=1000, braking=1000.0, profile=1000.0, lag=0.1)
+    bench.axes.velocity[:], bench.axes.demand[:], bench.axes.demand_seen[:] = 2000.0 * sign, 1000 * sign, 1.0
+    bench.see(position=[200 * sign])
+    bench.stops("the position is 21", position=[1021 * sign])
+    bench.axes.demand[:] = 1021 * sign
+    bench.stops("its stop would end 1400 increments", position=[200 * sign])  # 2000 of the ramp, 200 of the lag
+
+
+def test_a_stop_in_csv_begins_with_the_speed_that_was_asked_for():
+    bench = Bench(mode=CSV, high=1000, braking=1000.0)
+    bench.axes.asked_speed[:] = 1000.0  # 500 by the ramp, 10 before it begins
+    bench.see(position=[1000 + SLACK - 510])
+    bench.stops("its stop would end 51 increments", position=[1000 + SLACK - 509])
+
+
+@pytest.mark.parametrize(("mode", "name", "speed"), [(TQ, "asked_current", 100.0), (PV, None, 100.0)])
+def test_what_the_integral_holds_of_an_axis_that_speeds_up_adds_to_its_way(mode, name, speed):
+    bench = Bench(mode=mode, high=1000, braking=1000.0, windup=2.0)
+    if name:
+        bench.axes.asked_current[:] = 50
+    bench.see(position=[0])
+    bench.axes.clock, bench.axes.velocity = 1.01, np.array([speed])
+    way = 5 + 1 + 100  # ramp, latency, 2 increments for each of 50 counts
+    bench.see(position=[1000 + SLACK - way], current=[50])
+    bench.stops("its stop would end 51 increments", position=[1000 + SLACK - way + 1], current=[50])
 
 
 @pytest.mark.parametrize(("mode", "given", "stops"), [(HM, False, False), (HM, True, True), (CSV, False, True)])

@@ -92,11 +92,13 @@ STATUS, POSITION, VELOCITY, CURRENT, DEMAND = (0x6041, 0), (0x6064, 0), (0x606C,
 ALL = (STATUS, POSITION, VELOCITY, CURRENT, DEMAND)
 
 
-def looks_of(current=NO_LIMIT, following=NO_LIMIT, *, time_waits=True, lacks=()):
+def looks_of(current=NO_LIMIT, following=NO_LIMIT, *, travel=False, time_waits=True, lacks=()):
     """Looks at two axes, their drives, and their limits."""
     drives = HeldObjects({key: (k, 10 + k) for k, key in enumerate(ALL) if key not in lacks}, 2)
     drives.time_waits = time_waits
-    limits = SimpleNamespace(current=np.array([NO_LIMIT, current]), following=np.array([NO_LIMIT, following]))
+    limits = SimpleNamespace(
+        current=np.array([NO_LIMIT, current]), following=np.array([NO_LIMIT, following]), has_position=travel
+    )
     axes = SimpleNamespace(clock=5.0, now=lambda: axes.clock, epoch=0)
     return Looks(drives, axes, SimpleNamespace(bounds=lambda: limits), lambda *seen: None), drives, axes, limits
 
@@ -106,22 +108,24 @@ def indices(entries):
 
 
 @pytest.mark.parametrize(
-    ("current", "following", "lacks", "watched"),
+    ("current", "following", "travel", "lacks", "watched"),
     [
-        (NO_LIMIT, NO_LIMIT, (), [STATUS, POSITION, VELOCITY]),
-        (400, NO_LIMIT, (), [STATUS, POSITION, CURRENT, VELOCITY]),  # the most important first
-        (NO_LIMIT, 100, (), [STATUS, POSITION, VELOCITY, DEMAND]),
-        (400, 100, (), [STATUS, POSITION, CURRENT, VELOCITY, DEMAND]),
-        (400, 100, (CURRENT, VELOCITY), [STATUS, POSITION, DEMAND]),
+        (NO_LIMIT, NO_LIMIT, False, (), [STATUS, POSITION, VELOCITY]),
+        (400, NO_LIMIT, False, (), [STATUS, POSITION, CURRENT, VELOCITY]),  # the most important first
+        (NO_LIMIT, 100, False, (), [STATUS, POSITION, VELOCITY, DEMAND]),
+        (400, 100, False, (), [STATUS, POSITION, CURRENT, VELOCITY, DEMAND]),
+        (400, 100, False, (CURRENT, VELOCITY), [STATUS, POSITION, DEMAND]),
+        (NO_LIMIT, NO_LIMIT, True, (), [STATUS, POSITION, VELOCITY, DEMAND]),  # where csp leads tells whether it stays
     ],
 )
-def test_what_no_limit_needs_is_not_watched(current, following, lacks, watched):
-    looks, _, _, limits = looks_of(current, following, lacks=lacks)
+def test_what_no_limit_needs_is_not_watched(current, following, travel, lacks, watched):
+    looks, _, _, limits = looks_of(current, following, travel=travel, lacks=lacks)
     found = looks.watched()
     assert indices(found) == watched
     limits.current = np.array([NO_LIMIT, NO_LIMIT])
     assert looks.watched() is found  # while limits are these
-    looks._limits.bounds = lambda: SimpleNamespace(current=np.array([NO_LIMIT]), following=np.array([NO_LIMIT]))
+    looks._limits.bounds = lambda: SimpleNamespace(current=np.array([NO_LIMIT]), following=np.array([NO_LIMIT]),
+                                                   has_position=False)  # fmt: skip
     assert looks.watched() is not found
 
 

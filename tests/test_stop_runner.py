@@ -51,7 +51,17 @@ def runner_of(values=None, count=2, *, bounds=None, latest=True, ranges=None, **
     axes = Axes(drives)
     axes.place(np.zeros(count, np.int64), np.full(count, 1000.0))
     axes.live[:], axes.status[:], axes.mode[:], axes.clock = True, ENABLED, PP, 10.0
-    full = {"low": -NO_LIMIT, "high": NO_LIMIT, "braking": 1000.0, "rest": 10.0, "current": 400} | (bounds or {})
+    full = {
+        "low": -NO_LIMIT,
+        "high": NO_LIMIT,
+        "braking": 1000.0,
+        "rest": 10.0,
+        "current": 400,
+        "settled": 20.0,
+        "slack": 50.0,
+        "lag": 0.0,
+        "slowing": 0.0,
+    } | (bounds or {})
     found = SimpleNamespace(**{name: np.full(count, value) for name, value in full.items()})
     limits = SimpleNamespace(bounds=lambda: found, latest=found if latest else None)
     ceased = []

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
+from drive_env.safety.stopping import ANSWER, LONGEST_FOLLOWING, AxisStop, Phase, Sample, Stop
 
 ENABLED, STOPPING, OFF = 0x0637, 0x0617, 0x0650  # statuswords (CiA 402)
 QUICK_STOP, DISABLE_VOLTAGE = 0x02, 0x00  # controlwords
@@ -336,3 +336,24 @@ def test_a_stop_of_several_axes_is_over_when_each_is():
     assert not several.is_over
     axes[1].is_over = axes[5].is_over = True
     assert several.is_over
+
+
+@pytest.mark.parametrize(("follows_until", "begun"), [(0.0, 0.0), (0.1, 0.1), (9.0, LONGEST_FOLLOWING)])
+def test_an_axis_that_is_left_to_its_set_point_gets_its_ramp_later_and_in_any_case(follows_until, begun):
+    clock, axis = [0.0], Axis(lambda since: SPEED - RAMP * since if since < SPEED / RAMP else 0.0)
+    one = AxisStop(0.0, SPEED, RAMP, REST, True, lambda: clock[0] < follows_until)
+    sent = None
+    for step in range(200):
+        clock[0] = now = step * PERIOD
+        word = one.step(now, axis.sample(now))
+        if word is not None:
+            axis.take(word, now)
+        sent = now if sent is None and word == QUICK_STOP else sent
+    assert sent == pytest.approx(begun, abs=2 * PERIOD) and one.phase is Phase.REST
+
+
+def test_an_axis_that_is_left_to_its_set_point_and_not_seen_any_more_gets_its_ramp():
+    axis = Axis(lambda since: SPEED, seen_until=0.05)
+    one = AxisStop(0.0, SPEED, RAMP, REST, True, lambda: True)
+    words = [one.step(step * PERIOD, axis.sample(step * PERIOD)) for step in range(60)]
+    assert words.index(QUICK_STOP) * PERIOD == pytest.approx(0.05 + ANSWER, abs=2 * PERIOD)

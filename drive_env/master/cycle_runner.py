@@ -275,7 +275,7 @@ class CycleRunner:
             def watch(first: int, end: int) -> None:
                 nonlocal last
                 last = (first, end, held.decode(first, end))
-                watcher.observe(last[2], asked)
+                watcher.observe(last[2], asked, None, None if outputs is None else end)
 
         try:
             run_cycles(

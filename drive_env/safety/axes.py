@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.master.description import Key
 from drive_env.safety.bounds import COUNTED
-from drive_env.safety.objects import CURRENT, HM, POSITION, STATUSWORD, VELOCITY
+from drive_env.safety.objects import CURRENT, DEMAND, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped
 
 if TYPE_CHECKING:
@@ -46,7 +46,15 @@ class Axes:
         lost: Axes that could not be proved off.
         outside: How far outside its limits an axis was when it became live, or since [inc]; -1: not seen yet.
         aim: Axis to the target of pp before, from which relative moves go on [inc].
+        moves: Whether a move in pp was started to it in the present mode.
+        led: Where set-points of csp have led it, in the present mode [inc]; nan before the first.
+        demand: Demand of the position [inc].
+        demand_seen: When it came last [s].
+        asked_speed: What set-points of a velocity add up to [inc/s]; of rows that are played, the next one's.
+        asked_current: What those of a torque add up to [unit of 6077h].
         velocity: As the drive says [inc/s].
+        told_speed: As the drive says in another unit, by the scale of its positions [inc/s].
+        speed_count: Increments a second of a count of 606Ch; nan where its unit tells none.
         speed: From positions [inc/s].
         has_scale: Whether the drive says how many increments a revolution has.
         mean_current: Over the last 30 ms [unit of 6077h].
@@ -73,8 +81,14 @@ class Axes:
         self.mode = np.zeros(count, np.int64)
         self.outside = np.full(count, -1, np.int64)
         self.aim: dict[int, int] = {}
+        self.moves = np.zeros(count, bool)
+        self.led = np.full(count, math.nan)
+        self.demand = np.zeros(count, np.int64)
+        self.asked_speed, self.asked_current = np.zeros(count), np.zeros(count)
+        self.demand_seen = np.full(count, -math.inf)
         self.position = np.zeros(count, np.int64)
         self.velocity = np.zeros(count)
+        self.told_speed, self.speed_count = np.zeros(count), np.full(count, math.nan)
         self.speed = np.zeros(count)
         self.mean_current = np.zeros(count)
         self.seen = np.full(count, -math.inf)
@@ -113,15 +127,25 @@ class Axes:
             axes[k * per_node : (k + 1) * per_node] = True
         return axes
 
+    def newest_speed(self) -> Floats:
+        """Return the speeds [inc/s]: those that the drives say, for positions tell them some milliseconds late."""
+        return np.where(np.abs(self.told_speed) > np.abs(self.velocity), self.told_speed, self.velocity)
+
     def assume(self, axes: Mask) -> None:
         """Count axes as live from now on: a frame that could enable them is about to be sent."""
         with self.lock:
             self.epoch += 1
             begins = axes & ~self.live
             self.outside = np.where(begins, -1, self.outside)
+            self.forget_motion(begins)
             self.assumed |= axes
             self.in_flight |= axes
             self.live |= axes
+
+    def forget_motion(self, axes: Mask) -> None:
+        """Take note that no set-point of a position moves some axes any more: a new one must be given."""
+        self.moves = self.moves & ~axes
+        self.led = np.where(axes, math.nan, self.led)
 
     def take_for_off(self, axes: Mask) -> None:
         """Count axes as off: they were proved to be."""
@@ -184,6 +208,11 @@ class Axes:
             self._current_time = np.where(where, now, self._current_time)
         if VELOCITY in rows and self.is_counted:
             self.velocity = np.where(where, rows[VELOCITY][-1], self.velocity).astype(float)
+        elif VELOCITY in rows:
+            self.told_speed = np.where(where, rows[VELOCITY][-1] * np.nan_to_num(self.speed_count), self.told_speed)
+        if DEMAND in rows:
+            self.demand = np.where(where, rows[DEMAND][-1], self.demand)
+            self.demand_seen = np.where(where, now, self.demand_seen)
         if POSITION in rows:
             has_new_zero = self._take_position(rows[POSITION], now, where)
         if POSITION in rows and not (VELOCITY in rows and self.is_counted):

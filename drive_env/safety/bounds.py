@@ -11,14 +11,16 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.dictionary.units import split_unit
+from drive_env.dictionary.units import Context, find_unit, split_unit
+from drive_env.gains import PI, gain_factors
 from drive_env.master.description import Key
 from drive_env.master.errors import RefusedError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
-from drive_env.safety.objects import VELOCITY
+from drive_env.safety.objects import CURRENT, VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 
 if TYPE_CHECKING:
+    from drive_env.devices import Device
     from drive_env.master.bus_drives import BusDrives
 
 Integers = NDArray[np.int64]
@@ -60,9 +62,13 @@ class Bounds:
         following: Largest following error [inc].
         braking: Deceleration of a quick stop [inc/s^2]; 0 where it is not known.
         profile: Highest deceleration of a profile [inc/s^2], or `braking`.
+        slowing: Deceleration of a profile that ends, or has no set-point any more [inc/s^2]; 0 where it is not known.
         rest: Speed below which an axis is at rest [inc/s].
         default_speed: Whether the speed limit is ours, for want of another.
         speed: Highest speed by positions [inc/s], where 606Ch does not count increments; else infinite.
+        lag: Of the position loop: what the demand is ahead of an axis, over its speed [s]; 0 where it is not known.
+        windup: How far an axis goes on by what the integral of its velocity loop holds, of a count of 6077h [inc]; 0
+            where it is not known.
     """
 
     low: Integers
@@ -76,9 +82,12 @@ class Bounds:
     following: Integers
     braking: Floats
     profile: Floats
+    slowing: Floats
     rest: Floats
     default_speed: Mask
     speed: Floats
+    lag: Floats
+    windup: Floats
     has_position: bool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -176,10 +185,51 @@ def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors:
         ),
         braking,
         np.maximum.reduce([braking, *(_rate(drives, key, rotor) for key in (ACCELERATION, DECELERATION))]),
+        _slowing(drives, rotor),
         np.where(known_scale, REST_TURNS * rotor.scale, REST_INCREMENTS),
         ours,
         np.where(known_scale & (unit != COUNTED), np.maximum(DEFAULT_SPEED * rotor.scale, by_position), np.inf),
+        *_loops(drives, rotor),
     )
+
+
+def motion_gains(device: Device | None) -> dict[tuple[str, str], Key]:
+    """Return the gains of velocity and position loop by loop and part, of a device whose cascade we know."""
+    if device is None or device.gains.cascade != PI:
+        return {}
+    return {(row.loop, row.part): row.key for row in device.gains.rows if row.loop in ("velocity", "position")}
+
+
+def _loops(drives: BusDrives, rotor: RotorAngle) -> tuple[Floats, Floats]:
+    """Return by how much a demand is ahead, of the speed [s], and the way that a count of current holds [inc]."""
+    device, none = drives.device, np.zeros(drives.num_axes)
+    keys = motion_gains(device)
+    if device is None or not keys:
+        return none, none
+    factors: dict[Key, float] = dict(zip((row.key for row in device.gains.rows), gain_factors(device), strict=True))
+    gain = {part: np.asarray(factors[key] * read_own(drives, key, 0), float) for part, key in keys.items()}
+    # The integral, in A, is P I f times the angle by which the axis is behind.
+    per_rad = gain.get(("velocity", "P"), none) * gain.get(("velocity", "I"), none) * device.velocity_rate
+    return (
+        _reciprocal(gain.get(("position", "P"), none)),
+        _reciprocal(per_rad) * _ampere(drives) * np.where(rotor.scale > 1.0, rotor.scale, 0.0) / (2.0 * np.pi),
+    )
+
+
+def _reciprocal(value: Floats) -> Floats:
+    return np.asarray(np.where(value > 0.0, 1.0 / np.where(value > 0.0, value, 1.0), 0.0), float)
+
+
+def _ampere(drives: BusDrives) -> Floats:
+    """Return how many amperes a count of 6077h is; 0 where its unit tells none."""
+    known, device = drives.description, drives.device
+    if device is None or CURRENT not in device.bindings or not known.has(CURRENT):
+        return np.zeros(drives.num_axes)
+    key = known.role(Role.PEAK_CURRENT)
+    peak = np.full(drives.num_axes, np.nan) if key is None else read_own(drives, key, 0) * 1e-3
+    context = Context(np.nan, np.nan, peak_current=peak)
+    factor = np.asarray(find_unit(device.bindings[CURRENT].unit).factor(context), float)
+    return np.asarray(np.nan_to_num(np.broadcast_to(factor, (drives.num_axes,))), float)
 
 
 REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filter may show of a rotor at rest
@@ -237,6 +287,12 @@ def increments_per_count(unit: str, rotor: RotorAngle) -> Floats:
     if base in BY_RATIO:
         return np.where(scale > 1.0, number * scale / 60.0 * rotor.ratio, np.nan)
     return np.where(scale > 1.0, number * scale / 60.0, np.nan) if base in BY_MINUTE else np.full(len(scale), np.nan)
+
+
+def _slowing(drives: BusDrives, rotor: RotorAngle) -> Floats:
+    """Return 6084h, where that is 0 6083h [inc/s^2]."""
+    down = _rate(drives, DECELERATION, rotor)
+    return np.where(down > 0.0, down, _rate(drives, ACCELERATION, rotor))
 
 
 def _rate(drives: BusDrives, key: Key, rotor: RotorAngle) -> Floats:

@@ -21,6 +21,7 @@ from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_t
 from drive_env.safety.objects import (
     CONTROLWORD,
     CSP,
+    CSV,
     DEMAND,
     HOMING_SPEED_TO_SWITCH,
     HOMING_SPEED_TO_ZERO,
@@ -41,6 +42,7 @@ from drive_env.safety.objects import (
     VELOCITY_OFFSET,
 )
 from drive_env.safety.rotor import scale_objects
+from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -81,6 +83,7 @@ class Commands:
         self._drives = drives
         self._known = drives.description.dictionary
         self._current_limit = drives.description.role(Role.CURRENT_LIMIT)
+        self._is_stepped = drives.description.role(Role.MICROSTEPS) is not None
         self._scale_objects = scale_objects(drives.description)
         self._axes = axes
         self._limits = limits
@@ -114,6 +117,25 @@ class Commands:
     def note(self, key: Key, raw: Integers, where: Mask) -> None:
         """Take note of a set-point that was written."""
         self._set_points[key] = np.where(where, raw, self._set_points.get(key, 0))
+        if key in (TARGET_POSITION, POSITION_OFFSET):
+            led = where & self._axes.live & (self._axes.mode == CSP)
+            other = self._set_points.get(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION, 0)
+            self._axes.led = np.where(led, self._set_points[key] + other, self._axes.led)
+        if key in _PARTNERS:
+            self.note_running(where, (key,))
+
+    def note_running(self, where: Mask, keys: tuple[Key, ...] = (TARGET_VELOCITY, TARGET_TORQUE)) -> None:
+        """Take note that axes act on the set-points of speed and torque that they have, by default on both."""
+        for key in keys:
+            asked = self._set_points.get(key, 0) + self._set_points.get(_PARTNERS[key], 0)
+            if _MAGNITUDES[key] == "velocity":
+                self._axes.asked_speed = np.where(where, asked * self._speed_count(), self._axes.asked_speed)
+            else:
+                self._axes.asked_current = np.where(where, asked, self._axes.asked_current)
+
+    def _speed_count(self) -> NDArray[np.float64]:
+        """Return the increments a second of a count of 60FFh; 0 where its unit tells none."""
+        return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
         """Forget a set-point, by default all: a node was reset, or nobody knows whether it took the last one."""
@@ -129,6 +151,7 @@ class Commands:
         for axis in np.flatnonzero(starts).tolist() if target is not None else ():
             base = self._axes.aim.get(axis, int(self._axes.position[axis])) if words[axis] & cia402.RELATIVE else 0
             self._axes.aim[axis] = base + int(target[axis])  # type: ignore[index]
+            self._axes.moves[axis] = True
 
     def check_start(self, words: Integers, where: Mask) -> None:
         """Check a move when it is started: only then is it known whether it is relative, and how fast it will be."""
@@ -197,6 +220,7 @@ class Commands:
         if aim.shape != rows.shape:
             aim = np.broadcast_to(aim, rows.shape)
         self._check_position(entry, aim, self._axes.everywhere, (CSP,))
+        self._check_jumps(entry, aim, self._axes.everywhere)
         if (entry.index, entry.sub) == TARGET_POSITION:
             self._check_position(entry, rows, self._axes.everywhere, (PP,))
 
@@ -208,10 +232,12 @@ class Commands:
             other = self._last(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION)
             if key == TARGET_POSITION or np.any(self._modes() == CSP):
                 self._check_position(entry, raw + other, where, (CSP,))
+                self._check_jumps(entry, raw + other, where)
         elif key == QUICK_STOP_DECELERATION:
             self._check_braking(entry, raw, where)
         elif key == MODE:
             self.check_modes(where & self._axes.may_turn, raw)
+            self._check_mode_room(raw, where & self._axes.live)
         else:
             self._check_magnitude(entry, raw, where, played or {})
 
@@ -252,6 +278,74 @@ class Commands:
                 f"inside, or widen {origin}"
             )
 
+    def _check_jumps(self, entry: Entry, aim: Integers, axes: Mask) -> None:
+        """Raise SafetyError for set-points of csp that jump faster than an axis may turn, where nothing softens that.
+
+        A stepper's field is where its set-point is: after a jump the motor has lost steps, and stands anywhere.
+        """
+        if not self._is_stepped or not np.any(axes & self._axes.live):
+            return
+        bounds, led = self._limits.bounds(), self._axes.led
+        begin = np.where(np.isnan(led), self._axes.position, led)
+        jump = np.abs(np.diff(np.vstack([begin, np.atleast_2d(aim)]), axis=0)).max(axis=0)
+        limit = np.nan_to_num(bounds.velocity * bounds.count, nan=np.inf)
+        cycle = self._drives.description.cycle
+        if np.all(jump <= limit * cycle):
+            return
+        period = np.maximum(self._interpolation_period(), cycle)
+        wrong = axes & self._axes.live & (jump > limit * period) & (self._modes() == CSP)
+        for axis in np.flatnonzero(wrong).tolist():
+            raise SafetyError(
+                f"axis {axis}: {entry.label} would jump by {jump[axis]:.0f} increments within "
+                f"{1e3 * period[axis]:g} ms, {jump[axis] / period[axis]:.0f} a second, beyond the limit "
+                f"{limit[axis]:.0f}: a stepper loses steps by it; nothing was sent. Lead it there in "
+                f"smaller steps, or raise {self._velocity_origin(axis)}"
+            )
+
+    def _interpolation_period(self) -> NDArray[np.float64]:
+        """Return the time that a set-point of csp takes [s]; 0 where the drive does not say."""
+        value, index = (read_own(self._drives, (cia402.INTERPOLATION_PERIOD, sub), 0) for sub in (1, 2))
+        return np.asarray(value * 10.0 ** index.astype(float), float)
+
+    def _check_mode_room(self, modes: Integers, axes: Mask) -> None:
+        """Raise SafetyError for a mode of a position in which an axis would not come to rest within its travel.
+
+        The demand of such a mode is ahead of the axis, and pp without a set-point brakes by its profile's ramp.
+        """
+        bounds, speed = self._limits.bounds(), self._axes.newest_speed()
+        if not (bounds.has_position and axes.any()):
+            return
+        ramp = np.where(modes == PP, profile_way(bounds, speed), ramp_way(bounds, speed) + speed * bounds.lag)
+        beyond = outside(bounds, self._axes.position + ramp)
+        wrong = axes & np.isin(modes, (PP, CSP)) & (np.abs(speed) > bounds.rest)
+        wrong &= beyond > np.maximum(outside(bounds, self._axes.position), bounds.slack)
+        for axis in np.flatnonzero(wrong & (self._modes() != modes)).tolist():
+            raise SafetyError(
+                f"axis {axis}: in mode {modes[axis]} it would come to rest {beyond[axis]:.0f} increments beyond the "
+                f"limits {bound_text(bounds.low[axis])} to {bound_text(bounds.high[axis])}, from its "
+                f"{abs(speed[axis]):.0f} increments a second; nothing was sent. Slow it down first"
+            )
+
+    def _check_braking_room(self, entry: Entry, value: Integers, where: Mask) -> None:
+        """Raise SafetyError for a speed of csv from which a quick stop would end outside: its ramp begins with that."""
+        bounds, axes = self._limits.bounds(), self._axes
+        if not bounds.has_position:
+            return
+        speed = np.atleast_2d(value)[0] * self._speed_count()
+        faster = (np.abs(speed) > np.abs(axes.asked_speed)) | (speed * axes.asked_speed < 0.0)
+        end = axes.position + ramp_way(bounds, speed) + speed * LATENCY
+        beyond = outside(bounds, end)
+        wrong = where & axes.live & faster & (beyond > np.maximum(outside(bounds, axes.position), bounds.slack))
+        if not wrong.any():
+            return
+        for axis in np.flatnonzero(wrong & (self._modes() == CSV)).tolist():
+            raise SafetyError(
+                f"axis {axis}: from {entry.label} = {np.atleast_2d(value)[0][axis]} a quick stop would end "
+                f"{beyond[axis]:.0f} increments beyond the limits {bound_text(bounds.low[axis])} to "
+                f"{bound_text(bounds.high[axis])}; nothing was sent. Choose less, raise 6085h, or widen "
+                f"{self._limits.origin(self._limits.user.position, 'position', '607Dh')}"
+            )
+
     def _check_magnitude(self, entry: Entry, raw: Integers, where: Mask, played: Mapping[Entry, Integers]) -> None:
         key = (entry.index, entry.sub)
         if key == self._current_limit:
@@ -266,6 +360,8 @@ class Commands:
         if partner is not None:
             added = next((rows for e, rows in played.items() if (e.index, e.sub) == partner), self._last(partner))
             value = raw + added
+        if key in (TARGET_VELOCITY, VELOCITY_OFFSET):
+            self._check_braking_room(entry, value, where)
         above = np.maximum(np.abs(raw), np.abs(value)) > limit
         if not above.any():
             return

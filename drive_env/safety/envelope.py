@@ -39,6 +39,7 @@ from drive_env.safety.bounds import (
     POSITION_HIGH,
     POSITION_LOW,
     QUICK_STOP_DECELERATION,
+    motion_gains,
 )
 from drive_env.safety.commands import Commands
 from drive_env.safety.errors import SafetyError as SafetyError
@@ -103,6 +104,7 @@ class Envelope:
         self._checked_stop: Stop | None = None  # when the controlword that is being written was checked
         self._is_closing = False
         self._disabling = np.zeros(drives.num_axes, bool)  # the last controlword was "disable operation"
+        self._played: dict[Key, Integers] = {}  # modes and set-points of the rows that are under way
         self._of_further_axes = drives.description.of_further_axes()
 
     @property
@@ -175,7 +177,7 @@ class Envelope:
         self._commands.forget(key)
         if key in scale_objects(self._drives.description):
             self._limits.place_again()
-        elif key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT):
+        elif self._is_limit(key):
             self._limits.forget()
         if entry.index == STORE and self._axes.is_armed:
             with logged():
@@ -193,16 +195,22 @@ class Envelope:
             self._commands.note(key, raw, where)
         elif key in scale_objects(self._drives.description):
             self._limits.place()
-        elif key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT):
+        elif self._is_limit(key):
             self._limits.forget()
             if key == HOME_OFFSET and self._axes.is_armed:
                 self._limits.lend()  # it corrects software limits
         elif entry.index == STORE and self._axes.is_armed:
             self._lend()
 
+    def _is_limit(self, key: Key) -> bool:
+        """Return whether limits, or the way of a stop, depend on an object."""
+        gains = motion_gains(self._drives.device).values()
+        return key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT) or key in gains
+
     def _note_mode(self, key: Key, where: Mask) -> None:
         """Take note of what may make an axis ignore commands for a moment, until it has both of its modes."""
         if key in (MODE, self._drives.description.role(Role.MODE_GATE)):
+            self._axes.forget_motion(where)
             self._axes.mode_written = np.where(where, self._axes.now(), self._axes.mode_written)
 
     def write_lent(self, entry: Entry, axis: int, value: int) -> bool:
@@ -246,6 +254,11 @@ class Envelope:
             self._prove_watchdogs(enables)
             self._axes.assume(enables)
         self._checked_stop = self._stops.current
+        self._played = {
+            (entry.index, entry.sub): rows
+            for entry, rows in played.items()
+            if (entry.index, entry.sub) in (MODE, *SET_POINTS) and len(rows)
+        }
 
     def _check_place(self, entry: Entry) -> None:
         """Raise SafetyError for a further axis' object by its own index, by which nothing would monitor that axis."""
@@ -310,12 +323,14 @@ class Envelope:
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
         """Take note of what was played."""
+        self._played = {}
         for entry, rows in played.items():
             if len(rows):
                 self.after_write(entry, rows[-1], self._axes.everywhere)
 
     def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
         """Take note that the drives may have taken any of the rows."""
+        self._played = {}
         for entry in played:
             self.after_failed_write(entry)
 
@@ -370,15 +385,29 @@ class Envelope:
         """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
         self._watch.looks.sampled(chosen)
 
-    def observe(self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None) -> None:
+    def observe(
+        self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None, coming: int | None = None
+    ) -> None:
         """Look at samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
 
         Args:
             rows: The samples, one communication cycle apart.
             epoch: The envelope's when they were asked for.
             where: Axes that they are of, all by default.
+            coming: The number of the row that goes out next, of those that are played.
         """
+        if coming is not None:
+            self._note_rows(coming)
         self._watch.observe(rows, epoch, where)
+
+    def _note_rows(self, coming: int) -> None:
+        """Take note of the mode that axes have by the newest row, and of the set-points of the one that comes."""
+        for key, rows in self._played.items():
+            if key != MODE:
+                self._commands.note(key, rows[min(coming, len(rows) - 1)], self._axes.everywhere)
+            elif np.any(self._axes.mode != rows[coming - 1]):
+                self._note_mode(key, self._axes.mode != rows[coming - 1])
+                self._axes.mode = rows[coming - 1].copy()
 
     def stop(self, reason: str) -> None:
         """Bring what is live to rest by grades and switch it off; what fails is logged.
@@ -467,10 +496,15 @@ class Envelope:
             self._axes.in_flight &= ~where
         disables = cia402.matches(words, cia402.COMMANDS["disable operation"])
         self._disabling = np.where(where, disables, self._disabling)
+        idle = where & ~cia402.may_enable(words)
+        self._axes.forget_motion(idle)
+        for asked in (self._axes.asked_speed, self._axes.asked_current):
+            asked[idle] = 0.0
         self._commands.note_start(words, where)
         if np.any(where & cia402.may_enable(words)):
             self._watch.forget_signal()
         if np.any(enabled := where & cia402.may_enable(words)):
+            self._commands.note_running(enabled)
             with self._axes.lock:
                 if self._stops.current is not self._checked_stop:
                     # It was stopped between the check and the frame, which may have undone that.

@@ -14,10 +14,11 @@ from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits import NO_LIMIT
-from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
+from drive_env.safety.limits_in_force import LimitsInForce, bound_text
 from drive_env.safety.objects import CSP, CURRENT, DEMAND, HM, POSITION, PP, STATUSWORD, VELOCITY
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
 from drive_env.safety.rotor import wrapped
+from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, sees_demand
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -25,7 +26,6 @@ Mask = NDArray[np.bool_]
 
 # A current above its limit is no accident until it lasts: noise and overshoot are within this.
 CURRENT_MARGIN, CURRENT_CYCLES = 1.25, 10
-LATENCY = 0.010  # s from a sample to the drive's ramp
 MODE_SETTLES = 0.05  # s after a mode was written, within which a drive may not be heard yet
 
 
@@ -58,6 +58,7 @@ class Judging:
         self._mode_gate = mode_gate
         count = len(axes.everywhere)
         self._over_current = np.zeros(count, np.int64)
+        self._stop_ends = StopEnds(axes)
         self._swings = [Swings() for _ in range(count)]
 
     def judge(self, rows: Mapping[Key, Integers], judged: Mask) -> None:
@@ -70,6 +71,7 @@ class Judging:
             self._trip(judged, fastest, bounds.velocity, VELOCITY, "lower the profile velocity or the target")
         if POSITION in rows:
             self._judge_speed(judged, bounds)
+        self._stop_ends.take(rows, bounds)
         if POSITION in rows and bounds.has_position:
             self._judge_position(judged, rows[POSITION], bounds)
         if POSITION in rows and DEMAND in rows:
@@ -108,9 +110,11 @@ class Judging:
             )
 
     def _judge_position(self, judged: Mask, position: Integers, bounds: Bounds) -> None:
-        ahead = self._stopping_distance(bounds)
-        end = position[-1] + ahead
-        low, high = np.minimum(position.min(axis=0), end), np.maximum(position.max(axis=0), end)
+        ends = np.stack([position[-1] + way for way in self._ways(bounds)])
+        low, high = (
+            np.minimum(position.min(axis=0), ends.min(axis=0)),
+            np.maximum(position.max(axis=0), ends.max(axis=0)),
+        )
         if ((low >= bounds.low) & (high <= bounds.high)).all():
             self._axes.outside[:] = 0
             return
@@ -139,16 +143,17 @@ class Judging:
                 f"move it back, or widen {self._limits.origin(self._limits.user.position, 'position', '607Dh')}",
             )
 
-    def _stopping_distance(self, bounds: Bounds) -> Floats:
-        """Return how far the axes go on, if they are stopped now [inc]."""
-        speed = self._axes.velocity
-        planned = (self._axes.mode == PP) | (self._axes.mode == CSP)  # ends by itself, at a target that was checked
-        braking = np.where(planned, bounds.profile, bounds.braking)
-        # Where the ramp is not known, as long a way as a stop may take at most.
-        unknown = np.where(planned, 0.0, np.abs(speed) * STOP_WITHIN / 2.0)
-        ramp = np.where(braking > 0.0, speed**2 / (2.0 * np.where(braking > 0.0, braking, 1.0)), unknown)
-        way = ramp + np.where(planned, 0.0, np.abs(speed) * LATENCY)
-        return np.asarray(np.sign(speed) * way)
+    def _ways(self, bounds: Bounds) -> tuple[Floats, Floats]:
+        """Return how far the axes go on, if they are stopped now: by their speed, and by the one asked for [inc]."""
+        axes, speed = self._axes, self._stop_ends.speed
+        own, asked = self._stop_ends.ways(bounds)
+        # What ends by itself is as near to its end as the steepest ramp of a profile says, whatever a stop would do.
+        known = bounds.profile > 0.0
+        profile = np.sign(speed) * speed**2 / (2.0 * np.where(known, bounds.profile, 1.0)) * known
+        ends = ends_by_itself(axes, bounds)
+        own = np.where(ends | ((axes.mode == CSP) & ~sees_demand(axes)), profile, own)
+        own = np.where((axes.mode == CSP) & ends, 0.0, own)
+        return own, np.where(by_position(axes), own, asked)
 
     def _judge_following(self, judged: Mask, error: Integers, bounds: Bounds) -> None:
         largest: Integers = np.abs(wrapped(error)).max(axis=0)

@@ -126,6 +126,7 @@ class LimitsInForce:
             bounds.velocity = np.minimum(bounds.velocity, np.minimum(ramp, float(NO_LIMIT)).astype(np.int64))
             if generation == self._generation:  # else something changed while another thread's answers were read
                 self.latest = bounds
+                self._axes.speed_count = bounds.count
         return bounds
 
     def lend(self) -> None:

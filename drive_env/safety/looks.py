@@ -80,7 +80,7 @@ class Looks:
         keys = [STATUSWORD, POSITION, VELOCITY]
         if np.any(bounds.current < NO_LIMIT):
             keys.insert(2, CURRENT)
-        if np.any(bounds.following < NO_LIMIT):
+        if bounds.has_position or np.any(bounds.following < NO_LIMIT):
             keys.append(DEMAND)
         entries = [self._known.find(key) for key in keys if self._drives.description.has(key)]
         self._watched = (bounds, entries)

@@ -39,6 +39,7 @@ SET_POINTS = (
 )  # fmt: skip
 
 PP, PV, HM, CSP, CSV = 1, 3, 6, 8, 9  # modes of operation
+TORQUE_MODES = (4, 10)
 UNRAMPED_MODES = (4, CSP, 10)  # tq, csp, cst: no object says how fast what they command may become
 # What sets the speed of a mode, sums in brackets: from when the mode is on, and from when a move is started.
 RUNNING_SPEEDS = {PV: ((TARGET_VELOCITY,),), CSV: ((TARGET_VELOCITY, VELOCITY_OFFSET),)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Callable
@@ -16,7 +17,6 @@ from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import increments_per_count, read_own
 from drive_env.safety.errors import SafetyError, logged
-from drive_env.safety.judging import LATENCY
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
@@ -32,7 +32,8 @@ from drive_env.safety.objects import (
     PV,
     QUICK_STOP_OPTION,
 )
-from drive_env.safety.stopping import REPEAT, AxisStop, Phase, Sample, Stop
+from drive_env.safety.stop_ends import LATENCY, ends_by_itself, outside, stop_way
+from drive_env.safety.stopping import GRACE, REPEAT, SHARE, AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -90,6 +91,7 @@ class StopRunner:
         self._opened: set[int] = set()  # axes that were told last to take commands, not which
         self._modes: dict[int, int] = {}  # axis that ignores commands -> its mode of operation, asked for
         self._asked_at: dict[int, float] = {}  # axis -> when its mode was asked for [s]
+        self._beyond: dict[int, tuple[float, float]] = {}  # axis that leaves its travel by itself -> when, how fast
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
     def make_sure_of_ramps(self) -> None:
@@ -225,8 +227,34 @@ class StopRunner:
             speed = max(abs(self._axes.speed[axis]), abs(self._axes.velocity[axis]))
             braking = 0.0 if bounds is None else float(bounds.braking[axis])
             rest = 0.0 if bounds is None else float(bounds.rest[axis])
-            stop.axes[axis] = AxisStop(now, speed, braking, rest, holds)
+            leaves = bounds is not None and bool(ends_by_itself(self._axes, bounds)[axis])
+            follows = functools.partial(self._follows, axis) if leaves else None
+            self._beyond.pop(axis, None)
+            stop.axes[axis] = AxisStop(now, speed, braking, rest, holds, follows)
         stop.step(now)
+
+    def _follows(self, axis: int) -> bool:
+        """Return whether an axis that ends by itself had better go on: a quick stop would take it out of its travel.
+
+        Out there only one that its loops brake, or bring back.
+        """
+        bounds, axes = self._limits.latest, self._axes
+        if bounds is None or not cia402.matches(int(axes.status[axis]), cia402.OPERATION_ENABLED):
+            return False
+        speed, place = axes.newest_speed(), axes.position.astype(float)
+        if outside(bounds, place + stop_way(axes, bounds, speed))[axis] <= bounds.slack[axis]:
+            return False
+        is_out = outside(bounds, place)[axis] > bounds.settled[axis]
+        leaves = speed[axis] * (1.0 if place[axis] > bounds.high[axis] else -1.0) > bounds.rest[axis]
+        if not (is_out and leaves):
+            self._beyond.pop(axis, None)
+            return True
+        now, fast = axes.now(), float(abs(speed[axis]))
+        since, before = self._beyond.setdefault(axis, (now, fast))
+        if now - since < GRACE:
+            return True
+        self._beyond[axis] = now, fast
+        return bool(before - fast >= SHARE * bounds.braking[axis] * (now - since))
 
     def hold(self) -> None:
         """Have axes that are stopping stay in quick stop active at first; ask those that are not heard for a mode."""

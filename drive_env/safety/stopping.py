@@ -16,6 +16,7 @@ REPEAT = 0.02  # s after which a command that shows no effect is sent again
 ANSWER = 0.1  # s within which a drive must have begun its ramp
 GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
 SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
+LONGEST_FOLLOWING = 0.5  # s until the ramp of an axis begins that ends by itself
 LONGEST = 1.0  # s; whoever would stand by then at the present deceleration is slowing down well, too
 # Measurements of the deceleration, one after the other, that must be too low before one was enough: a loop that was at
 # its limit of current goes on as before until the ramp has come down to the speed that there is.
@@ -32,6 +33,7 @@ LOST = 0.6  # s for which the voltage-off is repeated before an axis is given up
 class Phase(Enum):
     """Where the stop of an axis is."""
 
+    FOLLOW = "following"
     RAMP = "ramp"
     REST = "at rest, held"
     CUT = "voltage off"
@@ -56,10 +58,20 @@ class AxisStop:
         deceleration: Of its quick stop ramp [inc/s^2]; 0 where it is not known.
         rest: Speed below which it is at rest [inc/s].
         holds: Let it stay in quick stop active, which holds its place, instead of switching it off.
+        follows: Returns whether it had better go on to its set-point before its ramp begins; None for one that had not.
     """
 
-    def __init__(self, now: float, speed: float, deceleration: float, rest: float, holds: bool) -> None:
-        self.phase = Phase.RAMP
+    def __init__(
+        self,
+        now: float,
+        speed: float,
+        deceleration: float,
+        rest: float,
+        holds: bool,
+        follows: Callable[[], bool] | None = None,
+    ) -> None:
+        self.phase = Phase.RAMP if follows is None else Phase.FOLLOW
+        self._follows = follows
         self.why = ""  # the voltage had to go
         self._begun = self._since = now
         self._first = abs(speed)
@@ -87,7 +99,9 @@ class AxisStop:
         if fresh and sample.time > self._begun and not cia402.is_live(sample.status) and self._sent is not None:
             self.phase = Phase.OFF
             return None
-        if self.phase is Phase.RAMP:
+        if self.phase is Phase.FOLLOW:
+            self._watch_following(now, sample)
+        elif self.phase is Phase.RAMP:
             self._watch_ramp(now, sample, fresh)
         elif self.phase is Phase.CUT and now - self._since > LOST:
             self.phase = Phase.LOST
@@ -109,6 +123,12 @@ class AxisStop:
     def release(self) -> None:
         """Hold it no longer: at its next step, or once it is at rest, its voltage goes."""
         self.holds = False
+
+    def _watch_following(self, now: float, sample: Sample) -> None:
+        assert self._follows is not None
+        if now - self._begun > LONGEST_FOLLOWING or now - self._seen > ANSWER or not self._follows():
+            self.phase, self._begun, self._since = Phase.RAMP, now, now
+            self._first = abs(sample.speed)
 
     def _watch_ramp(self, now: float, sample: Sample, fresh: bool) -> None:
         if not fresh:

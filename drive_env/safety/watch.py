@@ -24,7 +24,7 @@ from drive_env.safety.looks import Looks
 from drive_env.safety.objects import CONTROLWORD, CURRENT, MODE_DISPLAY, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.stop_runner import StopRunner
 from drive_env.safety.stopping import BLIND as BLIND_TIMEOUT
-from drive_env.safety.stopping import LOST, RAMP_TIMEOUT
+from drive_env.safety.stopping import LONGEST_FOLLOWING, LOST, RAMP_TIMEOUT
 from drive_env.safety.supervisor import Supervisor
 from drive_env.safety.watchdogs import Watchdogs
 
@@ -41,7 +41,7 @@ BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, unti
 MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no samples: it is not operational
 MOST_STOP_CYCLES = 5000  # in lockstep
 SILENT_CYCLE = 0.1  # s of lockstep that count as passed where nobody answers
-LONGEST_STOP = RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
+LONGEST_STOP = LONGEST_FOLLOWING + RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
 AT_ONCE = 0.1  # s after a signal within which another one means the same
 
 
@@ -291,7 +291,7 @@ class Watch:
         except BusError as error:
             logger.error("%s", error)
             self._axes.clock += SILENT_CYCLE
-        there = [key for key in (STATUSWORD, POSITION, CURRENT) if self._drives.description.has(key)]
+        there = [key for key in (STATUSWORD, POSITION, VELOCITY, CURRENT) if self._drives.description.has(key)]
         self.looks.ask([self._known.find(key) for key in there])
         self._axes.clock += self._drives.description.cycle
         with self._axes.lock:

@@ -1,0 +1,144 @@
+"""Where a stop of an axis would end, and whether the axis had better be left to its own set-point instead.
+
+A quick stop ends where its demand does. With v the speed, a the deceleration of 6085h and i the current:
+
+    pp, csp           v^2 / 2a + v / k_v                   the demand is ahead by the lag of the position loop
+    csv               v^2 / 2a + sum of (asked - v) dt     the ramp begins with the speed that was asked for
+    pv, torque modes  v^2 / 2a + i / (P I f)               of an axis that speeds up
+
+In the last two the integral of the velocity loop holds what it has gathered, a current, and is rid of it only once the
+axis is so much farther than its demand (`Bounds.windup`, times the current limit at most).
+
+An axis in pp or csp ends by itself, at a set-point that was checked. Its loops brake it with all the current that they
+have, a quick stop with no more than 6085h: one that is fast because a set-point of csp has jumped, or because its
+profile is steeper than 6085h, would be taken out of its travel by the stop alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.master.description import Key
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import Bounds
+from drive_env.safety.limits import NO_LIMIT
+from drive_env.safety.limits_in_force import STOP_WITHIN
+from drive_env.safety.objects import CSP, CSV, CURRENT, PP, TORQUE_MODES
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LATENCY = 0.010  # s from a sample to the drive's ramp
+DEMAND_AGE = 0.05  # s
+BEFORE = 0.006  # s over which an axis is seen to speed up
+SPEEDS_UP = 0.1  # of the deceleration of a quick stop; less than that its integral makes of it
+FORGETS = 0.2  # s after which what a speed was short of counts no more: a load holds it back, and will
+PROFILE_SHARE = 0.8  # of its way: its axis is a little faster or slower than it
+SHORT = 0.75  # of the current that is asked for: less flows at the end of the voltage, and the integral has it all
+
+
+def by_position(axes: Axes) -> Mask:
+    """Return which axes are in a mode that ends by itself, at a set-point which was checked."""
+    return np.asarray((axes.mode == PP) | (axes.mode == CSP))
+
+
+def sees_demand(axes: Axes) -> Mask:
+    """Return of which axes the demand of the position is known, in the mode that they have."""
+    now = axes.now()
+    return np.asarray((now - axes.demand_seen <= DEMAND_AGE) & (axes.demand_seen >= axes.mode_written))
+
+
+def ends_by_itself(axes: Axes, bounds: Bounds) -> Mask:
+    """Return which axes come to rest within their limits if they are left to their set-point, as far as that tells."""
+    aim = axes.demand.astype(float)
+    for axis, target in axes.aim.items():
+        aim[axis] = target if axes.mode[axis] == PP else aim[axis]
+    leads = np.where(axes.mode == PP, axes.moves, sees_demand(axes))
+    # A move to a place behind the axis turns round only where its profile has brought it to rest.
+    turn = axes.position + profile_way(bounds, axes.newest_speed(), PROFILE_SHARE)
+    turns_inside = (axes.mode != PP) | (outside(bounds, turn) <= bounds.settled)
+    return np.asarray(by_position(axes) & leads & turns_inside & (outside(bounds, aim) <= bounds.settled))
+
+
+def profile_way(bounds: Bounds, speed: Floats, share: float = 1.0) -> Floats:
+    """Return how far a profile goes on from a speed [inc/s] until it rests, with a share of its ramp's way [inc]."""
+    known = bounds.slowing > 0.0
+    ramp = np.where(known, speed**2 / (2.0 * np.where(known, bounds.slowing, 1.0)), 0.0)
+    return np.asarray(share * np.sign(speed) * ramp + speed * bounds.lag)
+
+
+def ramp_way(bounds: Bounds, speed: Floats) -> Floats:
+    """Return the way of a quick stop's ramp from a speed [inc/s], with its sign [inc]."""
+    fast = np.abs(speed)
+    # Where the ramp is not known, as long a way as a stop may take at most.
+    known = bounds.braking > 0.0
+    way = np.where(known, fast**2 / (2.0 * np.where(known, bounds.braking, 1.0)), fast * STOP_WITHIN / 2.0)
+    return np.asarray(np.sign(speed) * way)
+
+
+def stop_way(axes: Axes, bounds: Bounds, speed: Floats) -> Floats:
+    """Return how far the axes go on from a speed [inc/s], if they are quick-stopped now, by that alone [inc]."""
+    before = np.where(by_position(axes), np.maximum(bounds.lag, LATENCY), LATENCY)
+    return np.asarray(ramp_way(bounds, speed) + speed * before)
+
+
+def outside(bounds: Bounds, position: Floats | Integers) -> Floats:
+    """Return how far positions [inc] lie outside the limits [inc], 0 within them."""
+    return np.asarray(np.maximum(np.maximum(bounds.low - position, position - bounds.high), 0.0), float)
+
+
+class StopEnds:
+    """Where stops would end that begin now, by what the axes were seen to do.
+
+    Args:
+        axes: What is known of the axes.
+
+    Attributes:
+        speed: The speeds that there are [inc/s].
+    """
+
+    def __init__(self, axes: Axes) -> None:
+        count = len(axes.everywhere)
+        self.speed = np.zeros(count)
+        self._axes = axes
+        self._short = np.zeros(count)  # way by which an axis in csv is behind what was asked for [inc]
+        self._before = np.zeros(count)  # speed, a moment ago [inc/s]
+        self._gain = np.zeros(count)  # of speed since then [inc/s^2], outwards
+        self._before_at = self._at = 0.0  # s
+        self._current = np.zeros(count)
+
+    def take(self, rows: Mapping[Key, Integers], bounds: Bounds) -> None:
+        """Take note of samples, each object of shape (rows, num_axes)."""
+        axes, now = self._axes, self._axes.now()
+        self.speed = axes.newest_speed()
+        if CURRENT in rows:
+            self._current = rows[CURRENT][-1].astype(float)
+        span, self._at = min(max(now - self._at, 0.0), BEFORE), now
+        most = bounds.windup * np.where(bounds.current < NO_LIMIT, bounds.current, 0.0)
+        gathered = self._short * (1.0 - span / FORGETS) + (axes.asked_speed - self.speed) * span
+        self._short = np.where(axes.mode == CSV, np.clip(gathered, -most, most), 0.0)
+        if now - self._before_at >= BEFORE:
+            self._gain = (np.abs(self.speed) - np.abs(self._before)) / (now - self._before_at)
+            self._before, self._before_at = self.speed, now
+
+    def ways(self, bounds: Bounds) -> tuple[Floats, Floats]:
+        """Return how far the axes go on by the speed that they have, and by what was asked for [inc]."""
+        axes = self._axes
+        own = stop_way(axes, bounds, self.speed) + self._held(bounds)
+        asked = ramp_way(bounds, axes.asked_speed) + axes.asked_speed * LATENCY + self._short
+        return own, np.where(axes.mode == CSV, asked, own)
+
+    def _held(self, bounds: Bounds) -> Floats:
+        """Return what the current that the integral of the velocity loop holds adds to the way [inc]."""
+        axes, way = self._axes, np.sign(self.speed)
+        torque = np.isin(axes.mode, TORQUE_MODES)
+        asked = np.where(torque, axes.asked_current, 0.0)
+        speeds_up = self._gain > SPEEDS_UP * bounds.braking
+        is_short = np.abs(self._current) < SHORT * np.abs(asked)
+        current = np.where(torque, asked, self._current) * way
+        holds = (speeds_up | is_short) & ~by_position(axes) & (axes.mode != CSV) & (np.abs(self.speed) > bounds.rest)
+        return np.asarray(way * bounds.windup * np.where(holds, np.maximum(current, 0.0), 0.0))
