@@ -97,7 +97,7 @@ def test_a_fault_reset_ends_conditions_of_the_bus(wire):
     wire.start()
     wire.drives.machine.enable_input = False
     wire.play("""
-        rx 305  00 00 02
+        rx 305  0F 00 02
         tx 085  20 63 21 00 FF 00 00 00
     """)
     wire.wait(1)

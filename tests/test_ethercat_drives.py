@@ -258,6 +258,23 @@ def test_a_cable_that_is_pulled_stops_the_axes_by_the_slaves_own_watchdog(caplog
     assert not cia402.is_live(segment.drives.read(0x6041)).any()
 
 
+@pytest.mark.parametrize(("register", "value"), [(0x0420, b"\0\0"), (0x0400, b"\xff\xff")])
+def test_a_watchdog_that_another_master_switches_off_stops_the_axes_and_is_set_again(register, value):
+    """With 0420h = 0 the motors ran on for ever after the program's death; with 0400h = FFFFh for 26 times as long."""
+    with linked(Limits(silence=0.3), "real-time", load="inertia", num_machines=3) as (drives, segment):
+        assert turning(drives, segment) > 10_000
+        (slave,) = segment.slaves
+        with pytest.raises(SafetyError, match=r"another master has changed the watchdog of position 0"):
+            with segment.turn:
+                assert slave.controller.write(register, value, 0)
+            for _ in range(600):
+                drives.advance(0.1)
+        let_pass(segment, lambda: slave.controller.watchdog_time == pytest.approx(0.3))
+        segment.is_connected = False
+        let_pass(segment, lambda: (segment.drives.inside.records["stage_on"] == 0.0).all())
+        segment.is_connected = True
+
+
 def test_an_exception_in_the_program_stops_the_axes_before_op_is_left():
     with pytest.raises(KeyError), linked(pace="real-time", load="inertia", num_machines=3) as (drives, segment):
         assert turning(drives, segment) > 10_000

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 
+import numpy as np
 import pytest
 from coe_rig import CoeRig
 
 from drive_env import EmulatedDrives
+from drive_env.cia402 import State
 from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.firmware.record import get_lanes
 
 CYCLE = 1_000_000  # ns
 OUTPUT = struct.Struct("<HiiHiiHii")  # table 22 of the TMCM-3313's manual
@@ -142,3 +145,43 @@ def test_a_cycle_of_sync0_that_is_too_short_is_refused(rig):
     rig.write(0x09A0, struct.pack("<I", 249_999))  # ns
     rig.write(0x0981, "03")
     assert rig.request(4) == (0x12, AlStatusCode.DC_CYCLE_TIME)
+
+
+@pytest.mark.parametrize(("register", "content"), [
+    (0x0981, "00"),  # SYNC0 off
+    (0x09A0, "FF FF FF FF"),  # its cycle 4.3 s
+    (0x09A0, "00 00 00 00"),  # one more pulse
+    (0x0920, "00 00 00 00 00 00 00 F0"),  # the system time leaps back
+])  # fmt: skip
+def test_a_slave_whose_sync0_stays_away_leaves_op_and_stops_its_axes(rig, drives, register, content):
+    """Its outputs would never take effect: images went on, and a stop in them was void."""
+    start_sync0(rig)
+    rig.bring_to(AlState.OP)
+    enabled = [15, 0, 20_000] * 3
+    assert [rig.download(0x6060 + 0x800 * axis, 0, b"\3") for axis in range(3)] == [0, 0, 0]
+    for word in (6, 7, 15):
+        for _ in range(2):
+            rig.exchange_image(OUTPUT.pack(*[word, 0, 20_000] * 3))
+    assert (get_lanes(drives.inside.records, "fsa", 3) == State.OPERATION_ENABLED).all()
+    rig.write(register, content)
+    for _ in range(8):
+        rig.exchange_image(OUTPUT.pack(*enabled))
+    assert (rig.slave.state, rig.slave.code) == (AlState.SAFE_OP, AlStatusCode.FATAL_SYNC)
+    assert (get_lanes(drives.inside.records, "fsa", 3) != State.OPERATION_ENABLED).all()
+    for _ in range(500):
+        rig.exchange_image(OUTPUT.pack(*enabled))
+    assert (get_lanes(drives.inside.records, "stage_on", 3) == 0.0).all()
+    assert np.abs(get_lanes(drives.inside.records, "omega_m", 3)).max() < 1.0
+
+
+@pytest.mark.parametrize("leap", [1 << 60, (1 << 63) + 5, 10**9])
+@pytest.mark.parametrize("cycle", [CYCLE, 1])
+def test_a_leap_of_the_system_time_is_no_row_of_pulses(rig, leap, cycle):
+    """A write of 0920h by another master was 10^12 pulses, and the server did nothing else."""
+    start_sync0(rig)
+    rig.bring_to(AlState.OP)
+    rig.write(0x09A0, struct.pack("<I", cycle))
+    rig.write(0x0920, struct.pack("<Q", leap))
+    for _ in range(5):
+        send(rig, 0)
+    assert rig.value(0x0990, 8) != 0

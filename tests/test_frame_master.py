@@ -598,6 +598,17 @@ def test_an_error_is_acknowledged_in_safe_op_before_op_is_asked_for(way, master,
     """)
 
 
+def test_a_slave_whose_watchdog_was_quicker_than_a_busy_computer_is_asked_again(way, master, clock):
+    """Between the request of Op and the first images more than 100 ms went by: it was told as a refusal."""
+    way.change = status_of((4, 0), (0x14, 0x1B), (0x14, 0x1B), (4, 0), (8, 0))
+    master.operate([0], None, 1.0)
+    assert [line for line in way.take() if "FPWR" in line] == split("""
+        FPWR 1001 0120 08 00
+        FPWR 1001 0120 14 00
+        FPWR 1001 0120 08 00
+    """)
+
+
 def test_op_that_does_not_come_in_time_is_told(way, master, clock, monkeypatch):
     monkeypatch.setattr(frame_master, "LOOK", 0.5)
     way.change = status_of((4, 0))

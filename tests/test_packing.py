@@ -236,21 +236,35 @@ def test_a_node_s_objects_travel_one_behind_the_other(drive):
     assert len(MappedObjects([])) == 0 and MappedObjects([]).pack() == b"" and MappedObjects([]).write(b"")
 
 
-def test_set_points_take_effect_before_the_mode_and_that_before_the_controlword(drive):
+def test_a_stop_comes_first_and_what_enables_behind_set_points_and_mode(drive):
     mapped = MappedObjects([drive.ports[index] for index in (0x6040, 0x6060, 0x607A, 0x2000)])
-    assert mapped.write(bytes.fromhex("07 00 FF 00 01 00 00 80"))
-    assert drive.take() == [(0x607A, 256), (0x2000, 128), (0x6060, -1), (0x6040, 7)]
-    assert mapped.write(bytes.fromhex("06 00 FF 00 01 00 00 80"))
-    assert drive.take() == [(0x607A, 256), (0x2000, 128), (0x6040, 6)], "a mode that is repeated is no write"
+    assert mapped.write(bytes.fromhex("1F 01 FF 00 01 00 00 80"))
+    assert drive.take() == [(0x607A, 256), (0x2000, 128), (0x6060, -1), (0x6040, 0x011F)]
+    assert mapped.write(bytes.fromhex("0F 00 FF 00 01 00 00 80"))
+    assert drive.take() == [(0x607A, 256), (0x2000, 128), (0x6040, 15)], "a mode that is repeated is no write"
     drive.refused = {-1}
-    assert mapped.write(bytes.fromhex("06 00 FF 00 01 00 00 80")), "nor would it be refused"
+    assert mapped.write(bytes.fromhex("0F 00 FF 00 01 00 00 80")), "nor would it be refused"
+    drive.take()
+    for word in (0x00, 0x02, 0x06, 0x07, 0x0B, 0x80):
+        assert mapped.write(bytes((word,)) + bytes.fromhex("00 01 00 01 00 00 80"))
+        assert drive.take()[0] == (0x6040, word)
 
 
-def test_of_data_that_one_object_refuses_nothing_is_written(drive):
+def test_of_data_that_one_object_refuses_the_others_are_written(drive):
+    mapped = MappedObjects([drive.ports[index] for index in (0x6040, 0x607A, 0x2000)])
     drive.refused = {7}
-    mapped = MappedObjects([drive.ports[index] for index in (0x6040, 0x607A)])
-    assert not mapped.write(bytes.fromhex("07 00 00 01 00 00"))
-    assert drive.take() == []
+    assert not mapped.write(bytes.fromhex("07 00 00 01 00 00 80"))
+    assert drive.take() == [(0x607A, 256), (0x2000, 128)]
+    drive.refused = {256}
+    assert not mapped.write(bytes.fromhex("0F 00 00 01 00 00 80"))
+    assert drive.take() == [(0x2000, 128), (0x6040, 15)]
+
+
+def test_a_value_beyond_the_range_is_fitted_where_the_object_has_a_rule(drive):
+    fitted = drive.ports[0x2000]._replace(fit=lambda raw: raw & 0x3F)
+    drive.refused = {0xFF}
+    assert MappedObjects([fitted]).write(b"\xff")
+    assert drive.take() == [(0x2000, 0x3F)]
 
 
 def fields(*rows):
@@ -286,12 +300,12 @@ def test_of_a_field_an_object_takes_its_own_bits(drive):
     image = PackedFields(fields(("u16", None, False), ("u32", (0x6040, 0), False), ("u32", (0x6060, 0), False),
                                 ("i32", (0x607A, 0), False), ("u16", (0x2000, 0), False)), drive.find)  # fmt: skip
     assert image.write(bytes.fromhex("FF FF 07 00 FF FF 80 12 34 56 00 00 00 80 7F 01"))
-    assert drive.take() == [(0x607A, -(1 << 31)), (0x2000, 0x7F), (0x6060, -128), (0x6040, 7)]
-    assert image.write(bytes.fromhex("00 00 FF 80 00 00 7F 00 00 00 FF FF FF FF FF FF"))
-    assert drive.take() == [(0x607A, -1), (0x2000, 0xFF), (0x6060, 127), (0x6040, 0x80FF)]
+    assert drive.take() == [(0x6040, 7), (0x607A, -(1 << 31)), (0x2000, 0x7F), (0x6060, -128)]
+    assert image.write(bytes.fromhex("00 00 0F 80 00 00 7F 00 00 00 FF FF FF FF FF FF"))
+    assert drive.take() == [(0x607A, -1), (0x2000, 0xFF), (0x6060, 127), (0x6040, 0x800F)]
     drive.refused = {7}
     assert not image.write(bytes.fromhex("FF FF 07 00 FF FF 80 12 34 56 00 00 00 80 7F 01"))
-    assert drive.take() == []
+    assert drive.take() == [(0x607A, -(1 << 31)), (0x2000, 0x7F), (0x6060, -128)]
 
 
 @pytest.mark.parametrize(("raw", "transmit", "taken"), [

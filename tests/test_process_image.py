@@ -126,8 +126,8 @@ def test_an_image_takes_effect_at_once_on_all_axes(drives, image):
     np.testing.assert_array_equal(trace[0x6062][-1], [5000, -6000, 7000])
 
 
-def test_of_outputs_that_one_object_does_not_take_nothing_is_taken(drives, image):
-    """607Dh has no part in it: a mode that the drive lacks does."""
+def test_of_outputs_that_one_object_does_not_take_the_others_are_taken(drives, image):
+    """A mode that the drive lacks stays what it was."""
     assert write(image, 0x1C12, 0, 0) == write(image, 0x1600, 0, 0) == 0
     for sub, word in enumerate((0x607A0020, 0x60600008), 1):
         assert write(image, 0x1600, sub, word) == 0
@@ -135,7 +135,7 @@ def test_of_outputs_that_one_object_does_not_take_nothing_is_taken(drives, image
     assert image.output_size == 5
     assert image.write_outputs((4000).to_bytes(4, "little") + b"\x03")
     assert not image.write_outputs((5000).to_bytes(4, "little") + b"\x02")
-    assert (drives.read(0x607A)[0], drives.read(0x6060)[0]) == (4000, 3)
+    assert (drives.read(0x607A)[0], drives.read(0x6060)[0]) == (5000, 3)
 
 
 def test_data_of_another_length_is_a_mistake(image):

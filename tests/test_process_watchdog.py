@@ -188,3 +188,33 @@ def test_images_keep_it_quiet_before_its_time_is_over(silence, idle, exchanges, 
     assert watchdog._data.exchanges == [*exchanges, False] and watchdog._data.is_silent
     watchdog.end()
     assert watchdog.detection_time == float("inf")
+
+
+@pytest.mark.parametrize(("address", "value"), [(0x0420, 0), (0x0420, 0xFFFF), (0x0400, 0xFFFF), (0x0400, 0)])
+def test_a_watchdog_that_another_master_has_changed_is_told_once_and_set_again(address, value, monkeypatch):
+    slaves, now = Slaves({1: 2498, 4: 2498}), SimpleNamespace(now=100.0)
+    monkeypatch.setattr(process_watchdog, "time", SimpleNamespace(monotonic=lambda: now.now))
+    watchdog = watch(slaves)
+    assert watchdog.take_rival() == "", "none is set"
+    now.now += 1.0
+    watchdog.begin(0.1)
+    now.now += 1.0
+    assert watchdog.take_rival() == "" and watchdog.is_in_force(1)
+    before = struct.unpack("<H", slaves.registers[4][address])[0]
+    slaves.write_register(4, address, struct.pack("<H", value))
+    assert not watchdog.is_in_force(1)
+    assert watchdog.take_rival() == "", "it looks every 50 ms"
+    now.now += 0.06
+    told = watchdog.take_rival()
+    assert told.startswith("another master has changed the watchdog of position 4 (0400h, 0420h), so that")
+    assert slaves.registers[4][address] == struct.pack("<H", before) and watchdog.is_in_force(1)
+    now.now += 1.0
+    assert watchdog.take_rival() == ""
+
+
+def test_a_slave_that_does_not_answer_is_no_rival():
+    slaves = Slaves({1: 2498})
+    watchdog = watch(slaves)
+    watchdog.begin(0.1)
+    slaves.registers[1].clear()
+    assert watchdog.take_rival() == "" and not slaves.registers[1]

@@ -428,6 +428,12 @@ def test_slaves_are_taken_to_op_while_images_are_exchanged(master, soem, clock):
     master.operate([0, 1], None, 1.0)
 
 
+def test_a_slave_whose_watchdog_was_quicker_than_a_busy_computer_is_asked_again(master, soem, clock):
+    soem.slaves[0].statuses = [(4, 0), (0x14, 0x1B), (0x14, 0x1B), (4, 0), (8, 0)]
+    master.operate([0], None, 1.0)
+    assert take(soem) == [(0, "state", 8), (0, "state", 0x14), (0, "state", 8)]
+
+
 def test_op_that_does_not_come_in_time_is_told(master, soem, clock):
     clock.sleep = lambda seconds: setattr(clock, "now", clock.now + 0.5)
     soem.slaves[0].statuses, soem.slaves[1].statuses = [(4, 0)], [(8, 0)]

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 STANDARD_COMMISSIONING = "standard"
+HIGHEST, MASK = "highest", "mask"  # the object's highest value; the bits of its highest value
 
 
 class StageParameter(NamedTuple):
@@ -192,6 +193,8 @@ class Device(NamedTuple):
     shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
     num_outputs: int = 4
     mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
+    # What process data above an object's range are taken as, `HIGHEST` or `MASK`; of others the object stays as it was.
+    beyond_range: Mapping[tuple[int, int], str] = MappingProxyType({})
 
     @property
     def firmware(self) -> Firmware:
@@ -426,6 +429,7 @@ def _device(
         shared_values=frozenset(parse_key(text) for text in data.get("shared_values", [])),
         num_outputs=data.get("outputs", 4),
         mode_gate={int(mode): needed for mode, needed in data.get("mode_gate", {}).items()},
+        beyond_range=_beyond_range(data.get("beyond_range", {})),
     )
 
 
@@ -444,6 +448,13 @@ def allowed_values(data: Mapping[str, Any]) -> dict[tuple[int, int], tuple[int, 
     if data["quirks"]["strict_transmission_types"]:
         rows |= data["strict_transmission_types"]
     return {parse_key(text): tuple(value for item in items for value in _values(item)) for text, items in rows.items()}
+
+
+def _beyond_range(rows: Mapping[str, str]) -> dict[tuple[int, int], str]:
+    for text, rule in rows.items():
+        if rule not in (HIGHEST, MASK):
+            raise ValueError(f"beyond_range: {text} = {rule!r} must be {HIGHEST!r} or {MASK!r}")
+    return {parse_key(text): rule for text, rule in rows.items()}
 
 
 def _unsupported(data: Mapping[str, Any]) -> dict[tuple[int, int], str]:

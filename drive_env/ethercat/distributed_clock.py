@@ -16,6 +16,8 @@ PHASE_SHARE, RATE_SHARE = 0.25, 0.03  # of a difference, by which time and rate 
 ACTIVE, SYNC0 = 0x01, 0x02
 NOT_IN_NEAR_FUTURE = 0x04  # of the activation status: the start time has passed
 WORD = 1 << 32
+TIMES = 1 << 64  # of system time [ns], which begins anew then
+MOST_PULSES = 64  # that are due together; what is farther behind is a leap of the clock, and no row of pulses
 
 
 class DistributedClock:
@@ -128,9 +130,15 @@ class DistributedClock:
 
     def take_pulse(self, now: int) -> bool:
         """Return whether a pulse is due at `now` [ns], and go on to the next."""
-        pulse = self._next_pulse
-        if pulse is None or self.system(now) < pulse:
+        pulse, cycle = self._next_pulse, self.cycle
+        if pulse is None:
             return False
-        self._next_pulse = pulse + self.cycle if self.cycle else None
-        struct.pack_into("<Q", self._memory, registers.SYNC0_START, self._next_pulse or pulse)
+        behind = (self.system(now) - pulse) % TIMES
+        if behind >= TIMES // 2:
+            return False
+        if cycle:
+            passed = behind // cycle if behind > MOST_PULSES * cycle else 0
+            pulse = (pulse + (passed + 1) * cycle) % TIMES
+        self._next_pulse = pulse if cycle else None
+        struct.pack_into("<Q", self._memory, registers.SYNC0_START, pulse)
         return True

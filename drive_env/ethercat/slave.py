@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState, AlStatusCode, Application
 from drive_env.ethercat.controller import SlaveController
@@ -9,6 +11,7 @@ from drive_env.ethercat.mailbox import Mailbox, MailboxProtocol
 from drive_env.ethercat.state_machine import INPUTS, OUTPUTS, WITH_INPUTS, WITH_MAILBOX, StateMachine
 
 S = AlState
+LOST_PULSES = 3  # cycles of SYNC0 without a pulse after which a slave in Op gives it up; ours, as ETG.1020 leaves it
 
 
 class EtherCatSlave:
@@ -102,8 +105,11 @@ class EtherCatSlave:
         """Let pulses of SYNC0 and the watchdog happen that are due until `now` [s]."""
         clock = self.controller.clock
         while clock.take_pulse(round(now * 1e9)):
+            self._pulsed_at = now
             if self._machine.state in WITH_INPUTS:
                 self.application.sync0(now)
+        if self._machine.state is S.OP and now - self._pulsed_at > LOST_PULSES * self._sync0_cycle:
+            self._machine.force(S.SAFE_OP, AlStatusCode.FATAL_SYNC, now)  # outputs would never take effect
         deadline = self.controller.watchdog_deadline()
         if deadline is None or now < deadline or not self._is_watched:
             return
@@ -124,12 +130,20 @@ class EtherCatSlave:
         elif new is S.INIT or (new is S.PRE_OP and not self._had_mailbox):
             self.mailbox.open(is_bootstrap=False)
         self._had_mailbox = new in WITH_MAILBOX
+        if new is S.SAFE_OP:
+            clock = self.controller.clock
+            self._sync0_cycle = clock.cycle * 1e-9 if clock.has_sync0 else math.inf
+            self._pulsed_at = math.inf
         if new is S.OP:
             self.controller.trigger_watchdog(now)  # the first outputs have a watchdog's time
+            if self.controller.clock.next_pulse() is None:
+                self._pulsed_at = now
         if new in WITH_INPUTS:
             self._put_inputs(now)
 
     _had_mailbox = False
+    _sync0_cycle = math.inf  # that the slave is synchronised with [s]; infinite without SYNC0
+    _pulsed_at = math.inf  # time of the last pulse; infinite before the first
 
     def _put_inputs(self, now: float) -> None:
         manager = self.controller.managers[INPUTS]

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drive_env.devices import HIGHEST
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.codec import Code, decode_one, encode_one
@@ -34,7 +35,8 @@ class ObjectPort(NamedTuple):
     """The way to one object: what it is, its value, the check of a new value, the write of a checked one.
 
     `event` names what a write sets off, as in a binding. `write_text` takes a text or a domain, each byte of which is a
-    character; None where it cannot be written.
+    character; None where it cannot be written. `fit` returns what a value of process data is taken as, where the device
+    takes more of them than the object's range; None of others.
     """
 
     entry: Entry
@@ -43,6 +45,7 @@ class ObjectPort(NamedTuple):
     write: Callable[[int], None]
     event: str = ""
     write_text: Callable[[str], None] | None = None
+    fit: Callable[[int], int] | None = None
 
 
 class QueuedEmergency(NamedTuple):
@@ -142,10 +145,18 @@ class Axis:
         check = self._checker(entry)
         if entry.bits is None:
             return self._text_port(entry, check)
+        fit = self._fit(entry)
         if code is None:
             write = self._scale_writer(entry) or self._unbound_writer(entry)
-            return ObjectPort(entry, self._unbound_reader(entry), check, write)
-        return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event)
+            return ObjectPort(entry, self._unbound_reader(entry), check, write, fit=fit)
+        return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event, fit=fit)
+
+    def _fit(self, entry: Entry) -> Callable[[int], int] | None:
+        """Return what makes a value of process data one of the object's range, None where the device has no rule."""
+        rule, highest = self._device.beyond_range.get((entry.index, entry.sub)), entry.high
+        if rule is None or highest is None:
+            return None
+        return (lambda raw: min(raw, highest)) if rule == HIGHEST else (lambda raw: raw & highest)
 
     def _checker(self, entry: Entry) -> Callable[[int], None]:
         device, key = self._device, (entry.index, entry.sub)

@@ -9,7 +9,7 @@ from drive_env.devices.image_rows import TYPES, ImageField
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node import mapping
 from drive_env.node.axis import ObjectPort
-from drive_env.node.process_data import order_of_writing
+from drive_env.node.process_data import ReceivedFields
 
 
 class PackedFields:
@@ -30,7 +30,8 @@ class PackedFields:
         self._find = port
         self._ports = [None if field.key is None else port(*field.key) for field in fields]
         self._is_name = [field.is_name for field in fields]
-        self._order = order_of_writing([("" if one is None else one.event) for one in self._ports])
+        self._received = struct.Struct("<" + "".join(map(_received, self._bits, self._ports)))
+        self._fields = ReceivedFields([one for one in self._ports if one is not None])
 
     def pack(self) -> bytes:
         """Return their values as they are now; 0 of what is reserved."""
@@ -39,23 +40,8 @@ class PackedFields:
         )
 
     def write(self, data: bytes) -> bool:
-        """Write all of them, or none where one does not take its value; return whether they were written."""
-        raw = self._layout.unpack(data)
-        plan = []
-        for k in self._order:
-            port = self._ports[k]
-            if port is not None:
-                bits = port.entry.bits or 0
-                value = raw[k] & ((1 << bits) - 1)
-                plan.append((port, value - (1 << bits) if port.entry.signed and value >> (bits - 1) else value))
-        try:
-            for port, value in plan:
-                port.check(value)
-        except ObjectAccessError:
-            return False
-        for port, value in plan:
-            port.write(value)
-        return True
+        """Write each object that takes its value; return whether all did."""
+        return self._fields.write(self._received.unpack(data))
 
     def _read(self, k: int) -> int:
         port = self._ports[k]
@@ -73,3 +59,11 @@ class PackedFields:
         except ObjectAccessError:
             return 0
         return value if isinstance(value, int) else 0
+
+
+def _received(bits: int, port: ObjectPort | None) -> str:
+    """Return how `struct` reads a field of so many bits: an object's own in the lowest ones, the others passed over."""
+    if port is None:
+        return f"{bits // 8}x"
+    own = min(port.entry.bits or 0, bits)
+    return f"{mapping.LAYOUT[own][port.entry.signed]}{(bits - own) // 8}x"

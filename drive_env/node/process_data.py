@@ -1,22 +1,58 @@
-"""Process data of a node: objects that travel together, packed one behind the other, on whatever fieldbus."""
+"""Process data of a node: objects that travel together, packed one behind the other, on whatever fieldbus.
+
+Each field acts by itself: where an object does not take its value it stays as it was, and the other fields act all the
+same. A stop is so never void for what travels beside it.
+"""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
 
+from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node import mapping
 from drive_env.node.axis import ObjectPort
 
-# What is received takes effect as a whole: set-points first, then the mode, then the controlword, whatever their order
-# in it. A controlword that starts a move so finds the target of the same frame.
-_RANK = {"": 0, "set_point": 0, "mode": 1, "controlword": 2}
+_MASK, _ENABLES = cia402.COMMANDS["enable operation"]
+_RANK = {"mode": 1, "controlword": 2}  # all else is 0
 
 
-def order_of_writing(events: Sequence[str]) -> list[int]:
-    """Return the order in which objects take effect whose writes set off these events."""
-    return sorted(range(len(events)), key=lambda k: _RANK[events[k]])
+class ReceivedFields:
+    """Fields of what a node receives, and the objects behind them.
+
+    Args:
+        ports: The way to the object of each field.
+    """
+
+    def __init__(self, ports: Sequence[ObjectPort]) -> None:
+        order = sorted(range(len(ports)), key=lambda k: _RANK.get(ports[k].event, 0))
+        # Masters repeat the mode in every frame: what it is already is no write, which some drives would refuse.
+        rows = [(k, ports[k], ports[k].read if ports[k].event == "mode" else None) for k in order]
+        self._plan = [(k, port.fit, repeats, port.check, port.write) for k, port, repeats in rows]
+        self._controlwords = [k for k in order if ports[k].event == "controlword"]
+
+    def write(self, values: Sequence[int]) -> bool:
+        """Write each value that its object takes; return whether all were taken.
+
+        Whatever the order of the fields, controlwords that stop act first. Then come set-points, modes, and the
+        controlwords that enable operation: one that starts a move so finds the target of the same frame.
+        """
+        plan = self._plan
+        stops = [k for k in self._controlwords if values[k] & _MASK != _ENABLES]
+        if stops:
+            plan = sorted(plan, key=lambda row: row[0] not in stops)
+        all_taken = True
+        for k, fit, repeats, check, write in plan:
+            value = values[k] if fit is None else fit(values[k])
+            if repeats is not None and value == repeats():
+                continue
+            try:
+                check(value)
+                write(value)
+            except ObjectAccessError:
+                all_taken = False
+        return all_taken
 
 
 class MappedObjects:
@@ -34,8 +70,7 @@ class MappedObjects:
         self._layout = struct.Struct("<" + "".join(letters))
         self.size = self._layout.size
         self._readers = [port.read for port in ports]
-        self._plan = [(k, ports[k]) for k in order_of_writing([port.event for port in ports])]
-        self._modes = [(k, port) for k, port in self._plan if port.event == "mode"]
+        self._fields = ReceivedFields(ports)
 
     def __len__(self) -> int:
         return len(self._readers)
@@ -45,19 +80,5 @@ class MappedObjects:
         return self._layout.pack(*[read() for read in self._readers])
 
     def write(self, data: bytes) -> bool:
-        """Write all of them, or none where one does not take its value; return whether they were written."""
-        values = self._layout.unpack(data)
-        plan = self._plan
-        # Masters repeat the mode in every frame: what it is already is no write, which some drives would refuse.
-        if self._modes:
-            repeated = [k for k, port in self._modes if values[k] == port.read()]
-            if repeated:
-                plan = [(k, port) for k, port in plan if k not in repeated]
-        try:
-            for k, port in plan:
-                port.check(values[k])
-        except ObjectAccessError:
-            return False
-        for k, port in plan:
-            port.write(values[k])
-        return True
+        """Write each that takes its value; return whether all did."""
+        return self._fields.write(self._layout.unpack(data))

@@ -91,10 +91,10 @@ class ImageObjects:
         return self._images[INPUTS].size
 
     def write_outputs(self, data: bytes) -> bool:
-        """Let what the master sent take effect, all of it or, where an object does not take its value, nothing.
+        """Let what the master sent take effect; an object that does not take its value stays as it was.
 
         Returns:
-            Whether it took effect.
+            Whether each took its value.
 
         Raises:
             ValueError: For data of another length than the image; a sync manager passes none on.

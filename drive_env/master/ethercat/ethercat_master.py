@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-from drive_env.ethercat.application import AlState
+from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.master.link import ReceivedEmergency
 
 STATE, ERROR = 0x0F, 0x10  # of AL status
@@ -29,6 +29,11 @@ class SlaveStatus(NamedTuple):
     def is_op(self) -> bool:
         """Whether it is in Op, without an error."""
         return self.state == AlState.OP and not self.has_error
+
+    @property
+    def is_late(self) -> bool:
+        """Whether its watchdog has taken it out of Op: no images came in time."""
+        return self.has_error and self.code == AlStatusCode.SM_WATCHDOG
 
 
 class SlaveIdentity(NamedTuple):

@@ -315,19 +315,25 @@ class FrameMaster:
     def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
         """Take slaves to Op; `exchange` sends images meanwhile."""
         for position in positions:
-            if self.status(position).has_error:
-                self._to(position, AlState.SAFE_OP)
-            self._write(position, registers.AL_CONTROL, struct.pack("<H", AlState.OP))
+            self._ask_for_op(position)
         deadline = time.monotonic() + timeout
         while waiting := [(k, now) for k, now in ((k, self.status(k)) for k in positions) if not now.is_op]:
-            refused = [(k, now) for k, now in waiting if now.has_error]
+            refused = [(k, now) for k, now in waiting if now.has_error and not now.is_late]
             if refused or time.monotonic() > deadline:
                 position, status = (refused or waiting)[0]
                 raise BusError(refusal(position, AlState.OP, status))
+            for position, status in waiting:
+                if status.is_late:
+                    self._ask_for_op(position)
             if exchange is not None:
                 exchange()
             self.alive()
             time.sleep(LOOK)
+
+    def _ask_for_op(self, position: int) -> None:
+        if self.status(position).has_error:
+            self._to(position, AlState.SAFE_OP)
+        self._write(position, registers.AL_CONTROL, struct.pack("<H", AlState.OP))
 
     def leave_op(self, position: int) -> None:
         """Take a slave to Pre-Op."""

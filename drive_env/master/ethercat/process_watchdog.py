@@ -19,6 +19,8 @@ LONGEST = 0xFFFF  # ticks of the divider
 TRIGGERS = 0x40  # of a sync manager's control: process data keep the watchdog quiet
 OUTPUTS_CONTROL = registers.SYNC_MANAGERS + 2 * registers.SYNC_MANAGER_SIZE + 4
 FACTORY = 0.1  # s, of a controller after reset
+TIMES = (registers.WATCHDOG_DIVIDER, registers.SM_WATCHDOG)
+LOOK = 0.05  # s between two looks whether another master has changed them
 
 
 class ProcessWatchdog:
@@ -46,8 +48,9 @@ class ProcessWatchdog:
         self._master, self._nodes, self._data = master, tuple(nodes), data
         self._objects = [ChangedObjects(*one, description) for one in zip(nodes, clients, strict=True)]
         self._before: dict[int, bytes] = {}
-        self._counts: dict[int, bytes] = {}
+        self._set: dict[int, tuple[bytes, bytes]] = {}  # divider and time that each has been given
         self._time = math.inf
+        self._looked_at = 0.0
 
     @property
     def detection_time(self) -> float:
@@ -69,8 +72,8 @@ class ProcessWatchdog:
                     f"position {position} does not watch its outputs: its EEPROM has sync manager 2 without the "
                     f"watchdog (0814h, bit 6); {REMEDY}"
                 )
-            (divider,) = struct.unpack("<H", self._register(position, registers.WATCHDOG_DIVIDER))
-            tick = (divider + 2) * TICK
+            divider = self._register(position, registers.WATCHDOG_DIVIDER)
+            tick = (int.from_bytes(divider, "little") + 2) * TICK
             count = struct.pack("<H", min(max(math.floor(silence / tick + 1e-6), 1), LONGEST))
             found = self._register(position, registers.SM_WATCHDOG)
             self._master.write_register(position, registers.SM_WATCHDOG, count)
@@ -78,7 +81,7 @@ class ProcessWatchdog:
             if now != count:
                 raise NoWatchdogError(f"position {position} took {count.hex()} for 0420h and has {now.hex()}; {REMEDY}")
             self._before.setdefault(k, found)
-            self._counts[k] = count
+            self._set[k] = divider, count
             self._objects[k].quick_stop_on_lost_connection()
             times.append(int.from_bytes(count, "little") * tick)
         self._time = max(times)
@@ -101,21 +104,21 @@ class ProcessWatchdog:
 
     def is_set(self, node: int) -> bool:
         """Return whether a node's watchdog was set and not put back."""
-        return node in self._counts
+        return node in self._set
 
     def is_in_force(self, node: int) -> bool:
         """Return whether a node, asked, has the time that was set and is in Op, where it watches."""
         position = self._nodes[node]
-        has = self._register(position, registers.SM_WATCHDOG) == self._counts.get(node)
+        has = tuple(self._register(position, address) for address in TIMES) == self._set.get(node)
         return has and self._master.status(position).is_op and self._objects[node].are_in_force()
 
     def holds(self, key: Key) -> bool:
         """Return whether the watchdogs that are set depend on an object."""
-        return any(k in self._counts and one.holds(key) for k, one in enumerate(self._objects))
+        return any(k in self._set and one.holds(key) for k, one in enumerate(self._objects))
 
     def restore(self, node: int) -> None:
         """Put a node's watchdog back as it was found; BusError if it did not take all of it."""
-        self._counts.pop(node, None)
+        self._set.pop(node, None)
         before = self._before.pop(node, None)
         try:
             self._objects[node].restore()
@@ -127,11 +130,35 @@ class ProcessWatchdog:
         """Forget what was found: the node was reset."""
         self._objects[node].forget()
         self._before.pop(node, None)
-        self._counts.pop(node, None)
+        self._set.pop(node, None)
 
     def take_rival(self) -> str:
-        """Return "": another master on the segment would take the slaves' addresses and states, and so their Op."""
-        return ""
+        """Return, once, which slave's watchdog another master has changed; it is set again. "" if none was.
+
+        A master that takes a slave's address, states or images is noticed otherwise: the images do not come back.
+        """
+        now = time.monotonic()
+        if now - self._looked_at < LOOK:
+            return ""
+        self._looked_at = now
+        changed = [k for k in self._set if self._set_again(k)]
+        if not changed:
+            return ""
+        numbers = ", ".join(str(self._nodes[k]) for k in changed)
+        return (
+            f"another master has changed the watchdog of position {numbers} (0400h, 0420h), so that the drives would "
+            "not notice this program's death"
+        )
+
+    def _set_again(self, node: int) -> bool:
+        """Return whether a slave that answers has lost its watchdog's time, which it gets back."""
+        position, wanted = self._nodes[node], self._set[node]
+        found = tuple(self._master.register(position, address, 2) for address in TIMES)
+        if None in found or found == wanted:
+            return False
+        for address, value in zip(TIMES, wanted, strict=True):
+            self._master.write_register(position, address, value)
+        return True
 
     def _register(self, position: int, address: int) -> bytes:
         found = self._master.register(position, address, 2)

@@ -208,23 +208,29 @@ class SoemMaster:
     def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
         """Take slaves to Op; `exchange` sends images meanwhile."""
         deadline = time.monotonic() + timeout
-        with self._turn:
-            for position in positions:
-                if self.status(position).has_error:
-                    self._request(position, AlState.SAFE_OP)
-                slave = self._slave(position)
-                slave.state = int(AlState.OP)
-                slave.write_state()
+        for position in positions:
+            self._ask_for_op(position)
         while waiting := [(k, now) for k, now in ((k, self.status(k)) for k in positions) if not now.is_op]:
-            refused = [(k, now) for k, now in waiting if now.has_error]
+            refused = [(k, now) for k, now in waiting if now.has_error and not now.is_late]
             if refused or time.monotonic() > deadline:
                 position, status = (refused or waiting)[0]
                 raise BusError(refusal(position, AlState.OP, status))
+            for position, status in waiting:
+                if status.is_late:
+                    self._ask_for_op(position)
             if exchange is not None:
                 exchange()
             self.alive()
             time.sleep(0.001)
         self._looked = -math.inf
+
+    def _ask_for_op(self, position: int) -> None:
+        with self._turn:
+            if self.status(position).has_error:
+                self._request(position, AlState.SAFE_OP)
+            slave = self._slave(position)
+            slave.state = int(AlState.OP)
+            slave.write_state()
 
     def leave_op(self, position: int) -> None:
         """Take a slave to Pre-Op."""
