@@ -124,6 +124,7 @@ def serve(
         made = _server(bus, real_time, port, listen, token, interface, channel)
         server.append(made)
         controls: list[Control | BesideCan] = [*_faults(made, fault or [], control), *_beside(made, bus, real_time)]
+        made.world.power_on()  # a store may have another node-ID than the arguments
         _announce(made, bus, real_time, token, interface, channel)
         try:
             made.run(duration)
@@ -314,7 +315,7 @@ def _announce(
     from drive_env.bus.hub import Hub
 
     nodes = ", ".join(
-        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor_name}, {row.load}"
+        f"node {', '.join(_booted(server, node) for node in row.nodes)} ({row.device}, {row.motor_name}, {row.load}"
         f"{f'; {len(row.on_ethercat)} on EtherCAT' if row.on_ethercat else ''}"
         f"{'' if row.commissioned else '; factory values, not commissioned'})"
         for row in bus.machines
@@ -337,6 +338,13 @@ def _announce(
     else:
         print(f"on {interface} {channel or ''}".rstrip())
     sys.stdout.flush()
+
+
+def _booted(server: Server, given: int) -> str:
+    """Return the node-ID by which a node boots, and the one that it was given where its store has another."""
+    node = server.world.nodes.get(given)
+    booted = given if node is None else node.node_id  # one without a node-ID has a place of its own
+    return f"{booted}" if booted == given else f"{booted} (in its store; {given} was given)"
 
 
 def _statistics(server: Server) -> str:
