@@ -169,7 +169,7 @@ def test_an_axis_that_was_stopped_is_not_enabled_by_lowering_it(searching):
 
 def test_an_acknowledge_that_did_not_rise_does_not_count():
     drive = Deaf()
-    with pytest.raises(TimeoutError, match="axis 0 did not reach end of set-point acknowledge in 0.1 s"):
+    with pytest.raises(TimeoutError, match=r"axis 0 did not reach end of set-point acknowledge in 0\.1 s"):
         motion.start_move(drive, WAY, timeout=0.1)
     assert drive.controlword == 0x0F
 

@@ -367,14 +367,16 @@ def start_move(
     word = cia402.ENABLE_OPERATION | (cia402.RELATIVE if relative else 0)
     drives.write(cia402.TARGET_POSITION, position, where=where)
     with _bit_4_is_low(drives, word, where):
-        full = _still_acknowledged(drives, where)
-        if full.any() and relative:  # an edge would be ignored, and the acknowledge of the move before taken for its own
-            wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "room for another relative move", full)
-        kept = full & (not relative)
+        kept = _still_acknowledged(drives, where)
+        if relative and kept.any():
+            # The buffer is full: an edge would be ignored, and the acknowledge of the move before taken for its own.
+            wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "room for another relative move", kept)
+            kept = np.zeros_like(kept)
         if (others := axes & ~kept).any():
             _raise_bit_4(drives, word, others, timeout)
-            kept = kept | (_still_acknowledged(drives, others) & others)
+            kept = kept | _still_acknowledged(drives, others)
         if kept.any() and not relative:  # a relative one ends at the same place from the buffer, and must not go twice
+            # Here bit 12 is 1 already: that it falls afterwards tells that the set-point was taken.
             _raise_bit_4(drives, word, kept, timeout, cia402.CHANGE_AT_ONCE)
         wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
 
@@ -522,10 +524,10 @@ def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
         if fault.any() or failed.any():
             axis = int(np.flatnonzero(fault | failed)[0])
             number = axis_number(drives, axis)
-            what = "is in fault while homing; see emergencies()" if fault[axis] else "did not complete homing"
-            raise RuntimeError(
-                f"axis {number} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
-            )
+            told = f"statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
+            if fault[axis]:
+                raise RuntimeError(f"axis {number} is in fault while homing; see emergencies(): {told}")
+            raise RuntimeError(f"axis {number} did not complete homing: {told}")
         still = axes & (bits != cia402.HOMED)
         if not still.any():
             break

@@ -141,7 +141,8 @@ class BusDrives:
             self.safety.before_write(entry, raw, axes)
         try:
             if entry.index == cia402.CONTROLWORD and np.count_nonzero(axes) > 1:
-                self._link.hand_out([self._addressed(entry, int(axis), int(raw[axis])) for axis in np.flatnonzero(axes)])
+                words = [self._addressed(entry, axis, int(raw[axis])) for axis in np.flatnonzero(axes).tolist()]
+                self._link.hand_out(words)
             for axis in np.flatnonzero(axes):
                 self.write_axis(entry, int(axis), int(raw[axis]))
         except BaseException:

@@ -187,7 +187,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             ) from None
 
     def _take_for_answered(self) -> None:
-        """Take note that a transfer had its answer; not of one after another that had none, whose answer may be late."""
+        """Take note that a transfer had its answer, unless that of the one before may be late."""
         if not self._has_retried:
             self._recent.append(self._object)
         self._has_retried = False
