@@ -10,13 +10,16 @@ from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.can_port import CanPort
+from drive_env.bus.config import Bus, Machine, build_world
+from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
+from drive_env.commands.serve import _announce
 from drive_env.master.errors import BusError
 
-LOAD = 0x64616F6C
+LOAD, SAVE = 0x64616F6C, 0x65766173
 SAID = "two nodes answer as 1: switch all but one of them off, and give it another node-ID"
 
 
@@ -96,3 +99,21 @@ def test_scan_and_get_tell_of_them(twins, monkeypatch):
     assert scanned.stdout.startswith(f"node 1  {SAID}")
     assert [(row["node"], row["answers"]) for row in json.loads(rows.stdout)] == [(1, 2)]
     assert got.exit_code == 1 and SAID in got.stderr.replace("\n", " ")
+
+
+def test_serve_prints_the_node_id_that_boots(tmp_path, capsys):
+    """Before: the one of its arguments, under which nobody answers."""
+    bus = Bus(store=str(tmp_path), machines=(Machine(load="inertia", nodes=(5,)),))
+    for said in ("node 5 (tmcm1636, ", "node 33 (in its store; 5 was given) (tmcm1636, "):
+        world = build_world(bus, lockstep=True)
+        with Server(world, Hub(0)) as server:
+            server.stop()
+            _announce(server, bus, False, None, None, None)
+        assert said in capsys.readouterr().out
+        given = world.nodes[5].node_id
+        other = WorldBus(world)
+        with CanDrives(bus=other, nodes=(given,), pace="lockstep", safety=False) as drives:
+            drives.write(0x2705, 33)
+            drives.write(0x2706, SAVE)
+        other.shutdown()
+        world.close()

@@ -124,7 +124,6 @@ def serve(
         made = _server(bus, real_time, port, listen, token, interface, channel)
         server.append(made)
         controls: list[Control | BesideCan] = [*_faults(made, fault or [], control), *_beside(made, bus, real_time)]
-        made.world.power_on()  # a store may have another node-ID than the arguments
         _announce(made, bus, real_time, token, interface, channel)
         try:
             made.run(duration)
@@ -314,6 +313,7 @@ def _announce(
 ) -> None:
     from drive_env.bus.hub import Hub
 
+    server.world.power_on()  # what boots has the node-ID of its store, if that has one
     nodes = ", ".join(
         f"node {', '.join(_booted(server, node) for node in row.nodes)} ({row.device}, {row.motor_name}, {row.load}"
         f"{f'; {len(row.on_ethercat)} on EtherCAT' if row.on_ethercat else ''}"
