@@ -84,6 +84,20 @@ def test_an_offset_of_the_axis_stays_as_it_is_and_turns_nothing():
         assert drives.read(0x60B1) == [200_000] and drives.read(0x60FF) == [-200_000]
 
 
+def test_an_axis_that_was_stopped_does_not_go_on():
+    """Before: quick stop active with 605Ah = 6 was left at the speed of before."""
+    with EmulatedDrives("tmcm1636", "inertia", num_threads=1) as drives:
+        drives.write(0x605A, 6)
+        motion.enable(drives, "pv")
+        drives.write(0x60FF, 200_000)
+        drives.advance(1.0)
+        motion.quick_stop(drives)
+        drives.advance(1.0)
+        assert cia402.matches(drives.read(0x6041), cia402.QUICK_STOP_ACTIVE).all()
+        motion.enable(drives)
+        assert way(drives, drives) < STILL
+
+
 def test_an_axis_that_is_enabled_goes_on():
     with EmulatedDrives("tmcm1636", "inertia", num_threads=1) as drives:
         motion.enable(drives, "pv")

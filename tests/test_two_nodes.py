@@ -106,9 +106,9 @@ def test_serve_prints_the_node_id_that_boots(tmp_path, capsys):
     bus = Bus(store=str(tmp_path), machines=(Machine(load="inertia", nodes=(5,)),))
     for said in ("node 5 (tmcm1636, ", "node 33 (in its store; 5 was given) (tmcm1636, "):
         world = build_world(bus, lockstep=True)
-        with Server(world, Hub(0)) as server:
-            server.stop()
-            _announce(server, bus, False, None, None, None)
+        server = Server(world, Hub(0))
+        _announce(server, bus, False, None, None, None)
+        server.close()
         assert said in capsys.readouterr().out
         given = world.nodes[5].node_id
         other = WorldBus(world)
