@@ -313,7 +313,6 @@ def _announce(
 ) -> None:
     from drive_env.bus.hub import Hub
 
-    server.world.power_on()  # what boots has the node-ID of its store, if that has one
     nodes = ", ".join(
         f"node {', '.join(_booted(server, node) for node in row.nodes)} ({row.device}, {row.motor_name}, {row.load}"
         f"{f'; {len(row.on_ethercat)} on EtherCAT' if row.on_ethercat else ''}"
