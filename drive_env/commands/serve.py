@@ -341,8 +341,10 @@ def _announce(
 
 def _booted(server: Server, given: int) -> str:
     """Return the node-ID by which a node boots, and the one that it was given where its store has another."""
-    node = server.world.nodes.get(given)
-    booted = given if node is None else node.node_id  # one without a node-ID has a place of its own
+    from drive_env.canopen.node import Node
+
+    node = server.world.nodes.get(given)  # one without a node-ID has a place of its own
+    booted = node.node_id if isinstance(node, Node) else given
     return f"{booted}" if booted == given else f"{booted} (in its store; {given} was given)"
 
 
