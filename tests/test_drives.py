@@ -209,6 +209,7 @@ def test_a_turning_axis_is_taken_over_at_its_speed(running):
     running.advance(0.01)
     speed = int(running.read(0x606C)[0])
     motion.enable(running, mode="pv")
+    running.write(0x60FF, speed)
     trace = running.record([0x606C], 0.05)
     assert speed > 500_000
     assert trace[0x606C].min() > 0.8 * speed

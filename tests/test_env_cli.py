@@ -94,7 +94,7 @@ def test_a_node_that_boots_while_it_is_scanned_is_found_and_said_to_be_in_no_sta
         def wait(self, done, timeout):
             pass
 
-    assert scan._find(Port(), 1, 3, 0.1) == {(1, ""), (2, "operational")}
+    assert scan._find(Port(), 1, 3, 0.1) == {(1, "", 0), (2, "operational", 0)}
 
 
 class SilentPort:
@@ -130,7 +130,7 @@ def test_scan_shows_a_time_out_as_a_time_out(monkeypatch, capsys, silent, state,
         return (402).to_bytes(4, "little")
 
     monkeypatch.setattr("drive_env.master.can.sdo.SdoClient.read", read)
-    scan._print([scan._look(SilentPort(), 3, state, 0.3)], 0.3)
+    scan._print([scan._look(SilentPort(), 3, state, 0, 0.3)], 0.3)
     assert capsys.readouterr().out == line + "\n"
 
 

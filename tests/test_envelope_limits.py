@@ -212,8 +212,10 @@ STARTED = [("pp", (0x6081, 0)), ("hm", (0x6099, 1)), ("hm", (0x6099, 2))]
 def test_a_speed_that_a_drive_has_from_before_is_held_against_the_limit_when_it_is_enabled(bus, drive, mode, key):
     drive.values |= {(0x60FF, 0): (0, 4), (0x60B1, 0): (0, 4), key: (10 * TURN + 1, 4)}
     with CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=10 * TURN)) as drives:
+        drives.write(0x6060, cia402.MODES[mode])  # `motion.enable` would write over it
         with pytest.raises(SafetyError, match=f"= {10 * TURN + 1}, beyond the limit {10 * TURN}; nothing was sent"):
-            motion.enable(drives, mode=mode)
+            for word in cia402.ENABLING:
+                drives.write(0x6040, word)
         assert drive.get(0x6041) & 0x6F != 0x27
         words = [6, 6, 6, 7, 7, 7, 15, 15, 15]
         with pytest.raises(SafetyError, match="Write less there first"):

@@ -131,7 +131,7 @@ def _answers(drives):
 @pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--fault", "encoder_stuk"], "drive-env: --fault: no fault is named 'encoder_stuk'; there are "),
-    (["--fault", "jam torque=1e9"], "drive-env: --fault: fault jam: torque=1e+09 must lie in 0...1000 rated torque"),
+    (["--fault", "jam torque=1e9"], "drive-env: --fault: fault jam: torque=1e+09 must be 0 to 1000 rated torque"),
     (["--fault", "jam soon"], "'soon' must be as at=2"),
     (["--control", "70000"], "drive-env: --control 70000 must be 0 to 65535"),
 ])  # fmt: skip

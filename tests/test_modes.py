@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives, ObjectAccessError, motion
+from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 
 ACKNOWLEDGED, REACHED, LIMITED = 0x1000, 0x0400, 0x0800  # statusword bits 12, 10, 11
 TURN = 65536  # increments
@@ -413,12 +413,12 @@ def test_changing_the_mode_in_motion_does_not_jump(drives, before, after):
     holding = drives.record([0x6077], duration=0.1)[0x6077].mean(axis=0).round().astype(int)
     drives.write(0x6071, holding)  # what friction takes: the speed stays in cst
     if before == "cst":
-        motion.select_mode(drives, "cst")
+        drives.write(0x6060, cia402.CST)
         drives.advance(0.1)
     start = drives.record([0x606C], duration=0.02)[0x606C].mean()
     assert start == pytest.approx(SPEED, rel=0.06)
     drives.write(0x60FF, SPEED)
-    motion.select_mode(drives, after)
+    drives.write(0x6060, cia402.MODES[after])  # `motion.select_mode` would have it stay
     # The torque of cst holds no speed: it drifts, but it does not jump.
     trace = drives.record([0x606C, 0x6077], duration=0.03 if after == "cst" else 0.12)
     # pp has no set-point after a change of mode and brakes with 6084h; pv has its target; cst its torque.

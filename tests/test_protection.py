@@ -319,8 +319,8 @@ def test_fault_comes_by_its_cause_and_goes_after_it(name):
         elif row.cause is not brake_hard:
             reset_edge(drives)
             assert messages(drives) == [(0, 0x0000, (0, 0, 0, 0, 0))]
-            drives.write(0x60FF, FAST)
             motion.enable(drives, where=FIRST)
+            drives.write(0x60FF, FAST)
             until_fault(drives, row)
             assert messages(drives) == [(0, row.code, (*row.extra, 0, 0, 0))]
 

@@ -59,8 +59,8 @@ def go(drives, turns=0.1):
 
 
 def turn(drives):
-    motion.enable(drives, mode="pv")
     given = drives.read(0x60FF)
+    motion.enable(drives, mode="pv")  # by which the axes stay
     drives.write(0x60FF, np.where(given, given, 200 * RPM))
     return through(drives, 0.05)
 
@@ -72,7 +72,9 @@ def stop_quickly(drives):
 
 
 def twist(drives):
+    given = drives.read(0x6071)
     motion.enable(drives, mode="cst")
+    drives.write(0x6071, given)
     return through(drives, 0.01)
 
 

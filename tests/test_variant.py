@@ -468,8 +468,8 @@ def test_the_envelope_holds_speeds_and_ramps_in_whatever_they_count(device):
         drives.write("Target velocity", "299 rpm")
         with pytest.raises(SafetyError, match=r"limit (300|327680); .* the quick stop's ramp, 6085h: no axis may be"):
             drives.write("Target velocity", "301 rpm")
-        drives.write("Target velocity", "250 rpm")
         motion.enable(drives, mode="pv")
+        drives.write("Target velocity", "250 rpm")
         drives.advance(0.2)
         with pytest.raises(SafetyError, match=r"6085h:00 .* would not stop it within 1 s from its 2[0-9]{5} pps"):
             drives.write("Quick stop deceleration", "4 rev/s^2")

@@ -88,9 +88,7 @@ def _print_table(as_json: bool) -> None:
             print(f"{group}:")
         print(f"  {row.name:<20} {row.title}")
         for key, parameter in row.parameters.items():
-            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-            limits = f"{parameter.low:g}...{parameter.high:g}{unit}, default {parameter.default:g}"
-            print_lines([f"    {key}: {parameter.meaning} ({limits})"])
+            print_lines([f"    {key}: {parameter.meaning} ({parameter.range}, default {parameter.default:g})"])
 
 
 def _row(row: FaultRow) -> dict[str, Any]:

@@ -56,7 +56,11 @@ def get(
     raw: Raw = False,
     json: Json = False,
 ) -> None:
-    """Read objects over SDO and show them with their units."""
+    """Read objects over SDO and show them with their units.
+
+    Nothing is written. A node on CAN that is in the NMT state stopped, where it answers no SDO, is taken to
+    pre-operational first, by an NMT command, and stays there.
+    """
     with (
         errors_as_exit_codes(),
         connect(interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout, safety=False) as drives,

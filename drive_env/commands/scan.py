@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import partial
 from typing import Annotated, Any
 
@@ -41,6 +42,8 @@ def scan(
 ) -> None:
     """Find nodes and read their identification: 1000h, 1008h to 100Ah, 1018h. Nothing is written.
 
+    Two nodes with one node-ID, which both answer, are told.
+
     On EtherCAT: the slaves in their order, what their EEPROMs say, and their states; no state changes.
     """
     with errors_as_exit_codes():
@@ -60,7 +63,7 @@ def scan(
         options = {"bitrate": bitrate} if bitrate else {}
         port = Port(open_bus(interface, channel, **options))
         try:
-            found = [_look(port, node, state, timeout) for node, state in sorted(_find(port, first, last, timeout))]
+            found = [_look(port, *one, timeout) for one in sorted(_find(port, first, last, timeout))]
         finally:
             port.close()
         if json:
@@ -100,11 +103,11 @@ def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> No
         print_lines([f"position {row['position']}  {known}  {numbers}  {row['state']}"])
 
 
-def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, str]]:
-    """Return the nodes that answer or are heard, each with what is known of its state."""
+def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, str, int]]:
+    """Return the nodes that answer or are heard, each with what is known of its state, and how many answered as it."""
     from drive_env.canopen.frames import ERROR_CONTROL, SDO_REQUEST, SDO_RESPONSE
 
-    answered: set[int] = set()
+    answered: Counter[int] = Counter()
     heard: dict[int, str] = {}
     states = {4: "stopped", 5: "operational", 127: "pre-operational"}
 
@@ -115,23 +118,25 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
         heard[node] = states.get(data[0] & 0x7F, "unknown") if data else "unknown"
 
     for node in range(first, last + 1):
-        port.subscribe(SDO_RESPONSE + node, lambda _, node=node: answered.add(node))
+        port.subscribe(SDO_RESPONSE + node, lambda _, node=node: answered.update((node,)))
         port.subscribe(ERROR_CONTROL + node, partial(hear, node))
     for node in range(first, last + 1):
         port.send(SDO_REQUEST + node, bytes((0x40, 0x00, 0x10, 0, 0, 0, 0, 0)))
         port.wait(lambda: False, GAP)
     port.wait(lambda: False, timeout)
-    return {(node, heard.get(node, "")) for node in answered | set(heard)}
+    return {(node, heard.get(node, ""), answered[node]) for node in set(answered) | set(heard)}
 
 
-def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
+def _look(port: Any, node: int, state: str, answers: int, timeout: float) -> dict[str, Any]:
     from drive_env.devices import device_of
     from drive_env.dictionary.aborts import ObjectAccessError
-    from drive_env.master.can.sdo import SdoClient
+    from drive_env.master.can.sdo import TWICE, SdoClient
     from drive_env.master.errors import BusError, NoAnswerError
 
     sdo = SdoClient(port, node)
     row: dict[str, Any] = {"node": node, "state": state}
+    if answers > 1:  # of which each object would be one's or the other's
+        return row | {"answers": answers}
 
     def read(index: int, sub: int) -> bytes | None:
         label = f"{index:04X}h:{sub:02X}"
@@ -156,11 +161,16 @@ def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
         if number is not None:
             row[name] = int.from_bytes(number, "little")
     row["device"] = device_of(row["device type"], row.get("vendor"), row.get("product"))
-    return row
+    return row | ({"answers": 2} if sdo.answered_twice >= TWICE else {})
 
 
 def _print(found: list[dict[str, Any]], timeout: float) -> None:
+    from drive_env.master.can.sdo import several_answer
+
     for row in found:
+        if "answers" in row:
+            print_lines([f"node {row['node']}  {several_answer(row['answers'], row['node'])}"])
+            continue
         late = ", ".join(row.get("timed out", ()))
         late = f"no answer to {late} within {timeout:g} s; try a longer --timeout" if late else ""
         if "device type" not in row:

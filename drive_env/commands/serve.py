@@ -314,7 +314,7 @@ def _announce(
     from drive_env.bus.hub import Hub
 
     nodes = ", ".join(
-        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor_name}, {row.load}"
+        f"node {', '.join(_booted(server, node) for node in row.nodes)} ({row.device}, {row.motor_name}, {row.load}"
         f"{f'; {len(row.on_ethercat)} on EtherCAT' if row.on_ethercat else ''}"
         f"{'' if row.commissioned else '; factory values, not commissioned'})"
         for row in bus.machines
@@ -337,6 +337,15 @@ def _announce(
     else:
         print(f"on {interface} {channel or ''}".rstrip())
     sys.stdout.flush()
+
+
+def _booted(server: Server, given: int) -> str:
+    """Return the node-ID by which a node boots, and the one that it was given where its store has another."""
+    from drive_env.canopen.node import Node
+
+    node = server.world.nodes.get(given)  # one without a node-ID has a place of its own
+    booted = node.node_id if isinstance(node, Node) else given
+    return f"{booted}" if booted == given else f"{booted} (in its store; {given} was given)"
 
 
 def _statistics(server: Server) -> str:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
-from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import BasicDrives, axis_number
 
@@ -26,6 +27,16 @@ TAKEN_BACK = 0.05  # s after which a set-point whose acknowledge stays is in a d
 REST = 0.25  # s at the target, or at home, after which a drive without bit 10 has got there
 NEAR = 10  # increments around a target, where the drive has no window of its own
 STOP_TIMEOUT = 5.0  # s, for the stop of an axis whose own mode was changed while it was enabled
+# Of each mode that follows a target as soon as it is enabled: the target, and the object that is added to it.
+# ip and tq act as csp and cst where a drive has them (TGZ manual); pp and hm move at a rising edge of bit 4 alone.
+FOLLOWED = {
+    "pv": (cia402.TARGET_VELOCITY, None),
+    "tq": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
+    "ip": (cia402.TARGET_POSITION, cia402.POSITION_OFFSET),
+    "csp": (cia402.TARGET_POSITION, cia402.POSITION_OFFSET),
+    "csv": (cia402.TARGET_VELOCITY, cia402.VELOCITY_OFFSET),
+    "cst": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
+}
 
 
 def wait_for(
@@ -87,8 +98,9 @@ def _why_not_heard(drives: BasicDrives, status: int) -> str:
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
     """Select a mode of operation by abbreviation on the axes that are not in it yet.
 
-    Of a drive whose own mode must fit it, that is written, too. It stops an axis that is enabled where it sees the one
-    without the other, as on a bus; such an axis is enabled again.
+    An axis that is enabled stays where it is: the mode's target is written first, as `stay` does. Of a drive whose own
+    mode must fit it, that is written, too. It stops an axis that is enabled where it sees the one without the other, as
+    on a bus; such an axis is enabled again.
     """
     if mode not in cia402.MODES:
         raise ValueError(f"no mode is named {mode!r}; there are {', '.join(cia402.MODES)}")
@@ -98,8 +110,11 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
     needed = _own_modes(drives).get(number)
     closed = axes & False if needed is None else axes & (drives.read(Role.MODE_GATE) != needed)
     was_on = closed
-    if closed.any():
-        was_on = closed & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+    if (changed := closed | other).any():
+        on = changed & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+        was_on = closed & on
+        if on.any():
+            stay(drives, mode, on)
     if other.any():
         drives.write(cia402.MODE, number, where=other)
     if needed is not None and closed.any():
@@ -107,6 +122,44 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
     if was_on.any():
         _enable_again(drives, was_on)
     _await_mode(drives, mode, axes)
+
+
+def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
+    """Write the target by which axes stay in a mode, whatever a program has left in the drives.
+
+    It is the position that they have, no speed, or no torque, less the offset that the drive adds. Modes that move at
+    an edge of the controlword alone have none.
+    """
+    if mode not in FOLLOWED:
+        return
+    name, added = FOLLOWED[mode]
+    still = drives.read(cia402.POSITION_ACTUAL) if name == cia402.TARGET_POSITION else 0
+    offset = None if added is None else _read_if_there(drives, added)
+    drives.write(name, still if offset is None else still - offset, where=where)
+
+
+def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
+    """Return an object of every axis, None of drives that have no such object."""
+    try:
+        return drives.read(name)
+    except ObjectAccessError as error:
+        if error.abort_code not in (NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX):
+            raise
+        return None
+
+
+def _stay_in_own_mode(drives: BasicDrives, axes: Mask, mode: str | None) -> None:
+    """Have axes stay once they are enabled: in a mode, or in what each of them has, None."""
+    if mode is not None:
+        stay(drives, mode, axes)
+        return
+    # A drive may show a mode only once it is enabled: what was asked for counts, too.
+    asked, shown = drives.read(cia402.MODE), _shown_modes(drives)
+    for name in FOLLOWED:
+        number = cia402.MODES[name]
+        of_mode = axes & ((asked == number) | (False if shown is None else shown == number))
+        if of_mode.any():
+            stay(drives, name, of_mode)
 
 
 def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0) -> None:
@@ -194,6 +247,9 @@ def take_command(drives: BasicDrives, where: Mask | None = None) -> None:
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Take drives to operation enabled, a fault being reset first; `mode` is selected before.
 
+    Axes that were not enabled stay where they are: what a program has left in the target of the mode moves nothing.
+    Targets are written afterwards. Axes that are enabled already go on.
+
     Args:
         drives: The drives.
         mode: Abbreviation of a mode; None leaves it.
@@ -215,6 +271,7 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         select_mode(drives, mode, where)
     stopped = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.QUICK_STOP_ACTIVE)
     if stopped.any():
+        _stay_in_own_mode(drives, stopped, mode)
         drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=stopped)
         # By 605Ah the drive takes transition 16, or goes on to switch on disabled by itself: it is enabled from there.
         wait_for(drives, cia402.OPERATION_ENABLED, timeout, "the end of the quick stop", stopped,
@@ -227,6 +284,8 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         (cia402.SWITCH_ON, cia402.SWITCHED_ON, "switched on"),
         (cia402.ENABLE_OPERATION, cia402.OPERATION_ENABLED, "operation enabled"),
     ):
+        if word == cia402.ENABLE_OPERATION:
+            _stay_in_own_mode(drives, not_enabled, mode)
         drives.write(cia402.CONTROLWORD, word, where=not_enabled)
         try:
             wait_for(drives, state, timeout, name, not_enabled)
@@ -304,18 +363,47 @@ def start_move(
         TimeoutError: If the drive does not take the set-point within `timeout` [s].
     """
     _check_can_move(drives, where)
+    axes = np.ones(drives.num_axes, bool) if where is None else where
     word = cia402.ENABLE_OPERATION | (cia402.RELATIVE if relative else 0)
     drives.write(cia402.TARGET_POSITION, position, where=where)
-    drives.write(cia402.CONTROLWORD, word | cia402.NEW_SET_POINT, where=where)
+    with _bit_4_is_low(drives, word, where):
+        kept = _still_acknowledged(drives, where)
+        if relative and kept.any():
+            # The buffer is full: an edge would be ignored, and the acknowledge of the move before taken for its own.
+            wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "room for another relative move", kept)
+            kept = np.zeros_like(kept)
+        if (others := axes & ~kept).any():
+            _raise_bit_4(drives, word, others, timeout)
+            kept = kept | _still_acknowledged(drives, others)
+        if kept.any() and not relative:  # a relative one ends at the same place from the buffer, and must not go twice
+            # Here bit 12 is 1 already: that it falls afterwards tells that the set-point was taken.
+            _raise_bit_4(drives, word, kept, timeout, cia402.CHANGE_AT_ONCE)
+        wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
+
+
+def _raise_bit_4(drives: BasicDrives, word: int, where: Mask, timeout: float, more: int = 0) -> None:
+    """Have axes take their set-point at a rising edge, and lower the bit again."""
+    drives.write(cia402.CONTROLWORD, word | more | cia402.NEW_SET_POINT, where=where)
     wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", where)
     drives.write(cia402.CONTROLWORD, word, where=where)
-    kept = _still_acknowledged(drives, where)
-    if kept.any() and not relative:  # a relative one ends at the same place from the buffer, and must not go twice
-        at_once = word | cia402.CHANGE_AT_ONCE
-        drives.write(cia402.CONTROLWORD, at_once | cia402.NEW_SET_POINT, where=kept)
-        wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", kept)
-        drives.write(cia402.CONTROLWORD, word, where=kept)
-    wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
+
+
+@contextlib.contextmanager
+def _bit_4_is_low(drives: BasicDrives, word: int, where: Mask | None) -> Iterator[None]:
+    """Lower bit 4 of the controlword, which must rise to begin anything; and again where what follows fails.
+
+    Left high it would keep each move and each homing from beginning until the axis is disabled.
+    """
+    drives.write(cia402.CONTROLWORD, word, where=where)
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(Exception):  # what went wrong says more than that this fails, too
+            # An axis that was stopped must not be enabled by it.
+            on = np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
+            if (left := on if where is None else on & where).any():
+                drives.write(cia402.CONTROLWORD, word, where=left)
+        raise
 
 
 def _still_acknowledged(drives: BasicDrives, where: Mask | None) -> Mask:
@@ -409,9 +497,22 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
         TimeoutError: If home is not attained within `timeout` [s].
     """
     axes = np.ones(drives.num_axes, bool) if where is None else where
+    method = _read_if_there(drives, cia402.HOMING_METHOD)
+    if method is not None and (none := axes & (method == 0)).any():
+        number = axis_number(drives, int(np.flatnonzero(none)[0]))
+        raise RuntimeError(
+            f"axis {number} cannot home: no homing method is chosen (6098h is 0); write the number of "
+            "the one that fits the machine's switches"
+        )
     enable(drives, mode="hm", where=where)
-    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise
-    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
+    with _bit_4_is_low(drives, cia402.ENABLE_OPERATION, where):
+        drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
+        _await_home(drives, axes, timeout)
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)
+
+
+def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
+    """Let time pass until axes that are homing have attained home."""
     waited, silent = 0.0, 0
     while True:
         drives.advance(2 * STEP)  # the first look comes after the drive has begun
@@ -423,10 +524,10 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
         if fault.any() or failed.any():
             axis = int(np.flatnonzero(fault | failed)[0])
             number = axis_number(drives, axis)
-            what = "is in fault while homing; see emergencies()" if fault[axis] else "did not complete homing"
-            raise RuntimeError(
-                f"axis {number} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
-            )
+            told = f"statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
+            if fault[axis]:
+                raise RuntimeError(f"axis {number} is in fault while homing; see emergencies(): {told}")
+            raise RuntimeError(f"axis {number} did not complete homing: {told}")
         still = axes & (bits != cia402.HOMED)
         if not still.any():
             break
@@ -438,7 +539,6 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
             axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])
             number = axis_number(drives, axis)
             raise TimeoutError(f"axis {number} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
-    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)
 
 
 def _rests(drives: BasicDrives, axes: Mask) -> bool:

@@ -25,6 +25,11 @@ class FaultParameter:
     unit: str
     meaning: str
 
+    @property
+    def range(self) -> str:
+        """From its lowest to its highest value, as text; a share has no unit."""
+        return f"{self.low:g} to {self.high:g}" + ("" if self.unit == "1" else f" {self.unit}")
+
 
 @dataclass(frozen=True)
 class FaultRow:
@@ -98,9 +103,7 @@ def checked_parameters(row: FaultRow, given: Mapping[str, float]) -> dict[str, f
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ValueError(f"fault {row.name}: {name} must be a finite number, not {value!r}")
         if not limits.low <= value <= limits.high:
-            raise ValueError(
-                f"fault {row.name}: {name}={value:g} must lie in {limits.low:g}...{limits.high:g} {limits.unit}"
-            )
+            raise ValueError(f"fault {row.name}: {name}={value:g} must be {limits.range}")
         if isinstance(limits.default, int) and value != int(value):
             raise ValueError(f"fault {row.name}: {name}={value:g} must be a whole number")
     return {name: float(given.get(name, limits.default)) for name, limits in row.parameters.items()}

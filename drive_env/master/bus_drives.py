@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
 from drive_env.devices import device_of, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable, checked_values
@@ -27,7 +28,7 @@ from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.trace import Trace
 from drive_env.master.cycle_runner import CycleRunner
-from drive_env.master.description import Description
+from drive_env.master.description import Description, Key
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.link import Link, ObjectClient
 from drive_env.master.pace import Pace, Timing
@@ -139,6 +140,9 @@ class BusDrives:
         if self.safety is not None:
             self.safety.before_write(entry, raw, axes)
         try:
+            if entry.index == cia402.CONTROLWORD and np.count_nonzero(axes) > 1:
+                words = [self._addressed(entry, axis, int(raw[axis])) for axis in np.flatnonzero(axes).tolist()]
+                self._link.hand_out(words)
             for axis in np.flatnonzero(axes):
                 self.write_axis(entry, int(axis), int(raw[axis]))
         except BaseException:
@@ -389,6 +393,11 @@ class BusDrives:
         """Return the node of an axis by its position, and index, sub-index and label of an object there."""
         node, part = divmod(axis, self._description.num_axes)
         return node, *self._description.key(entry, part), self._description.label(entry, part)
+
+    def _addressed(self, entry: Entry, axis: int, value: int) -> tuple[int, Key, bytes]:
+        """Return the node of an axis by its position, an object there, and what it gets as bytes."""
+        node, index, sub, _ = self._place_of(entry, axis)
+        return node, (index, sub), self._description.encode(entry, value)
 
     def _greet(self) -> None:
         """Check that every node is there and is the device it is taken for."""

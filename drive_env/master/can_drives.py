@@ -19,6 +19,8 @@ from drive_env.master.description import check_timeout, describe
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, cycles_per_sync
 from drive_env.safety.limits import Limits
 
+TWIN_TIME = 0.005  # s by which a second node with the same node-ID may answer later: they are of one kind
+
 
 class CanDrives(BusDrives):
     """Drives on a CAN bus, with the interface of `EmulatedDrives`: the same calls, the same integers.
@@ -48,7 +50,7 @@ class CanDrives(BusDrives):
             (from DRIVE_ENV_TOKEN if not given).
 
     Raises:
-        BusError: If the bus cannot be opened, a node does not answer or is another device.
+        BusError: If the bus cannot be opened, a node does not answer or is another device, or two answer as one.
         ValueError: For an unknown device or pace, a node-ID or a time-out that cannot be.
     """
 
@@ -94,7 +96,8 @@ class CanDrives(BusDrives):
             port = Port(open_bus(interface, channel, **options))
         self._port = port
         bus_time = BusTime() if by_sync else BusTime(float(options.get("bitrate") or BIT_RATE), description.cycle)
-        super().__init__(CanLink(port, node_ids, description, bus_time), description, paced, safety)
+        link = CanLink(port, node_ids, description, bus_time, 0.0 if by_sync else TWIN_TIME)
+        super().__init__(link, description, paced, safety)
 
     @property
     def port(self) -> Port:

@@ -310,6 +310,15 @@ class Link(Protocol):
         """Begin to listen for other masters."""
 
     # --- cycles -----------------------------------------------------------------------------------------------------
+    def hand_out(self, words: Sequence[tuple[int, Key, bytes]]) -> None:
+        """Have controlwords of several axes act in one cycle, as far as the bus can: axes may share a load.
+
+        Each is written by a transfer of its own afterwards, which follow one another.
+
+        Args:
+            words: Of each axis its node, the object there and the bytes that it gets.
+        """
+
     def sync(self) -> None:
         """Begin a cycle: the drives take what was handed out since the one before, and sample.
 

@@ -365,7 +365,8 @@ class Commands:
         above = np.maximum(np.abs(raw), np.abs(value)) > limit
         if not above.any():
             return
-        rows, above = np.atleast_2d(np.broadcast_to(value, above.shape)), np.atleast_2d(above)
+        shown = np.where(np.abs(raw) > np.abs(value), raw, value)  # it alone may be too much, the sum less
+        rows, above = np.atleast_2d(np.broadcast_to(shown, above.shape)), np.atleast_2d(above)
         wrong = np.flatnonzero(where & above.any(axis=0))
         if wrong.size:
             axis = int(wrong[0])

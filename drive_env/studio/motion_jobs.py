@@ -48,9 +48,7 @@ def enable(axis: int, mode: str) -> MotionJob:
     """Return the job that enables an axis in a mode."""
 
     def job(drives: Drives) -> None:
-        where = only(drives, axis)
-        _stay(drives, where, mode)
-        motion.enable(drives, mode=mode, where=where, timeout=3.0)
+        motion.enable(drives, mode=mode, where=only(drives, axis), timeout=3.0)
 
     return job
 
@@ -82,7 +80,7 @@ def command(axis: int, word: int) -> MotionJob:
         else:
             motion.take_command(drives, where=only(drives, axis))
             if word == cia402.ENABLE_OPERATION:
-                _stay(drives, only(drives, axis), _mode_of(drives, axis))
+                motion.stay(drives, _mode_of(drives, axis), only(drives, axis))
             drives.write(cia402.CONTROLWORD, word, where=only(drives, axis))
 
     return job
@@ -90,14 +88,7 @@ def command(axis: int, word: int) -> MotionJob:
 
 def select_mode(axis: int, mode: str) -> MotionJob:
     """Return the job that selects a mode of operation; an axis that is enabled stays where it is."""
-
-    def job(drives: Drives) -> None:
-        where = only(drives, axis)
-        if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
-            _stay(drives, where, mode)
-        motion.select_mode(drives, mode, where=where)
-
-    return job
+    return lambda drives: motion.select_mode(drives, mode, where=only(drives, axis))
 
 
 def home(axis: int) -> MotionJob:
@@ -187,16 +178,6 @@ def _mode_of(drives: Drives, axis: int) -> str:
     except ObjectAccessError:  # a drive that does not show it
         number = int(drives.read(cia402.MODE)[axis])
     return next((name for name, one in cia402.MODES.items() if one == number), "")
-
-
-def _stay(drives: Drives, where: Mask, mode: str) -> None:
-    """Have no target of before move an axis once it is in a mode: its position is the target, and no speed."""
-    if mode in ("csp", "pp", "ip"):
-        drives.write(cia402.TARGET_POSITION, drives.read(cia402.POSITION_ACTUAL), where=where)
-    elif mode in ("pv", "csv"):
-        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
-    elif mode in ("tq", "cst"):
-        drives.write(cia402.TARGET_TORQUE, 0, where=where)
 
 
 def _await_rest(drives: Drives, axis: int, timeout: float = 5.0) -> None:

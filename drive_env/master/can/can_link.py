@@ -19,7 +19,7 @@ from drive_env.master.can.pdo import PdoConfiguration
 from drive_env.master.can.port import Port
 from drive_env.master.can.process_data import PdoProcessData
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.description import Description
+from drive_env.master.description import Description, Key
 from drive_env.master.link import ObjectClient, ReceivedEmergency, Wording
 
 _EMCY_COB_ID, _PRODUCER_HEARTBEAT = 0x1014, (0x1017, 0)
@@ -34,6 +34,7 @@ class CanLink:
         nodes: Node-IDs.
         description: What device they are.
         bus_time: What the bus carries in a cycle.
+        twin_time: How long a second node with the same node-ID may take longer for its answer than the first [s].
     """
 
     def __init__(
@@ -42,8 +43,10 @@ class CanLink:
         nodes: Sequence[int],
         description: Description,
         bus_time: BusTime = BusTime(),  # noqa: B008
+        twin_time: float = 0.0,
     ) -> None:
         self.port = port
+        self._twin_time = twin_time
         self.nodes = tuple(nodes)
         self.is_dry = isinstance(port, DryPort)
         self.wording = Wording(
@@ -59,6 +62,8 @@ class CanLink:
             self._clients += [DrySdoClient(port, node, description) for node in self.nodes]
         else:
             clients = [SdoClient(port, node, lambda: self._alive()) for node in self.nodes]
+            for client in clients:
+                client.is_new = True
             self._network.on_boot = lambda node: clients[self.nodes.index(node)].forget()
             self._clients += clients
         borrowed = BorrowedIdentifiers(port, self.nodes, description.num_axes)
@@ -84,10 +89,16 @@ class CanLink:
         self._network.command(PRE_OPERATIONAL, (self.nodes[node],))
 
     def welcome(self, node: int) -> None:
-        """Take emergencies of a node from the identifier that its 1014h says."""
+        """Take emergencies of a node from the identifier that its 1014h says; BusError if it is two nodes."""
         if self._description.has(_EMCY_COB_ID):
             cob_id = self._read(node, self._description.dictionary.find(_EMCY_COB_ID))
             self._network.move_emergencies(self.nodes[node], cob_id)
+        client = self._clients[node]
+        if isinstance(client, SdoClient):
+            if self._twin_time > 0.0:
+                self.port.wait(lambda: False, self._twin_time)
+            client.check_alone()
+            client.is_new = False
 
     def start(self) -> None:
         """Take the nodes to NMT operational."""
@@ -138,6 +149,9 @@ class CanLink:
         return OtherMasters(self.port, self.nodes)
 
     # --- cycles -----------------------------------------------------------------------------------------------------
+    def hand_out(self, words: Sequence[tuple[int, Key, bytes]]) -> None:
+        """Do nothing: a node answers one SDO after the other, which follow as closely as the bus carries them."""
+
     def sync(self) -> None:
         """Send SYNC."""
         self.port.send(SYNC)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -31,6 +32,8 @@ _TIMED_OUT, _GENERAL = 0x05040000, 0x08000000
 _NO_BLOCKS = (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS)  # what servers without block transfers answer
 BUSY_TIME = 0.5  # s for which a controller's buffer may be full of segments
 PRE_OPERATIONAL = 0x80  # NMT command (CiA 301, 7.2.8.3.1)
+TWICE = 2  # transfers that must be answered twice: one frame may be repeated
+RECENT = 8  # transfers whose second answer may come yet
 PATIENT = 4.0  # times as long as usual is waited for what should not be left undone
 
 
@@ -41,6 +44,10 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         port: The bus.
         node: Node-ID.
         alive: Called while an answer is waited for.
+
+    Attributes:
+        is_new: The node may be two with one node-ID: a transfer is refused once that is seen.
+        answered_twice: Transfers to which an answer came when they had theirs.
     """
 
     def __init__(self, port: Port, node: int, alive: Callable[[], None] = lambda: None) -> None:
@@ -54,6 +61,10 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._in_block = False  # every frame is of the block transfer under way
         self._object: tuple[int, int]  # of the transfer under way
         self._timeout: float  # and its time for an answer [s]
+        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # objects of transfers that had their answer
+        self._has_retried = False  # so that an answer which comes late is no second one
+        self.is_new = False
+        self.answered_twice = 0
         self._turn = threading.RLock()  # one transfer at a time: the supervisor's thread looks at the drive, too
         port.subscribe(SDO_RESPONSE + node, self._answers.append)
 
@@ -120,6 +131,23 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         """End the transfer that is under way: the node has booted, and knows nothing of it."""
         self._has_booted = True
 
+    def check_alone(self) -> None:
+        """Raise BusError where two nodes have answered under this node-ID."""
+        self._port.drain()
+        self._count_seconds(self._answers)
+        if self.answered_twice >= TWICE:
+            raise BusError(several_answer(2, self._node))
+
+    def _count_seconds(self, answers: list[bytes]) -> None:
+        """Take note of answers to transfers that had theirs, and forget them all."""
+        while answers:
+            answer = answers.pop(0)
+            if len(answer) == 8 and (answer[0] == _ABORT or answer[0] & 0xE0 in _INITIATE):
+                named = struct.unpack_from("<HB", answer, 1)
+                if named in self._recent:
+                    self._recent.remove(named)
+                    self.answered_twice += 1
+
     def _transfer(self, index: int, sub: int, data: bytes | None, what: str, timeout: float) -> bytes:
         with self._turn:
             return self._transfer_alone(index, sub, data, what, timeout)
@@ -128,17 +156,24 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._object = (index, sub)
         self._timeout = timeout
         where = f"node {self._node}"
+        if self.is_new:
+            self.check_alone()
         self._port.drain()
-        self._answers.clear()
+        self._count_seconds(self._answers)
         self._has_booted = False
         try:
+            found = b""
             if data is None:
-                return self._read(index, sub)
-            self._write(index, sub, data)
-            return b""
+                found = self._read(index, sub)
+            else:
+                self._write(index, sub, data)
+            self._take_for_answered()
+            return found
         except SdoAbortedError as error:
+            self._take_for_answered()
             raise refused(where, what, int(error.code)) from None
         except SdoCommunicationError as error:
+            self._has_retried = True
             if "No SDO response" not in str(error):
                 raise BusError(f"{where} answered {what} wrongly: {error}; is another master on the bus?") from None
             if self._has_booted:
@@ -150,6 +185,12 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                 "(`drive-env scan`), and that the node is not stopped; a slow object takes a longer --timeout "
                 "(in Python timeouts={index: seconds})"
             ) from None
+
+    def _take_for_answered(self) -> None:
+        """Take note that a transfer had its answer, unless that of the one before may be late."""
+        if not self._has_retried:
+            self._recent.append(self._object)
+        self._has_retried = False
 
     def _read(self, index: int, sub: int) -> bytes:
         """Read in segments what is short, and in blocks what the server says to be long."""
@@ -244,6 +285,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                     if answer[0] == _ABORT:
                         raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
                     return answer
+                self._count_seconds([answer])
             if self._has_booted:
                 raise SdoCommunicationError("No SDO response received")
             left = deadline - time.monotonic()
@@ -269,3 +311,11 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         if answer[0] == _ABORT:
             return (index, sub) in (self._object, (0, 0))  # some servers abort without naming the object
         return answer[0] & 0xE0 not in _INITIATE or (index, sub) == self._object
+
+
+def several_answer(count: int, node: int) -> str:
+    """Return, for a message, that several nodes have one node-ID."""
+    return (
+        f"{'two' if count == 2 else count} nodes answer as {node}: switch all but one of them off, and give it another "
+        "node-ID, with `drive-env lss` or by its own object; if another master has read the same just then, try again"
+    )

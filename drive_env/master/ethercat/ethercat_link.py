@@ -176,6 +176,19 @@ class EtherCatLink:
         return OtherEtherCatMasters(self)
 
     # --- cycles -----------------------------------------------------------------------------------------------------
+    def hand_out(self, words: Sequence[tuple[int, Key, bytes]]) -> None:
+        """Put controlwords of several axes into the images, all of which go out in one frame.
+
+        Their transfers alone would be some frames apart, in which one axis turns what its twin does not hold yet. In
+        lockstep these take no time.
+        """
+        if any(cia402.may_enable(int.from_bytes(data, "little")) for _, _, data in words):
+            self.start()
+        with self.process.turn:
+            before = [self.process.put(node, key, data) for node, key, data in words]
+            if not self._lockstep and any(one is not None for one in before):
+                self.process.exchange(is_cycle=False)
+
     def sync(self) -> None:
         """Exchange the images of a cycle, and before it those that did not come back."""
         self.process.owed += 1
