@@ -16,7 +16,7 @@ from tuning.target import emulated
 
 def drives_that_told(*messages):
     told = [EmergencyMessage(axis, code, 0, (0,) * 5, name) for axis, code, name in messages]
-    return SimpleNamespace(num_axes=2, emergencies=lambda: told)
+    return SimpleNamespace(num_axes=2, emergencies=lambda: told, observers=())
 
 
 def test_each_axis_has_its_causes_once_and_in_their_order():

@@ -36,6 +36,7 @@ from tuning.identify.working_state import (
     still_enabled,
     working_state,
 )
+from tuning.lateness import late_first
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken, watch_of
 from tuning.response.frequency_response import Signal, measure
 from tuning.stop_causes import stop_causes
@@ -75,6 +76,7 @@ class Experiments:
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         check_linear_model(target.device)  # what is moved with here comes from it
         self.target, self.where, self.progress = target, where, progress
+        self._drives = target.drives
         self._at_rest: list[Estimate] = []  # resistances, where they are looked for
         self._under_way: tuple[str, tuple[str, ...]] = ("", NAMES)
         self.found: list[dict[str, Estimate]] = [
@@ -87,6 +89,7 @@ class Experiments:
         """Do them all."""
         with timed(self.target) as (target, clock):
             noise = target.device.stage["adc_noise"].high
+            self._drives = target.drives
             watch = OscillationWatch(self.where, np.full(target.num_axes, target.current), noise)
             watched = ObservedDrives(target.drives, watch)
             with working_state(replace(target, drives=watched), self.where) as working:
@@ -112,12 +115,13 @@ class Experiments:
         swung = working.where & (np.zeros_like(working.where) if watch is None else watch.swung)
         what, names = self._under_way
         for k in np.flatnonzero(swung):
+            assert watch is not None, "it saw them"
             for name in names:
                 before = self.found[k][name]
                 if not before.is_known and not before.reason.startswith(OSCILLATED):
                     self.found[k][name] = refused(UNITS[name], (
-                        f"{OSCILLATED} ({what}) and was switched off within 50 ms: check whether this is the right "
-                        "motor, and whether current and inertia fit its data sheet"
+                        f"{OSCILLATED} at about {watch.frequency[k]:.0f} Hz ({what}) and was switched off within 50 "
+                        "ms: check whether this is the right motor, and whether current and inertia fit its data sheet"
                     ))  # fmt: skip
         return replace(working, where=working.where & ~swung)
 
@@ -128,7 +132,8 @@ class Experiments:
         good = working.where.copy()
         for k in np.flatnonzero(working.where):
             check = checks[k]
-            self.found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
+            both = {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
+            self.found[k] |= {name: one._replace(reason=self._late_first(one.reason)) for name, one in both.items()}
             reason = self._wrong(working, int(k), check)
             if reason:
                 good[k] = False
@@ -313,8 +318,12 @@ class Experiments:
             )
         return np.array(rows, np.int64)
 
+    def _late_first(self, reason: str) -> str:
+        return late_first(self._drives, reason)
+
     def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
-        """Refuse what has no value yet."""
+        """Refuse what has no value yet, by a reason or by late SYNCs."""
+        reason = self._late_first(reason)
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
                 self.found[k][name] = refused(UNITS[name], reason)
