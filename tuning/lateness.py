@@ -7,6 +7,8 @@ from drive_env.drives.observed import Observer
 from drive_env.master.pace import Timing
 
 NONE = Timing(0, 0, 0.0)
+# From here on a check that turns the field says nothing: a part of it takes 24 ms, in which the field turns by a fifth.
+DISTORTING, DISTORTING_SHARE = 0.02, 0.05  # s, of the worst SYNC; of all
 LATE = "SYNCs were more than a cycle late"
 REMEDY = "end other programs, or put `chrt -f 10` before the command (Linux)"
 
@@ -28,8 +30,7 @@ def told_lateness(drives: Drives) -> str:
     Of those since the tuner began, where it is known when (`tuning.target.timed` knows), else since the drives were
     opened.
     """
-    before = next((each.before for each in drives.observers if isinstance(each, Punctuality)), NONE)
-    now = _timing(drives)
+    before, now = _before(drives), _timing(drives)
     if now.late <= before.late:
         return ""
     # The worst of all runs: that of these alone, unless it is the same as before.
@@ -40,10 +41,21 @@ def told_lateness(drives: Drives) -> str:
     )
 
 
+def is_distorted(drives: Drives) -> bool:
+    """Return whether SYNCs were so late since the tuner began that what the drives showed says nothing."""
+    before, now = _before(drives), _timing(drives)
+    late, worst = now.late - before.late, now.worst if now.worst > before.worst else 0.0
+    return late > 0 and (worst >= DISTORTING or late > DISTORTING_SHARE * (now.cycles - before.cycles))
+
+
 def late_first(drives: Drives, reason: str) -> str:
     """Return why something failed, late SYNCs first if there were any; "" stays ""."""
     late = told_lateness(drives)
     return f"{late}. With that: {reason}" if late and reason and LATE not in reason else reason
+
+
+def _before(drives: Drives) -> Timing:
+    return next((each.before for each in drives.observers if isinstance(each, Punctuality)), NONE)
 
 
 def _timing(drives: Drives) -> Timing:

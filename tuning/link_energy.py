@@ -1,8 +1,8 @@
 """What a motion feeds back into a drive's DC link, and what the link holds until the drive cuts its stage.
 
 A stop feeds back the kinetic energy. A weight that goes down feeds back as long as it goes, through a motor that
-merely holds it: power -K_t i omega with i = holding + (J domega/dt) / K_t, less what the winding loses. The current that
-holds the axis is measured at the motor, and what the transmission loses is in it. A supply may not take energy back.
+merely holds it: power -K_t i omega with i = holding + (J domega/dt) / K_t, less what the winding loses. The current
+that holds the axis is measured at the motor, and what the transmission loses is in it. A supply may not take it back.
 """
 
 from __future__ import annotations

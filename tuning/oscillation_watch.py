@@ -127,7 +127,7 @@ class OscillationWatch(Observer):
         if late.any():
             below.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=late)
             self.swung |= late
-            self.frequency = np.where(late, strongest_frequency(window), self.frequency)
+            self.frequency = np.where(late, strongest_frequency(window)[0], self.frequency)
             if self.swung[self._where].all():
                 raise OscillationError("all axes oscillate, and were switched off")
 

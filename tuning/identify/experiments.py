@@ -36,7 +36,7 @@ from tuning.identify.working_state import (
     still_enabled,
     working_state,
 )
-from tuning.lateness import late_first
+from tuning.lateness import is_distorted, late_first, told_lateness
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken, watch_of
 from tuning.response.frequency_response import Signal, measure
 from tuning.stop_causes import stop_causes
@@ -59,6 +59,7 @@ UNITS = {
     "loop_delay": "s", "velocity_filter": "Hz",
 }  # fmt: skip
 MECHANICS, RESPONSE = NAMES[NAMES.index("inertia") :], NAMES[NAMES.index("anti_resonance") :]
+SAYS_NOTHING = "so the check of pole pairs and encoder says nothing, and torque is not commanded"
 OSCILLATED = "the axis oscillated"  # how the reason begins where one did
 
 
@@ -132,9 +133,13 @@ class Experiments:
         good = working.where.copy()
         for k in np.flatnonzero(working.where):
             check = checks[k]
-            both = {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
-            self.found[k] |= {name: one._replace(reason=self._late_first(one.reason)) for name, one in both.items()}
+            self.found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
             reason = self._wrong(working, int(k), check)
+            if reason and is_distorted(self._drives):
+                # It turned the field by more than was asked for: what it blames, wiring or motor, may be right.
+                reason = f"{told_lateness(self._drives)}; {SAYS_NOTHING}"
+                self.found[k] |= {name: refused("1", reason) for name in ("pole_pairs", "encoder_direction")}
+                self._wiring[k] = {}
             if reason:
                 good[k] = False
                 self.refuse(int(k), NAMES, reason)
@@ -150,6 +155,7 @@ class Experiments:
             own = {key: int(values[k]) for key, values in has.items()}
             self._wiring[k] = needed(working.target.device, own, checks[k].direction.value, checks[k].halls)
             again[k] = bool(changes(self._wiring[k])) and (self.corrects or working.fresh[k])
+        again &= not is_distorted(self._drives)
         # What its halls aligned when it was first enabled stays so until it is switched off.
         again &= ~_aligned_by_halls(working)
         if not again.any():

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.gains import check_linear_model, read_gains
@@ -63,6 +64,7 @@ TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
 SPEED, CURRENT = 0.45, 0.9
 TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the shaking but an oscillation
 SLOWER, TINY = 0.9, 1e-6  # by which a run is made slower and weaker in turn that would overcharge it; J
+ONE_FREQUENCY = 0.5  # of the power of what an oscillation is, within 10 Hz of its frequency; of noise it is 0.05
 RETURN_SHARE = 0.5  # of the speed from which the DC link holds what a stop gives back
 IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
 TRAVEL = 0.85
@@ -207,9 +209,11 @@ class _Measurement:
                 room = np.where(target.high >= -target.low, target.high, target.low) * TRAVEL
                 sign = np.sign(room)
                 limit = self._current_limit()
-                self._holding = shaker.hold()
+                # At once: friction that has come to rest would make the trial another one.
+                self._holding = counted.drives.read(cia402.TORQUE_ACTUAL) * ampere_per_count(counted.drives)
                 speed = self._trial_speed(shaker, np.abs(room))
                 trial = self._trial(shaker, limit, speed, sign)
+                self._holding = shaker.hold()
                 progress(0.2)
                 rough = transfer(trial.set_point, trial.answer, self._lines)[0]
                 room = np.abs(room) - speed * _duration(1, self._lines)
@@ -350,11 +354,13 @@ class _Measurement:
         current = seen.current.reshape(shape)
         own = (current - current.mean(axis=1, keepdims=True)).reshape(self._passes, -1, len(where))
         found = where & shakes(own.reshape(-1, len(where)), self._target.motor.rated_current)
+        # Of the pass in which it is strongest: at the seam of two the swing has another phase.
+        strongest = own[own.std(axis=1).argmax(axis=0), :, np.arange(len(where))].T
+        frequency, share = strongest_frequency(strongest)
+        found &= share > ONE_FREQUENCY  # noise has all of them
         for axis in np.flatnonzero(found):
-            # Of the pass in which it is strongest: at the seam of two the swing has another phase.
-            most = own[own[:, :, axis].std(axis=1).argmax(), :, [axis]].T
             self._notes[axis].append(
-                f"the loop oscillates at {strongest_frequency(most)[0]:.0f} Hz, whatever it is shaken with"
+                f"the loop oscillates at {frequency[axis]:.0f} Hz, whatever it is shaken with"
                 f"{', or late SYNCs make it swing' if self._late else ''}: lower its gains, velocity P first"
             )
         return np.asarray(found)
