@@ -9,7 +9,7 @@ from drive_env.master.pace import Timing
 NONE = Timing(0, 0, 0.0)
 # From here on a check that turns the field says nothing: a part of it takes 24 ms, in which the field turns by a fifth.
 DISTORTING, DISTORTING_SHARE = 0.02, 0.05  # s, of the worst SYNC; of all
-LATE = "SYNCs were more than a cycle late"
+LATE = "SYNCs were more than a cycle late"  # by which a reason is known that names them
 REMEDY = "end other programs, or put `chrt -f 10` before the command (Linux)"
 
 
@@ -36,8 +36,8 @@ def told_lateness(drives: Drives) -> str:
     # The worst of all runs: that of these alone, unless it is the same as before.
     worst = f"the worst by {'at most ' if before.worst == now.worst else ''}{1e3 * now.worst:.1f} ms"
     return (
-        f"{now.late - before.late} of {now.cycles - before.cycles} {LATE}, {worst}: this computer is too busy, which "
-        f"distorts moves and frequency responses; {REMEDY}"
+        f"{now.late - before.late} of {now.cycles - before.cycles} SYNCs were more than a cycle late, {worst}: this "
+        f"computer is too busy, which distorts moves and frequency responses; {REMEDY}"
     )
 
 

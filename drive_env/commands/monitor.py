@@ -59,7 +59,7 @@ def monitor(
     """Show objects in a table that refreshes, with emergencies as they come; it only reads, over SDO.
 
     An axis that stands with its current at its limit for half a second (blocked, against a stop, or its encoder is
-    stuck) is told, too. With --json a line for each reading.
+    stuck) is named, too. With --json a line for each reading.
     """
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():

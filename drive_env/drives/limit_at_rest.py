@@ -28,8 +28,8 @@ class LimitAtRest:
     """Tells the axes that stand with their current at its limit; raw integers of the wire throughout.
 
     Args:
-        drives: The drives. Of those without a current limit of their own, as steppers, and of those that are known by
-            their EDS alone, none is told.
+        drives: The drives. Of those without a current limit of their own, as steppers, and of those known by
+            their EDS alone, none is named.
     """
 
     def __init__(self, drives: Drives) -> None:

@@ -359,10 +359,9 @@ class _Measurement:
         frequency, share = strongest_frequency(strongest)
         found &= share > ONE_FREQUENCY  # noise has all of them
         for axis in np.flatnonzero(found):
-            self._notes[axis].append(
-                f"the loop oscillates at {frequency[axis]:.0f} Hz, whatever it is shaken with"
-                f"{', or late SYNCs make it swing' if self._late else ''}: lower its gains, velocity P first"
-            )
+            told = f"the loop oscillates at {frequency[axis]:.0f} Hz, whatever it is shaken with"
+            also = ", or late SYNCs make its current swing so"
+            self._notes[axis].append(f"{told}{also if self._late else ''}: lower its gains, velocity P first")
         return np.asarray(found)
 
     def _note_limits(self, peak: Floats, where: Mask) -> None:
