@@ -94,7 +94,7 @@ def test_a_response_or_the_envelope_that_stops_it_names_late_syncs_first(late):
     assert notes[0].split(" of ")[0].isdigit()
 
 
-# --- what counts -------------------------------------------------------------------------------------------------------
+# --- what counts ------------------------------------------------------------------------------------------------------
 class Timed:
     """Drives of a bus, as far as they tell how punctual their SYNCs were."""
 

@@ -12,7 +12,7 @@ from drive_env.firmware.record import get_lanes
 from drive_env.motors import find_motor
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
-from tuning.link_energy import fed_back, link_energy
+from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.response.frequency_response import measure
 from tuning.target import emulated
 
@@ -66,9 +66,8 @@ def test_the_capacitor_of_a_falling_weight_has_what_was_foreseen():
         foreseen = float(fed_back(drives.motor, speed[:, None], CYCLE, inertia, holding)[0])
     stored = 0.5 * capacitance * (max(volts) ** 2 - volts[0] ** 2)
     assert foreseen > 0.5, "J: it is worth foreseeing"
-    assert stored <= 1.05 * foreseen
-    assert stored >= 0.6 * foreseen
-    print(stored, foreseen)
+    assert LINK_SHARE * stored <= foreseen, "a loop lags and overshoots: the share of the link leaves room for it"
+    assert stored >= 0.8 * foreseen
 
 
 def identified(num_machines, seed, how=identify):

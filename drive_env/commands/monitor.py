@@ -102,8 +102,16 @@ class _Pushing:
         """Return which of the axes do now, as they are listed."""
         if not self._watch.is_known:
             return [False] * len(self._axes)
-        names = (cia402.STATUSWORD, cia402.TORQUE_ACTUAL, cia402.VELOCITY_ACTUAL, Role.CURRENT_LIMIT)
-        return [bool(x) for x in self._watch.look(time.monotonic(), *map(self._drives.read, names))[self._axes]]
+        names: tuple[int | Role, ...] = (
+            cia402.STATUSWORD,
+            cia402.TORQUE_ACTUAL,
+            cia402.VELOCITY_ACTUAL,
+            Role.CURRENT_LIMIT,
+        )
+        return [
+            bool(x)
+            for x in self._watch.look(time.monotonic(), *(self._drives.read(name) for name in names))[self._axes]
+        ]
 
 
 def _heard(drives: BusDrives, axes: list[int]) -> list[Any]:
