@@ -83,7 +83,7 @@ def identified(num_machines, seed, how=identify):
 
 
 def test_a_vertical_axis_does_not_fall_while_it_is_identified():
-    """It fell by 50 turns: braking it fed 1.2 times as much into the link as that holds."""
+    """It fell by 50 turns: the quick way to where its moves begin, downwards, fed back more than the link holds."""
     target, (found,) = identified(1, GUARD_SEED)
     with target:
         assert found.estimates["inertia"].value == pytest.approx(truth(target.drives, 0, 0.0)["inertia"], rel=0.1)
