@@ -442,7 +442,8 @@ def test_gains_that_shake_at_rest_are_eased_until_they_do_not(monkeypatch, tmp_p
 @pytest.mark.parametrize(("late", "told"), [(0, False), (7, True)])
 def test_syncs_that_were_late_are_told(late, told):
     """A busy computer tears holes into set-points and samples: whoever reads a certificate of such a run must know."""
-    drives = SimpleNamespace(time_waits=False, bus=SimpleNamespace(total_timing=Timing(9000, late, 0.0031)))
+    bus = SimpleNamespace(total_timing=Timing(9000, late, 0.0031))
+    drives = SimpleNamespace(time_waits=False, bus=bus, observers=())
     reservations = []
     tell_of_lateness(SimpleNamespace(
         target=SimpleNamespace(drives=drives, num_axes=1), reserve=lambda where, text: reservations.append(text)

@@ -437,7 +437,9 @@ def test_monitor_shows_values_and_state(run):
     assert "switch on disabled" in out
     lines = run("monitor", "6041", "6064", "--json", "--duration", 0.1, "--period", 0.02)[1].splitlines()
     assert len(lines) >= 2
-    assert set(json.loads(lines[0])) == {"t", "6041:00", "6064:00", "emergencies"}
+    first = json.loads(lines[0])
+    assert set(first) == {"t", "6041:00", "6064:00", "emergencies", "current at its limit at rest"}
+    assert first["current at its limit at rest"] == [False]
 
 
 def test_scope_writes_a_table_and_a_picture(run, tmp_path):

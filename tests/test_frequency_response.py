@@ -10,7 +10,7 @@ from test_parity import served
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
-from drive_env.gains import BASELINE_RULE, rule_gains, write_gains
+from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, write_gains
 from drive_env.motors import find_motor
 from tuning.identify.true_plant import true_plant
 from tuning.response import excitation_run
@@ -372,13 +372,27 @@ def test_a_loop_without_gains_is_not_shaken():
     assert response.trusted[:, 1].any()
 
 
+def test_a_loop_that_oscillates_is_told_with_its_frequency():
+    """Its true gain margin is -2.4 dB at 243 Hz, by the linear model of what it is; it said "excitation too weak"."""
+    with emulated(load="two_mass", randomise=True, seed=1, num_threads=1) as target:
+        f = np.geomspace(2.0, 2000.0, 20_000)
+        L = velocity_open_loop(target.device, true_plant(target.drives), read_gains(target.drives)[0], f)
+        crossing = f[np.flatnonzero(np.diff(np.unwrap(np.angle(L)) < -math.pi))[0]]
+        assert 20.0 * math.log10(abs(L[np.searchsorted(f, crossing)])) > 2.0, "it is unstable"
+        note = " ".join(measure(target).notes[0])
+    told = re.search(r"the loop oscillates at (\d+) Hz", note)
+    assert told is not None, note
+    assert float(told[1]) == pytest.approx(crossing, rel=0.05)
+    assert "too weak" not in note
+
+
 def test_a_loop_that_oscillates_is_no_response():
     target = emulated(load="two_mass")
     write_gains(target.drives, np.full((1, 5), 32767))
     response = measure(target)
     assert not response.trusted.any()
-    assert any("oscillates" in note for note in response.notes[0])
-    assert any("excitation too weak" in note for note in response.notes[0])
+    assert any("the loop oscillates at 2" in note for note in response.notes[0])  # 227 Hz
+    assert not any("too weak" in note for note in response.notes[0])
     assert math.isnan(response.margins().phase_deg)
 
 

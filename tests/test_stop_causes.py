@@ -7,16 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from drive_env import motion
 from drive_env.drives.emergency import EmergencyMessage
 from tuning.identify.identification import identify
 from tuning.response.frequency_response import measure
-from tuning.stop_causes import stop_causes
-from tuning.target import emulated
+from tuning.stop_causes import UNTOLD, stop_causes
+from tuning.target import emulated, timed
 
 
 def drives_that_told(*messages):
     told = [EmergencyMessage(axis, code, 0, (0,) * 5, name) for axis, code, name in messages]
-    return SimpleNamespace(num_axes=2, emergencies=lambda: told)
+    return SimpleNamespace(num_axes=2, emergencies=lambda: told, observers=())
 
 
 def test_each_axis_has_its_causes_once_and_in_their_order():
@@ -26,6 +27,31 @@ def test_each_axis_has_its_causes_once_and_in_their_order():
         "no emergency message with the cause was received",
         "Over voltage (3210h), Following error (8611h)",
     ]
+
+
+def test_a_cause_is_remembered_for_as_long_as_the_axis_is_in_fault():
+    """An emergency can be read but once, and a tuner asks in several places."""
+    with emulated(load="inertia", num_machines=2, num_threads=1) as target, timed(target) as (watched, _):
+        drives = watched.drives
+        motion.enable(drives, "csv")
+        drives.machine.fault("supply_surge", duration=0.1, where=np.array([True, False]))
+        drives.advance(0.1)
+        told = ["overvoltage (3210h)", UNTOLD]
+        assert stop_causes(drives) == told
+        assert stop_causes(drives) == told
+        drives.advance(1.0)
+        motion.reset_fault(drives)
+        assert stop_causes(drives) == [UNTOLD, UNTOLD]
+
+
+def test_every_figure_of_an_identification_that_a_fault_ended_names_the_emergency():
+    """Each said that no emergency message was received: it had been read before the second moves."""
+    with emulated(load="inertia", num_threads=1) as target:
+        target.drives.machine.fault("supply_surge", at=3.0, duration=0.1)  # in the first moves
+        found = identify(target)[0]
+    unknown = {name: one.reason for name, one in found.estimates.items() if not one.is_known}
+    assert {"inertia", "coulomb", "viscous", "resonance", "velocity_filter"} <= unknown.keys()
+    assert all("overvoltage (3210h)" in reason for reason in unknown.values()), unknown
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
-from drive_env.trials.oscillation import OSCILLATION
+from drive_env.trials.oscillation import OSCILLATION, strongest_frequency
 from drive_env.trials.positioning import WATCH
 
 Floats = NDArray[np.float64]
@@ -46,6 +46,7 @@ class OscillationWatch(Observer):
     Attributes:
         limit: As given; it may be lowered.
         swung: Axes that oscillated and were switched off, shape (num_axes,).
+        frequency: At which each did so last [Hz], to 40 Hz; nan before, shape (num_axes,).
 
     What lets time pass raises OscillationError once all of them have.
     """
@@ -60,6 +61,7 @@ class OscillationWatch(Observer):
         self._shaken: Floats | None = None  # most current meanwhile [A RMS]
         self._window: list[Floats] = []  # currents since the last look, the one before it among them
         self.swung: Mask = np.zeros(len(where), bool)
+        self.frequency: Floats = np.full(len(where), np.nan)
 
     def patience(self) -> int:
         """Return the cycles until the window is full."""
@@ -125,6 +127,7 @@ class OscillationWatch(Observer):
         if late.any():
             below.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=late)
             self.swung |= late
+            self.frequency = np.where(late, strongest_frequency(window)[0], self.frequency)
             if self.swung[self._where].all():
                 raise OscillationError("all axes oscillate, and were switched off")
 

@@ -23,6 +23,8 @@ from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.drives.speeds import per_increment
+from tuning.lateness import Punctuality, late_first
+from tuning.stop_causes import ToldCauses
 
 if TYPE_CHECKING:
     from drive_env import EmulatedDrives
@@ -371,9 +373,18 @@ def check_coupling(axes: str) -> None:
 
 @contextmanager
 def timed(target: Target) -> Iterator[tuple[Target, DriveTime]]:
-    """Give the target with drives whose passing time is counted, and the clock that counts it."""
+    """Give the target with drives whose time, emergencies and SYNCs are kept in mind, and the clock of the time.
+
+    An error of the envelope or of a motion names late SYNCs before its own reason.
+    """
     clock = DriveTime()
-    yield replace(target, drives=ObservedDrives(target.drives, clock)), clock
+    drives = ObservedDrives(target.drives, clock, ToldCauses(target.num_axes), Punctuality(target.drives))
+    try:
+        yield replace(target, drives=drives), clock
+    except (RuntimeError, TimeoutError) as error:  # the envelope's, and those of motion
+        if error.args and isinstance(error.args[0], str):
+            error.args = (late_first(drives, error.args[0]), *error.args[1:])
+        raise
 
 
 class DriveTime(Observer):
@@ -447,17 +458,3 @@ def hold_to_travel(target: Target) -> None:
     speed = np.ceil(slack_of_speed * target.motor.rated_speed * target.speed_counts())
     assert drives.safety is not None, "drives of a bus are opened with an envelope"
     drives.safety.change(Limits(position=(low.tolist(), high.tolist()), velocity=speed.tolist()))
-
-
-def told_lateness(drives: Drives) -> str:
-    """Return what to say of SYNCs of a bus in real time that were late, which distorts moves and responses; or ""."""
-    if drives.time_waits or drives.bus is None:
-        return ""
-    timing = drives.bus.total_timing
-    if not timing.late:
-        return ""
-    return (
-        f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {1e3 * timing.worst:.1f} "
-        "ms: this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
-        "`chrt -f 10` before the command (Linux)"
-    )

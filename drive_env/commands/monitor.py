@@ -29,6 +29,7 @@ from drive_env.commands.options import (
     scales_of,
 )
 from drive_env.commands.tables import Column, tables
+from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -57,7 +58,8 @@ def monitor(
 ) -> None:
     """Show objects in a table that refreshes, with emergencies as they come; it only reads, over SDO.
 
-    With --json a line for each reading.
+    An axis that stands with its current at its limit for half a second (blocked, against a stop, or its encoder is
+    stuck) is named, too. With --json a line for each reading.
     """
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():
@@ -67,12 +69,13 @@ def monitor(
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
             axes = axes_of_nodes(drives, axis)
+            watch = _Pushing(drives, axes)
             end = time.monotonic() + (float("inf") if duration is None else duration)
             try:
                 if json:
-                    _lines(drives, axes, entries, period, end)
+                    _lines(drives, axes, entries, watch, period, end)
                 else:
-                    _table(drives, axes, entries, period, end)
+                    _table(drives, axes, entries, watch, period, end)
             except KeyboardInterrupt:
                 pass  # the usual end
 
@@ -81,26 +84,59 @@ def _look(drives: BusDrives, axes: list[int], entries: list[Any]) -> dict[Any, A
     return {entry: [drives.read_axis(entry, axis) for axis in axes] for entry in entries}
 
 
+class _Pushing:
+    """Axes whose current is at its limit while they stand, by readings of their own.
+
+    Args:
+        drives: The drives.
+        axes: Which are looked at.
+    """
+
+    def __init__(self, drives: BusDrives, axes: list[int]) -> None:
+        from drive_env.drives.limit_at_rest import LimitAtRest
+
+        self._drives, self._axes = drives, axes
+        self._watch = LimitAtRest(drives)
+
+    def look(self) -> list[bool]:
+        """Return which of the axes do now, as they are listed."""
+        if not self._watch.is_known:
+            return [False] * len(self._axes)
+        names: tuple[int | Role, ...] = (
+            cia402.STATUSWORD,
+            cia402.TORQUE_ACTUAL,
+            cia402.VELOCITY_ACTUAL,
+            Role.CURRENT_LIMIT,
+        )
+        return [
+            bool(x)
+            for x in self._watch.look(time.monotonic(), *(self._drives.read(name) for name in names))[self._axes]
+        ]
+
+
 def _heard(drives: BusDrives, axes: list[int]) -> list[Any]:
     """Return the emergencies of these axes, of all of a node those that tell none."""
     return [message for message in drives.emergencies() if message.axis in axes]
 
 
-def _lines(drives: BusDrives, axes: list[int], entries: list[Any], period: float, end: float) -> None:
+def _lines(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushing, period: float, end: float) -> None:
     start = time.monotonic()
     while True:
         values = _look(drives, axes, entries)
         row: dict[str, Any] = {"t": round(time.monotonic() - start, 3)}
         row |= {f"{e.index:04X}:{e.sub:02X}": list(values[e]) for e in entries}
         row["emergencies"] = [message._asdict() for message in _heard(drives, axes)]
+        row["current at its limit at rest"] = watch.look()
         print_json(row)
         if time.monotonic() + period > end:
             return
         time.sleep(period)
 
 
-def _table(drives: BusDrives, axes: list[int], entries: list[Any], period: float, end: float) -> None:
+def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushing, period: float, end: float) -> None:
     from rich.live import Live
+
+    from drive_env.drives.limit_at_rest import REMEDY
 
     scales = scales_of(drives)
     emergencies: list[str] = []
@@ -109,8 +145,14 @@ def _table(drives: BusDrives, axes: list[int], entries: list[Any], period: float
             for message in _heard(drives, axes):
                 when = time.strftime("%H:%M:%S")
                 emergencies.append(f"{when}  {axis_name(drives, message.axis)}: {message.code:04X}h {message.name}")
+            pushing = [
+                f"{axis_name(drives, axis)}: its current is at its limit, and it stands: {REMEDY}"
+                for axis, pushes in zip(axes, watch.look(), strict=True)
+                if pushes
+            ]
+            told = emergencies[-5:] + pushing
             live.update(
-                _draw(drives, axes, _look(drives, axes, entries), scales, emergencies[-5:], live.console.width),
+                _draw(drives, axes, _look(drives, axes, entries), scales, told, live.console.width),
                 refresh=True,
             )
             if time.monotonic() + period > end:
@@ -123,7 +165,7 @@ def _draw(
     axes: list[int],
     values: dict[Any, Any],
     scales: list[Scale],
-    emergencies: list[str],
+    told: list[str],
     width: int,
 ) -> Any:
     from rich.console import Group
@@ -145,4 +187,4 @@ def _draw(
             else:
                 cells.append(show(int(value), entry, scales[axis]))
         rows.append((entry.label, *cells))
-    return Group(*tables(columns, rows, width), *map(Text, emergencies))
+    return Group(*tables(columns, rows, width), *map(Text, told))

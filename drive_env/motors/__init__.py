@@ -92,8 +92,12 @@ class Motor(NamedTuple):
     @property
     def thermal_resistance(self) -> float:
         """Winding to ambient [K/W]: the rated current warms the winding, then of higher resistance, by `RATED_RISE`."""
-        hot = self.R_s * (1.0 + COPPER * RATED_RISE)
-        return RATED_RISE / (self._phase_factor * hot * self.rated_current**2)
+        return RATED_RISE / ((1.0 + COPPER * RATED_RISE) * self.copper_resistance * self.rated_current**2)
+
+    @property
+    def copper_resistance(self) -> float:
+        """What the winding loses at 25 degC over the square of its peak current [ohm]."""
+        return self._phase_factor * self.R_s
 
     @property
     def _phase_factor(self) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 OSCILLATION = 0.4
+NEAR = 10.0  # Hz
 
 
 def shakes(current: NDArray[np.floating], rated_current: float) -> NDArray[np.bool_]:
@@ -21,3 +22,18 @@ def shakes(current: NDArray[np.floating], rated_current: float) -> NDArray[np.bo
     """
     change = np.diff(current, axis=0)
     return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated_current)
+
+
+def strongest_frequency(current: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return at which frequency each axis' current swings most [Hz], and the share of its power within 10 Hz of that.
+
+    To 1 over the samples' duration; what swings faster than 500 Hz is seen below it.
+
+    Args:
+        current: Torque-producing current, a sample per millisecond [A], shape (n, axes).
+    """
+    power = np.abs(np.fft.rfft(current - current.mean(axis=0), axis=0)) ** 2
+    f = np.fft.rfftfreq(len(current), 0.001)
+    found = f[power.argmax(axis=0)]
+    near = np.abs(f[:, None] - found) <= NEAR
+    return found, np.asarray((power * near).sum(axis=0) / np.maximum(power.sum(axis=0), np.finfo(float).tiny))

@@ -16,7 +16,7 @@ from drive_env import cia402
 from drive_env.gains import read_gains
 from drive_env.trials.positioning import longer_way, wrapped
 from tuning.identify.wiring import Key, write_wiring
-from tuning.stop_causes import UNTOLD, stop_causes
+from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
     from tuning.auto.proving import ProvingGround
@@ -151,9 +151,6 @@ class AutoBench:
         drives = self.target.drives
         faulted = self.going & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         causes = stop_causes(drives)
-        if self.ground is not None:  # which has read those of its last trial
-            both = zip(causes, self.ground.causes, strict=True)
-            causes = [before if cause == UNTOLD else cause for cause, before in both]
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
 
     def drop_faults(self, meanwhile: str) -> None:

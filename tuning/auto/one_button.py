@@ -28,9 +28,10 @@ from tuning.auto.settings import begin, commission, write
 from tuning.auto.stages import Basis, RecordedGains, TriedGains
 from tuning.auto.trials import prove
 from tuning.identify.quick_identification import identify_briefly
+from tuning.lateness import told_lateness
 from tuning.outcome import Outcome
 from tuning.snapshot import Transaction, can_store
-from tuning.target import timed, told_lateness
+from tuning.target import timed
 
 if TYPE_CHECKING:
     from tuning.auto.result import Result

@@ -182,7 +182,6 @@ class ProvingGround:
         self._origin = drives.read(cia402.POSITION_ACTUAL)
         self._direction = np.ones(target.num_axes, np.int64)
         self._shaken = np.zeros(target.num_axes, bool)
-        self.causes = [UNTOLD] * target.num_axes  # emergencies of each axis in the last trial
         self.moves = np.zeros(target.num_axes, np.int64)
         self.aborts = np.zeros(target.num_axes, np.int64)
         self.violations = np.zeros(target.num_axes, np.int64)
@@ -470,7 +469,7 @@ class ProvingGround:
         # What a heavier load makes of gains costs, and is no reason against them on this one.
         aborted = tried.aborted[: len(PHASES)]
         stopped: Mask = np.asarray(aborted.any(axis=0))
-        self.causes = stop_causes(self.target.drives)
+        causes = stop_causes(self.target.drives)
         self.aborts[where & tried.aborted.any(axis=0)] += 1
         self._shaken |= where & tried.aborted.any(axis=0)
         overshoot = terms.overshoot[:2].max(axis=0)
@@ -483,7 +482,7 @@ class ProvingGround:
             costs,
             stopped,
             tried.culprit,
-            self._reasons(aborted, overshoot, left, self.causes),
+            self._reasons(aborted, overshoot, left, causes),
             terms.noise[: len(PHASES)].max(axis=0),
             overshoot,
             terms.settling[:2].mean(axis=0),

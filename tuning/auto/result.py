@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.certificate.certificate import verdict
+from tuning.lateness import late_first
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
@@ -108,9 +109,10 @@ def collect(
     identified, axes = basis.identified, []
     for k, journal in enumerate(bench.journals):
         gains = bench.before[k] if journal.reason else recorded.gains[k]
+        reason = late_first(bench.target.drives, journal.reason)
         axes.append(
             AxisResult(
-                tuple(map(int, bench.before[k])), tuple(map(int, gains)), journal.reason, tuple(journal.reservations),
+                tuple(map(int, bench.before[k])), tuple(map(int, gains)), reason, tuple(journal.reservations),
                 tuple(journal.notes), identified.found[k], identified.plants[k], float(recorded.cost[k]),
                 float(recorded.proof[k]), verdict.verified[k], verdict.margins[k], verdict.at_least[k],
                 int(recorded.eased[k]), bool(recorded.kept[k]),

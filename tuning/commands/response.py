@@ -85,9 +85,10 @@ def response(
             _print(measured, numbers, out)
             tell_before(file)
         if measured.trusted.mean(axis=0).min() < FEWEST:
-            slow = "; or this computer or the emulator is too slow for real time: serve the emulator with --lockstep"
-            late = slow * (drive.bus and not drive.lockstep)
-            fail(f"less than a tenth of an axis's frequencies are coherent: the excitation was too weak{late}", REFUSED)
+            worst = int(measured.trusted.mean(axis=0).argmin())
+            # What has been seen comes before what may be.
+            why = "; ".join(measured.notes[worst]) or "the excitation was too weak"
+            fail(f"less than a tenth of an axis's frequencies are coherent: {why}", REFUSED)
 
 
 def _axes(measured: MeasuredLoop) -> range:

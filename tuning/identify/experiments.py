@@ -36,6 +36,7 @@ from tuning.identify.working_state import (
     still_enabled,
     working_state,
 )
+from tuning.lateness import is_distorted, late_first, told_lateness
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken, watch_of
 from tuning.response.frequency_response import Signal, measure
 from tuning.stop_causes import stop_causes
@@ -58,6 +59,7 @@ UNITS = {
     "loop_delay": "s", "velocity_filter": "Hz",
 }  # fmt: skip
 MECHANICS, RESPONSE = NAMES[NAMES.index("inertia") :], NAMES[NAMES.index("anti_resonance") :]
+SAYS_NOTHING = "so the check of pole pairs and encoder says nothing, and torque is not commanded"
 OSCILLATED = "the axis oscillated"  # how the reason begins where one did
 
 
@@ -75,6 +77,7 @@ class Experiments:
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         check_linear_model(target.device)  # what is moved with here comes from it
         self.target, self.where, self.progress = target, where, progress
+        self._drives = target.drives
         self._at_rest: list[Estimate] = []  # resistances, where they are looked for
         self._under_way: tuple[str, tuple[str, ...]] = ("", NAMES)
         self.found: list[dict[str, Estimate]] = [
@@ -87,6 +90,7 @@ class Experiments:
         """Do them all."""
         with timed(self.target) as (target, clock):
             noise = target.device.stage["adc_noise"].high
+            self._drives = target.drives
             watch = OscillationWatch(self.where, np.full(target.num_axes, target.current), noise)
             watched = ObservedDrives(target.drives, watch)
             with working_state(replace(target, drives=watched), self.where) as working:
@@ -112,12 +116,13 @@ class Experiments:
         swung = working.where & (np.zeros_like(working.where) if watch is None else watch.swung)
         what, names = self._under_way
         for k in np.flatnonzero(swung):
+            assert watch is not None, "it saw them"
             for name in names:
                 before = self.found[k][name]
                 if not before.is_known and not before.reason.startswith(OSCILLATED):
                     self.found[k][name] = refused(UNITS[name], (
-                        f"{OSCILLATED} ({what}) and was switched off within 50 ms: check whether this is the right "
-                        "motor, and whether current and inertia fit its data sheet"
+                        f"{OSCILLATED} at about {watch.frequency[k]:.0f} Hz ({what}) and was switched off within 50 "
+                        "ms: check whether this is the right motor, and whether current and inertia fit its data sheet"
                     ))  # fmt: skip
         return replace(working, where=working.where & ~swung)
 
@@ -130,6 +135,11 @@ class Experiments:
             check = checks[k]
             self.found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
             reason = self._wrong(working, int(k), check)
+            if reason and is_distorted(self._drives):
+                # It turned the field by more than was asked for: what it blames, wiring or motor, may be right.
+                reason = f"{told_lateness(self._drives)}; {SAYS_NOTHING}"
+                self.found[k] |= {name: refused("1", reason) for name in ("pole_pairs", "encoder_direction")}
+                self._wiring[k] = {}
             if reason:
                 good[k] = False
                 self.refuse(int(k), NAMES, reason)
@@ -145,6 +155,7 @@ class Experiments:
             own = {key: int(values[k]) for key, values in has.items()}
             self._wiring[k] = needed(working.target.device, own, checks[k].direction.value, checks[k].halls)
             again[k] = bool(changes(self._wiring[k])) and (self.corrects or working.fresh[k])
+        again &= not is_distorted(self._drives)
         # What its halls aligned when it was first enabled stays so until it is switched off.
         again &= ~_aligned_by_halls(working)
         if not again.any():
@@ -313,8 +324,12 @@ class Experiments:
             )
         return np.array(rows, np.int64)
 
+    def _late_first(self, reason: str) -> str:
+        return late_first(self._drives, reason)
+
     def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
-        """Refuse what has no value yet."""
+        """Refuse what has no value yet, by a reason or by late SYNCs."""
+        reason = self._late_first(reason)
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
                 self.found[k][name] = refused(UNITS[name], reason)

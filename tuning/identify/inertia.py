@@ -11,6 +11,7 @@ proportion to what it carries cancels: half of the time it brakes, half of the t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,6 +27,8 @@ from drive_env.gains import as_chip, write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
+from tuning.lateness import late_first
+from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import SOFTER, OscillationError, watch_of
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
@@ -35,7 +38,8 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MOST_RATIO = 30.0  # over the rotor's: beyond, a cautious excitation hardly moves the load (Yaskawa: 15 to 30)
-SPEED_SHARE, CURRENT_SHARE, ROOM_SHARE, LINK_SHARE = 0.7, 0.5, 0.75, 0.6  # of the limits
+SPEED_SHARE, CURRENT_SHARE, ROOM_SHARE = 0.7, 0.5, 0.75  # of the limits
+SLOWER = 0.9  # by which moves are made slower in turn that would overcharge the DC link
 SHARES = (1.0, 0.65, 0.35)  # of the greatest speed, in turn
 COARSE, FINE = (1, (0.6, 0.3)), (2, SHARES)  # how often, at which shares of the greatest speed
 RAMP, CRUISE = (30, 250), (60, 140)  # cycles, shortest and longest
@@ -62,6 +66,17 @@ class Mechanics(NamedTuple):
     offset: Estimate
 
 
+class Rough(NamedTuple):
+    """What moves say of one axis however rough they are, for the next ones.
+
+    Inertia [kg*m^2], current that holds the axis [A], and what dry friction takes of it in motion at least [A].
+    """
+
+    inertia: float
+    holding: float
+    friction: float
+
+
 @dataclass(frozen=True)
 class Plan:
     """Moves of every axis: set-points of speed [rad/s], shape (rows, num_axes), and the cruises of each."""
@@ -71,14 +86,16 @@ class Plan:
 
 
 def plan_moves(
-    working: Working, inertia: Floats, holding: Floats, times: int, shares: tuple[float, ...], linked: bool = False
-) -> Plan:
+    working: Working, inertia: Floats, holding: Floats, friction: Floats, times: int, shares: tuple[float, ...],
+    linked: bool = False,
+) -> Plan:  # fmt: skip
     """Return moves that stay inside the axes' travel, speed and current, and do not overcharge the DC link.
 
     Args:
         working: The drives.
         inertia: Total inertia as far as it is known [kg*m^2], shape (num_axes,).
         holding: Current that holds the axis [A], shape (num_axes,).
+        friction: Current that dry friction takes at least [A], shape (num_axes,).
         times: How often each speed comes.
         shares: Speeds over the greatest.
         linked: Whether the axes of a machine move as one: by what all of them can.
@@ -88,42 +105,81 @@ def plan_moves(
     if linked:
         down, up = _of_machines(target, down, np.max), _of_machines(target, up, np.min)
         inertia, holding = _of_machines(target, inertia, np.max), _of_machines(target, np.abs(holding), np.max)
+        friction = _of_machines(target, friction, np.min)
     columns, cruises = [], []
+    held = link_energy(target)
     for k in range(target.num_axes):
-        # To one side first where there is little room, and then over the whole of it.
-        sign = 1.0 if up[k] >= -down[k] else -1.0
-        longer, shorter = ROOM_SHARE * max(up[k], -down[k]), ROOM_SHARE * min(up[k], -down[k])
         spare = CURRENT_SHARE * max(working.current[k] - abs(holding[k]), 0.1 * working.current[k])
-        acceleration = spare * target.motor.torque_constant / inertia[k]
-        limit = min(SPEED_SHARE * target.speed, _link_speed(working, k, float(inertia[k])))
-        cruise, speed = _fastest(acceleration, longer, limit)
-        first = 0.0
-        if speed < limit and shorter > 0.0 and np.isfinite(longer + shorter):
-            first = -sign * shorter
-            cruise, speed = _fastest(acceleration, longer + shorter, limit)
-        rows = [np.zeros(STILL), _bump(first)]
-        marks: list[tuple[int, int, int]] = []
-        number = 0
-        for _ in range(times):
-            for share in shares:
-                w = sign * share * speed
-                ramp = _ramp(w, acceleration)
-                at = sum(map(len, rows))
-                rise, level = _rise(ramp), np.ones(cruise)
-                parts = [rise, level, 1.0 - 2.0 * _rise(2 * ramp), -level, rise - 1.0]
-                rows += [w * part for part in parts]
-                marks.append((at + ramp, at + ramp + cruise, number))
-                second = at + 3 * ramp + cruise
-                marks.append((second, second + cruise, number))
-                number += 1
-        rows.append(_bump(-first))
-        columns.append(np.concatenate(rows))
-        cruises.append(tuple(marks))
+        acceleration = float(spare * target.motor.torque_constant / inertia[k])
+
+        def fits(speed: Floats) -> bool:
+            most = fed_back(target.motor, speed[:, None], CYCLE, inertia[k], holding[k], friction[k])  # noqa: B023
+            return bool(most[0] <= LINK_SHARE * held[k])  # noqa: B023
+
+        limit = SPEED_SHARE * target.speed
+        column, marks = _moves(float(down[k]), float(up[k]), acceleration, limit, times, shares, fits)
+        columns.append(column)
+        cruises.append(marks)
     longest = max(map(len, columns))
     speed_rows = np.zeros((longest + STILL, target.num_axes))
     for k, column in enumerate(columns):
         speed_rows[: len(column), k] = column
     return Plan(speed_rows, tuple(cruises))
+
+
+def _moves(
+    down: float, up: float, acceleration: float, limit: float, times: int, shares: tuple[float, ...],
+    fits: Callable[[Floats], bool],
+) -> tuple[Floats, tuple[tuple[int, int, int], ...]]:  # fmt: skip
+    """Return one axis' set-points of speed [rad/s] and its cruises.
+
+    Args:
+        down: How far it may turn backwards [rad], 0 or less.
+        up: How far forwards.
+        acceleration: The steepest [rad/s^2].
+        limit: Of its speed [rad/s].
+        times: How often each speed comes.
+        shares: Speeds over the greatest.
+        fits: Whether the DC link bears a move.
+    """
+    # To one side first where there is little room, and then over the whole of it.
+    sign = 1.0 if up >= -down else -1.0
+    longer, shorter = ROOM_SHARE * max(up, -down), ROOM_SHARE * min(up, -down)
+    longest, speed = _fastest(acceleration, longer, limit)
+    first = 0.0
+    if speed < limit and shorter > 0.0 and np.isfinite(longer + shorter):
+        first = -sign * shorter
+        if fits(_bump(first)):
+            longest, speed = _fastest(acceleration, longer + shorter, limit)
+        else:
+            first = 0.0
+    while not fits(_there_and_back(speed, _ramp(speed, acceleration), CRUISE[0])):
+        speed *= SLOWER
+    rows = [np.zeros(STILL), _bump(first)]
+    marks: list[tuple[int, int, int]] = []
+    number = 0
+    for share in shares:
+        w = share * speed
+        ramp = _ramp(w, acceleration)
+        # A weight feeds back as long as it goes down: better a short cruise at a high speed, and more of them.
+        cruise = longest
+        while cruise > CRUISE[0] and not fits(_there_and_back(w, ramp, cruise)):
+            cruise -= 10
+        for _ in range(round(times * longest / cruise)):
+            at = sum(map(len, rows))
+            rows.append(sign * _there_and_back(w, ramp, cruise))
+            marks.append((at + ramp, at + ramp + cruise, number))
+            second = at + 3 * ramp + cruise
+            marks.append((second, second + cruise, number))
+            number += 1
+    rows.append(_bump(-first))
+    return np.concatenate(rows), tuple(marks)
+
+
+def _there_and_back(speed: float, ramp: int, cruise: int) -> Floats:
+    """Return a move as speeds [rad/s]: up in so many cycles of ramp, a cruise, the same back."""
+    rise, level = _rise(ramp), np.ones(cruise)
+    return speed * np.concatenate([rise, level, 1.0 - 2.0 * _rise(2 * ramp), -level, rise - 1.0])
 
 
 def _of_machines(target: Target, values: Floats, choose: Callable[..., Floats]) -> Floats:
@@ -149,13 +205,6 @@ def _bump(way: float) -> Floats:
 def _ramp(speed: float, acceleration: float) -> int:
     """Return how many cycles a smooth ramp takes: in its middle it is pi/2 times as steep as on the whole."""
     return int(np.clip(np.ceil(0.5 * np.pi * abs(speed) / acceleration / CYCLE), *RAMP))
-
-
-def _link_speed(working: Working, k: int, inertia: float) -> float:
-    """Return the speed whose energy the DC link can take when the axis brakes [rad/s]: a supply may not sink."""
-    device, supply = working.target.device, float(working.target.supply[k])
-    charge = 0.5 * device.stage["dc_capacitance"].low * max(device.overvoltage**2 - supply**2, 1.0)
-    return float(np.sqrt(2.0 * LINK_SHARE * charge / inertia))
 
 
 def _fastest(acceleration: float, way: float, limit: float) -> tuple[int, float]:
@@ -246,21 +295,25 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
     target = working.target
     results: list[Mechanics] = []
     softness = np.ones(target.num_axes, np.int64)
+    friction, holding = np.zeros(target.num_axes), holding.copy()
     for times, shares in (COARSE, FINE):
 
         def plan() -> Plan:
-            return plan_moves(working, inertia, holding, times, shares, linked)  # noqa: B023
+            return plan_moves(working, inertia, holding, friction, times, shares, linked)  # noqa: B023
 
         moves, angle, current, alive, gains = _moved(working, plan, cautious_gains(target, inertia), softness)
         results = []
         causes = [] if alive.all() else stop_causes(target.drives)
         for k in range(target.num_axes):
             if not alive[k]:
-                results.append(_none(f"the drive switched off during the moves: {causes[k]}"))
+                why = f"the drive switched off during the moves: {causes[k]}"
+                results.append(_none(late_first(target.drives, why)))
                 continue
             found, rough = _balance(working, k, angle[:, k], current[:, k], moves, gains[k])
             results.append(found)
-            inertia[k] = np.clip(rough, 0.7 * target.motor.inertia, 2.0 * MOST_RATIO * target.motor.inertia)
+            # At rest dry friction holds what it likes up to its own; in motion it is known what it takes.
+            holding[k], friction[k] = rough.holding, rough.friction
+            inertia[k] = np.clip(rough.inertia, 0.7 * target.motor.inertia, 2.0 * MOST_RATIO * target.motor.inertia)
     return results
 
 
@@ -336,8 +389,8 @@ def hidden_ripple(target: Target, k: int, gains: Integers, inertia: float) -> fl
 
 def _balance(
     working: Working, k: int, angle: Floats, current: Floats, plan: Plan, gains: Integers
-) -> tuple[Mechanics, float]:
-    """Return the estimates of one axis, and its inertia however rough [kg*m^2]."""
+) -> tuple[Mechanics, Rough]:
+    """Return the estimates of one axis, and what is known of it however rough."""
     target = working.target
     motor, K = target.motor, target.motor.torque_constant
     cruises = plan.cruises[k]
@@ -346,6 +399,9 @@ def _balance(
     fit = _fit(columns, charge, duration, moves)
     J = float(fit.mean[0] * K)
     J *= hidden_ripple(target, k, gains, max(J, 0.5 * motor.inertia))
+    t = t_quantile(fit.freedom)
+    offset, spread = float(fit.mean[3]), t * float(fit.spread[3])
+    rough = Rough(J, offset + math.copysign(spread, offset), max(float(fit.mean[1] - t * fit.spread[1]), 0.0))
     down, up = working.room()
     too_short = max(up[k], -down[k]) < np.pi
     why = "travel too short" if too_short else "excitation too weak"
@@ -354,8 +410,7 @@ def _balance(
             f"{why}: a move passes {passed:.0f} counts of the encoder, and {LEAST_COUNTS:.0f} are needed; allow more "
             f"{'travel' if too_short else 'current'} than {max(up[k], -down[k]):.2g} rad and {working.current[k]:.2g} A"
         )
-        return _none(reason), J
-    t = t_quantile(fit.freedom)
+        return _none(reason), rough
     scale = float(np.hypot(gain_error(target.device, motor), TORQUE_MODEL))
     half = t * fit.spread
     if MOST_RATIO * motor.inertia < J:
@@ -371,8 +426,8 @@ def _balance(
     viscous = _friction(float(fit.mean[2]), float(half[2]), float(np.hypot(scale, VISCOUS_MODEL)), "A*s/rad", why)
     # Offsets of the sensors turn with the field and average out; those of a brushed motor's one channel do not.
     sensor = 0.95 * abs(target.device.stage["adc_offset_a"].high) if motor.kind == "dc" else 0.0
-    offset = interval(float(fit.mean[3]), float(half[3]), scale, "A", sensor)
-    return Mechanics(inertia, coulomb, viscous, offset), J
+    holding = interval(float(fit.mean[3]), float(half[3]), scale, "A", sensor)
+    return Mechanics(inertia, coulomb, viscous, holding), rough
 
 
 def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:

@@ -24,6 +24,7 @@ from drive_env.drives.speeds import per_increment
 from drive_env.gains import bandwidth_gains, write_gains
 from drive_env.motors import Motor
 from tuning.identify.wiring import FINDINGS
+from tuning.stop_causes import told_causes
 from tuning.target import Target
 
 if TYPE_CHECKING:
@@ -215,7 +216,7 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
     except (TimeoutError, RuntimeError) as error:
-        causes = ", ".join(sorted({message.name for message in drives.emergencies()}))
+        causes = ", ".join(sorted({told for told in told_causes(drives) if told}))
         raise RuntimeError(f"{error}{f' ({causes})' if causes else ''}") from error
 
 

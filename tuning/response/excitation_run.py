@@ -124,7 +124,7 @@ class Shaker:
             periods: Of the excitation in each pass.
             traced: Record at the velocity loop's rate as well; on emulated drives only.
         """
-        steady, inside = self._steady(speed, passes, periods)
+        steady, inside = self.steady(speed, passes, periods)
         turning = np.any(np.diff(steady, axis=0, prepend=0.0) != 0.0, axis=1)
         omega = 2.0 * math.pi * self._lines.f[:, None]
         sized = amplitude if self._loop == "velocity" else amplitude / omega
@@ -162,7 +162,12 @@ class Shaker:
             enabled,
         )
 
-    def _steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, NDArray[np.bool_]]:
+    def hold(self) -> Floats:
+        """Return what holds the axes at rest [A], shape (axes,)."""
+        trace = self._drives.record([cia402.TORQUE_ACTUAL], 2 * REST * CYCLE)
+        return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
+
+    def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the steady velocity of every cycle, (cycles, axes), and which cycles are looked at."""
         rows, inside, before = [], [], np.zeros_like(speed)
         long = SETTLING + periods * self._lines.samples

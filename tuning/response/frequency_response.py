@@ -15,11 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.gains import check_linear_model, read_gains
 from drive_env.safety.envelope import swinging_allowed
+from drive_env.trials.oscillation import shakes, strongest_frequency
 from tuning.identify.dead_time import dead_time_resistance
+from tuning.lateness import told_lateness
+from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import OscillationError, shaken, watch_of
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
@@ -59,6 +63,8 @@ CONFIRMING, LESS = 6, 0.5  # passes of one that is confirmed, and the share of i
 TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
 SPEED, CURRENT = 0.45, 0.9
 TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the shaking but an oscillation
+SLOWER, TINY = 0.9, 1e-6  # by which a run is made slower and weaker in turn that would overcharge it; J
+ONE_FREQUENCY = 0.5  # of the power of what an oscillation is, within 10 Hz of its frequency; of noise it is 0.05
 RETURN_SHARE = 0.5  # of the speed from which the DC link holds what a stop gives back
 IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
 TRAVEL = 0.85
@@ -203,12 +209,15 @@ class _Measurement:
                 room = np.where(target.high >= -target.low, target.high, target.low) * TRAVEL
                 sign = np.sign(room)
                 limit = self._current_limit()
-                speed = self._trial_speed(np.abs(room))
+                # At once: friction that has come to rest would make the trial another one.
+                self._holding = counted.drives.read(cia402.TORQUE_ACTUAL) * ampere_per_count(counted.drives)
+                speed = self._trial_speed(shaker, np.abs(room))
                 trial = self._trial(shaker, limit, speed, sign)
+                self._holding = shaker.hold()
                 progress(0.2)
                 rough = transfer(trial.set_point, trial.answer, self._lines)[0]
                 room = np.abs(room) - speed * _duration(1, self._lines)
-                amplitude, speed = self._amplitude(rough, trial, room, limit)
+                amplitude, speed = self._amplitude(shaker, rough, trial, room, limit)
                 shaker.fastest = np.minimum(shaker.fastest, RETURN_SHARE * self._stoppable)
                 less = None
                 with shaken(counted.drives, SWING * limit):
@@ -218,11 +227,15 @@ class _Measurement:
                         less = shaker.run(LESS * amplitude, sign * speed, self._passes, self._periods)
         self._drive_time = clock.seconds + shaker.traced_time
         stopped = where & ~seen.enabled
-        causes = stop_causes(target.drives) if stopped.any() else []
+        self._late = told_lateness(counted.drives)
+        for axis in np.flatnonzero(where) if self._late else ():
+            self._notes[axis].insert(0, self._late)
+        causes = stop_causes(counted.drives) if stopped.any() else []
         for axis in np.flatnonzero(stopped):
             self._notes[axis].append(f"the drive stopped during the measurement: {causes[axis]}")
-        self._note_limits(seen.peak_current, where)
-        result = self._evaluate(seen, less, where & seen.enabled)
+        oscillates = self._note_oscillation(seen, where & seen.enabled)
+        self._note_limits(seen.peak_current, where & ~oscillates)
+        result = self._evaluate(seen, less, where & seen.enabled & ~oscillates)
         progress(1.0)
         return result
 
@@ -249,8 +262,17 @@ class _Measurement:
             self._gains = watch.soften(drives, self._where & watch.swung, self._gains, MODE[self._loop])
         return trial
 
-    def _trial_speed(self, room: Floats) -> Floats:
-        return np.minimum(TRIAL_SPEED * self._target.speed, 0.4 * room / _duration(1, self._lines))
+    def _trial_speed(self, shaker: Shaker, room: Floats) -> Floats:
+        speed = np.minimum(TRIAL_SPEED * self._target.speed, 0.4 * room / _duration(1, self._lines))
+        held = LINK_SHARE * link_energy(self._target)
+        while (over := self._falling(shaker, speed, 1, 1) > held).any():
+            speed = np.where(over, SLOWER * speed, speed)
+        return speed
+
+    def _falling(self, shaker: Shaker, speed: Floats, passes: int, periods: int) -> Floats:
+        """Return what weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
+        steady, _ = shaker.steady(speed, passes, periods)
+        return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding)
 
     def _trial_amplitude(self, speed: Floats, limit: Floats) -> Floats:
         n = len(self._lines.f)
@@ -262,7 +284,9 @@ class _Measurement:
         )
         return np.asarray(np.minimum(by_speed, by_current))
 
-    def _amplitude(self, rough: Complex, trial: Pass, room: Floats, limit: Floats) -> tuple[Floats, Floats]:
+    def _amplitude(
+        self, shaker: Shaker, rough: Complex, trial: Pass, room: Floats, limit: Floats
+    ) -> tuple[Floats, Floats]:
         """Return amplitudes and steady speeds of the run proper by what the trial showed."""
         lines, omega = self._lines, 2.0 * math.pi * self._lines.f[:, None]
         gain, error = _bounded(rough, 1e-3, 10.0), _bounded(1.0 - rough, 0.02, 10.0)
@@ -283,7 +307,8 @@ class _Measurement:
         flowing, shaken = (peak(self._kind, lines, amplitude, answer) for answer in (current, gain))
         tiny = np.finfo(float).tiny
         # A stop gives back J w^2 / 2, and a swing 2 J w dw, which the DC link must hold; losses come on top.
-        energy = self._link_energy() / (self._target.motor.torque_constant / mobility)
+        inertia, held = self._target.motor.torque_constant / mobility, link_energy(self._target)
+        energy = held / inertia
         self._stoppable, returned = np.sqrt(2.0 * energy), np.sqrt(energy / (2.0 * 1.1))
         shares = [
             available / (flowing + tiny), largest / (shaken + tiny), 0.5 * np.maximum(room, 1e-9) / (way + tiny),
@@ -292,17 +317,19 @@ class _Measurement:
         fits = np.min(shares, axis=0)
         amplitude, shaken = amplitude * fits, shaken * fits
         speed = np.minimum(1.1 * shaken, fastest)
+        # A weight that goes down has filled it before the stop.
+        while True:
+            falling = self._falling(shaker, speed, self._passes, self._periods)
+            over = falling > LINK_SHARE * np.maximum(held - 0.5 * inertia * (speed + shaken) ** 2, 0.0) + TINY
+            if not over.any():
+                break
+            amplitude, shaken, speed = (np.where(over, SLOWER * one, one) for one in (amplitude, shaken, speed))
         for axis in np.flatnonzero(self._where & (speed < 0.9 * shaken)):
             why = "its travel is too short" if by_way[axis] <= fastest[axis] else "its limits are too narrow"
             self._notes[axis].append(
                 f"{why} for a steady speed: the motion reversed, so that friction is part of the response"
             )
         return amplitude, speed
-
-    def _link_energy(self) -> Floats:
-        """Return what the DC link takes until the drive cuts its stage [J], by the least capacitance of its class."""
-        device = self._device
-        return np.asarray(0.5 * device.stage["dc_capacitance"].low * (device.overvoltage**2 - self._target.supply**2))
 
     def _current_gain(self) -> Complex:
         """Return demanded current per velocity of the set-point, the loop being open, complex (n, axes)."""
@@ -320,6 +347,22 @@ class _Measurement:
         motor = self._target.motor
         plant = Plant.from_data_sheet(self._device, motor, motor.voltage, motor.inertia)
         return velocity_noise(self._device, plant)
+
+    def _note_oscillation(self, seen: Pass, where: Mask) -> Mask:
+        """Return which axes oscillate: the current has what does not repeat with the excitation."""
+        shape = (self._passes, self._periods, self._lines.samples, len(where))
+        current = seen.current.reshape(shape)
+        own = (current - current.mean(axis=1, keepdims=True)).reshape(self._passes, -1, len(where))
+        found = where & shakes(own.reshape(-1, len(where)), self._target.motor.rated_current)
+        # Of the pass in which it is strongest: at the seam of two the swing has another phase.
+        strongest = own[own.std(axis=1).argmax(axis=0), :, np.arange(len(where))].T
+        frequency, share = strongest_frequency(strongest)
+        found &= share > ONE_FREQUENCY  # noise has all of them
+        for axis in np.flatnonzero(found):
+            told = f"the loop oscillates at {frequency[axis]:.0f} Hz, whatever it is shaken with"
+            also = ", or late SYNCs make its current swing so"
+            self._notes[axis].append(f"{told}{also if self._late else ''}: lower its gains, velocity P first")
+        return np.asarray(found)
 
     def _note_limits(self, peak: Floats, where: Mask) -> None:
         limit = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)

@@ -24,6 +24,7 @@ from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.load_reading import LOWER, STALL_ANGLE, has_coolstep, lacks_load_detection
 from drive_env.trials.open_loop import encoder_age
 from drive_env.trials.working_moves import WorkingMoves
+from tuning.lateness import told_lateness
 from tuning.search.optimise import Settings
 from tuning.search.samplers import load
 from tuning.search.trial_bench import TrialBench
@@ -32,7 +33,7 @@ from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
 from tuning.stepper.load_detection import LoadDetection
 from tuning.stepper.obstacle import REACTION, can_load, prove_with_load, why_not_loaded
 from tuning.stepper.result import StepperAxis, StepperResult, figure
-from tuning.target import Target, timed, told_lateness
+from tuning.target import Target, timed
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -1,0 +1,60 @@
+"""An axis that stands and pushes with all its current: blocked, against a stop, or with an encoder that is stuck.
+
+The drive itself sees nothing wrong: it is enabled, in no fault, and with an encoder that is stuck even its target is
+reached. The motor has its greatest torque meanwhile, and turns as soon as what holds it gives way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import Drives
+from drive_env.drives.speeds import per_increment
+
+Mask = NDArray[np.bool_]
+
+SHARE = 0.95  # of the current limit, from which on a current is at it: samples are noisy
+HELD = 0.5  # s, for which it stands so: to set off takes all the current, too, and less time
+REMEDY = (
+    "the axis is blocked or stands against a stop, or its encoder is stuck; disable it, and check both before it is "
+    "enabled again"
+)
+
+
+class LimitAtRest:
+    """Tells the axes that stand with their current at its limit; raw integers of the wire throughout.
+
+    Args:
+        drives: The drives. Of those without a current limit of their own, as steppers, and of those known by
+            their EDS alone, none is named.
+    """
+
+    def __init__(self, drives: Drives) -> None:
+        self.axes = drives.num_axes
+        self._since: NDArray[np.float64] = np.full(self.axes, np.nan)  # s, when it began
+        device = drives.device
+        self.is_known = device is not None and Role.CURRENT_LIMIT in device.roles
+        if device is not None and self.is_known:
+            increments = np.asarray(drives.read(Role.POSITION_SCALE), float) / (2.0 * np.pi)
+            self._slow = device.standstill * increments * per_increment(drives, cia402.VELOCITY_ACTUAL)
+
+    def look(self, now: float, status: ArrayLike, current: ArrayLike, speed: ArrayLike, limit: ArrayLike) -> Mask:
+        """Return which axes have stood so for `HELD`, shape (num_axes,).
+
+        Args:
+            now: Time of the readings [s].
+            status: 6041h, (num_axes,), as all that follow.
+            current: 6077h.
+            speed: 606Ch.
+            limit: The current limit, which counts as 6077h does.
+        """
+        if not self.is_known:
+            return np.zeros(self.axes, bool)
+        enabled = cia402.matches(np.asarray(status), cia402.OPERATION_ENABLED)
+        most = np.asarray(limit)
+        pushes = enabled & (most > 0) & (np.abs(current) >= SHARE * most) & (np.abs(speed) <= self._slow)
+        self._since = np.where(pushes, np.fmin(self._since, now), np.nan)
+        return np.asarray(now - self._since >= HELD)

@@ -1,0 +1,60 @@
+"""What a motion feeds back into a drive's DC link, and what the link holds until the drive cuts its stage.
+
+A stop feeds back the kinetic energy. A weight that goes down feeds back as long as it goes, through a motor that
+merely holds it: power -K_t i omega with i = holding + (J domega/dt) / K_t, less what the winding loses. The current
+that holds the axis is measured at the motor, and what the transmission loses is in it. A supply may not take it back.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from drive_env.motors import Motor
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+
+LINK_SHARE = 0.8  # of what the link holds, that is filled: the supply may be higher than what was entered
+
+
+def link_energy(target: Target) -> Floats:
+    """Return what each DC link holds above its supply until the stage is cut [J], shape (num_axes,).
+
+    By the least capacitance of the drive's class. The axes of a drive share its link, and may brake at one time.
+    """
+    device = target.device
+    square = np.maximum(device.overvoltage**2 - target.supply**2, 1.0)
+    return np.asarray(0.5 * device.stage["dc_capacitance"].low * square / device.num_axes)
+
+
+def fed_back(
+    motor: Motor, speed: Floats, step: float, inertia: ArrayLike, holding: ArrayLike, friction: ArrayLike = 0.0
+) -> Floats:
+    """Return the most energy that a motion has fed into the DC link at any moment [J], shape (num_axes,).
+
+    What the motor draws afterwards empties the link first. The weight may pull either way: the worse one counts.
+
+    Args:
+        motor: What turns each axis.
+        speed: Of the rotors [rad/s], shape (rows, num_axes).
+        step: From row to row [s].
+        inertia: Total inertia [kg*m^2], (num_axes,) or one for all.
+        holding: Current that holds the axis [A], alike. What dry friction has in it at rest, it has in motion, too:
+            such a one needs no other friction.
+        friction: Current that dry friction takes in motion for sure [A], alike.
+    """
+    K = motor.torque_constant
+    before = np.concatenate([np.zeros((1, speed.shape[1])), speed])
+    after = np.concatenate([speed, np.zeros((1, speed.shape[1]))])
+    mean, accelerating = 0.5 * (before + after), (after - before) / step * np.asarray(inertia, float) / K
+    most = np.zeros(speed.shape[1])
+    for weight in (np.asarray(holding, float), -np.asarray(holding, float)):
+        current = accelerating + weight + np.sign(mean) * np.asarray(friction, float)
+        energy = -step * np.cumsum(K * current * mean + motor.copper_resistance * current**2, axis=0)
+        emptied = np.minimum(np.minimum.accumulate(energy, axis=0), 0.0)
+        most = np.maximum(most, (energy - emptied).max(axis=0))
+    return most
