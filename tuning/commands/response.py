@@ -19,12 +19,12 @@ from tuning.commands.options import (
     before_as_json,
     errors_as_exit_codes,
     fail,
+    file_of,
     print_json,
     progress_bar,
     takes,
     tell_before,
     unchanged,
-    way_back,
 )
 from tuning.identify.estimate import TITLES
 
@@ -73,8 +73,8 @@ def response(
             )
         drive.check()
         drive.check_linear_model()
-        file = way_back(drive, "response", out)
-        with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
+        file = file_of(drive, "response", out)
+        with unchanged(drive, file) as (target, _), progress_bar("shaking") as show:
             measured = measure(target, loop, signal=Signal(signal, low, high, resolution), traced=trace, progress=show)
             numbers = target.axis_numbers
         if out is not None:
