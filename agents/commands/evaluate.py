@@ -489,13 +489,14 @@ def _tell(
 
 def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
     from agents.evaluation import episode_log, evaluation_plots
+    from drive_env.whole_file import write_whole
 
     folder.mkdir(parents=True, exist_ok=True)
     found.save(folder / "report.json")
     episode_log.save(folder / "episodes.npz", found.environment, found.configuration, found.episodes)
     evaluation_plots.save(found, folder)
     if gaps:
-        (folder / "gap.txt").write_text("\n".join(gaps) + "\n", encoding="utf-8")
+        write_whole(folder / "gap.txt", "\n".join(gaps) + "\n")
     if not json:
         print(f"written to {folder}")
 

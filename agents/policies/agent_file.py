@@ -7,6 +7,7 @@ versions and a hash of all that. The observation's normaliser is among the array
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.whole_file import write_whole
 from mechanics.untrusted import TooLargeError, parse_json, read_arrays
 
 FORMAT, FORMAT_VERSION = "drive-agent", 1
@@ -84,15 +86,14 @@ class AgentFile:
         path = Path(path)
         about = _canonical({**self._about(), "hash": self.hash}).encode()
         arrays = {name: np.ascontiguousarray(self.arrays[name]) for name in sorted(self.arrays)}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(path.name + ".part")  # a run that dies leaves the old file whole
-        with beside.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **{ABOUT: np.frombuffer(about, np.uint8), **arrays})
-        size = beside.stat().st_size
-        if size > MAX_BYTES:
-            beside.unlink()
-            raise BundleError(f"{path} would have {size} bytes and {MAX_BYTES} are allowed; use a smaller network")
-        beside.replace(path)
+        memory = io.BytesIO()
+        np.savez_compressed(memory, allow_pickle=False, **{ABOUT: np.frombuffer(about, np.uint8), **arrays})
+        content = memory.getvalue()
+        if len(content) > MAX_BYTES:
+            raise BundleError(
+                f"{path} would have {len(content)} bytes and {MAX_BYTES} are allowed; use a smaller network"
+            )
+        write_whole(path, content)
         return path
 
     @classmethod

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from drive_env.whole_file import write_whole
 from tuning.runs.shard_log import ShardLog, ShardLogError
 
 SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part-"
@@ -48,7 +49,7 @@ def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[Sh
     place.mkdir(parents=True, exist_ok=True)
     with ShardLog(place / SHARDS, settings) as log:
         if not (place / SETTINGS).exists():
-            (place / SETTINGS).write_text(settings, encoding="utf-8", newline="\n")
+            write_whole(place / SETTINGS, settings)
         try:
             yield log
         finally:
