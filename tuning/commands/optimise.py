@@ -167,13 +167,14 @@ def _on_machine(
     from tuning.runs import unfinished
 
     machine = drive.machine() | {"num_machines": copies}
-    try:
-        found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
-    except KeyboardInterrupt:
-        kept = what_an_interrupt_leaves(folder) if settings.journal is None else _kept_in(settings.journal)
-        fail(kept, INTERRUPTED)
     options = _named(drive) | {"load": drive.load, "copies": copies, "searches": searches}
-    _save(found, settings, folder, options)
+    with unfinished.telling_what_is_kept(folder):
+        try:
+            found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
+        except KeyboardInterrupt:
+            kept = what_an_interrupt_leaves(folder) if settings.journal is None else _kept_in(settings.journal)
+            fail(kept, INTERRUPTED)
+        _save(found, settings, folder, options)
     _report(found, settings, folder, None, f"an emulated {drive.load}", options, json)
     unfinished.discard(folder)
 

@@ -11,6 +11,7 @@ import io
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -53,7 +54,13 @@ class ShardLog:
         self._file.truncate(end)
         self._file.seek(end)
         if end == 0:
-            self._write(json.dumps({"run": self._key, "sources": provenance.SOURCES}).encode() + b"\n")
+            try:
+                self._write(json.dumps({"run": self._key, "sources": provenance.SOURCES}).encode() + b"\n")
+            except OSError:
+                with suppress(OSError):  # what found no room is tried once more
+                    self._file.close()
+                self.path.unlink()
+                raise
 
     def append(self, shard: int, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Add the result of a shard; once this returns it survives the process."""
@@ -67,7 +74,7 @@ class ShardLog:
 
     def close(self) -> None:
         """Close the file; it stays."""
-        with naming(self.path):  # what found no room is tried once more
+        with suppress(OSError):  # what found no room is tried once more, and was told
             self._file.close()
 
     def __enter__(self) -> ShardLog:
