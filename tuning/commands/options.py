@@ -301,8 +301,10 @@ def open_target(drive: DriveOptions) -> Target:
     """Return what a command's options name, drives on a bus or emulated ones, without asking.
 
     Raises:
-        ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer.
+        ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer, or
+            another master commands it.
     """
+    from drive_env.commands.scope import refuse_other_masters
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     drive.check()
@@ -313,6 +315,8 @@ def open_target(drive: DriveOptions) -> Target:
     options: dict[str, Any] = {} if drive.bitrate is None else {"bitrate": drive.bitrate}
     if drive.lockstep:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
+    # Two tuners take each other's answers, and the second would keep the first one's trial as the state before.
+    refuse_other_masters(drive.interface, drive.channel, drive.nodes, drive.bitrate)
     return on_bus(
         drive.device,
         drive.motor_name,
