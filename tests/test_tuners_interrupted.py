@@ -62,7 +62,7 @@ class Truth:
         return any(cia402.matches(int(word), cia402.OPERATION_ENABLED) for word in self.status)
 
     def is_off(self):
-        return len(self.status) > 0 and not any(cia402.is_live(int(word)) for word in self.status)
+        return not any(cia402.is_live(int(word)) for word in self.drives.read(cia402.STATUSWORD))
 
     def turned_until(self, since):
         """Return how long after a time an axis still turned [s]."""

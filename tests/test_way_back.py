@@ -226,6 +226,31 @@ def test_what_a_process_says_at_its_end_is_so(tmp_path, command, how):
         assert parameters(bus) == before
 
 
+# --- images of EtherCAT -------------------------------------------------------------------------------------------
+def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
+    """A mapping is changed while no sync manager carries it: `undo` was refused 1A00h:01 with 0601 0000h."""
+    from test_ethercat_tuning import served
+
+    from drive_env.master.ethercat_drives import EtherCatDrives
+    from drive_env.master.parameters import read_parameters
+    from tuning.snapshot import restore, take_of
+
+    device = "tmcm3313"
+    with served(device) as (port, _):
+        address = {"interface": "ethercat-udp", "channel": port, "pace": "lockstep", "safety": False}
+        with EtherCatDrives(device, **address) as drives:
+            before = [read_parameters(drives, axis) for axis in range(drives.num_axes)]
+            taken = take_of(drives, {})
+            drives.record([0x6064, 0x606C, 0x6041], 0.002)
+            drives.record([0x6062], 0.002, play={0x60FF: [0, 0]})
+            drives.link.process.forget([0])  # as a process that is killed does
+        with EtherCatDrives(device, **address) as drives:
+            left = [read_parameters(drives, axis) for axis in range(drives.num_axes)]
+            restore(drives, taken)
+            assert [read_parameters(drives, axis) for axis in range(drives.num_axes)] == before != left
+            assert differences(drives, taken) == []
+
+
 # --- axes that are left out ---------------------------------------------------------------------------------------
 def test_what_is_borrowed_of_axes_left_out_is_in_the_file_and_comes_back(tmp_path):
     """PDOs are mapped for a whole TMCM-6212: 50 objects of axes 1 to 5 stayed changed after `--axis 0` was killed."""
