@@ -104,7 +104,7 @@ def test_axes_without_a_motor_are_named_before_anything_moves(served, tmp_path, 
     assert done.exit_code == 1, done.output
     assert done.stderr.strip().splitlines()[-1] == (
         "drive-tune: axes 0, 2, 4, 5: a phase carries no current (1000h, open load), so no motor is connected there, "
-        "or its cable is broken; tune the others alone: --axis 1 --axis 3"
+        "or its cable is broken; look at the cable, or tune the other axes alone (--axis 1 --axis 3)"
     )
     assert "the drives have their state from before, by a second reading" in done.stderr
     assert [settings_of(drives, axis) for axis in range(AXES)] == before

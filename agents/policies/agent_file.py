@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.whole_file import write_whole
 from mechanics.untrusted import TooLargeError, parse_json, read_arrays
 
 FORMAT, FORMAT_VERSION = "drive-agent", 1
@@ -83,6 +82,8 @@ class AgentFile:
         Raises:
             BundleError: If it would be larger than MAX_BYTES, or its tables hold what JSON cannot.
         """
+        from drive_env.whole_file import write_whole  # who acts by an agent needs NumPy alone
+
         path = Path(path)
         about = _canonical({**self._about(), "hash": self.hash}).encode()
         arrays = {name: np.ascontiguousarray(self.arrays[name]) for name in sorted(self.arrays)}

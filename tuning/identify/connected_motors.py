@@ -48,8 +48,8 @@ def _name(drives: Drives, without: NDArray[np.bool_]) -> None:
     there = sorted(
         {drives.axis_numbers[int(k)] % count for k in np.flatnonzero(~without)} - {k % count for k in numbers}
     )
-    remedy = f"tune the others alone: {' '.join(f'--axis {k}' for k in there)}" if there else "see to the cables"
     raise RuntimeError(
         f"{'axes' if len(numbers) > 1 else 'axis'} {', '.join(map(str, numbers))}: a phase carries no current (1000h, "
-        f"open load), so no motor is connected there, or its cable is broken; {remedy}"
+        "open load), so no motor is connected there, or its cable is broken; look at the cable, or tune the other axes "
+        f"alone ({' '.join(f'--axis {k}' for k in sorted(others)) or 'there are none'})"
     )
