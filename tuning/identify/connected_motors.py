@@ -45,9 +45,7 @@ def check_motors(drives: Drives) -> None:
 def _name(drives: Drives, without: NDArray[np.bool_]) -> None:
     count = drives.bus.description.num_axes if drives.bus is not None else drives.num_axes
     numbers = [drives.axis_numbers[int(k)] for k in np.flatnonzero(without)]
-    there = sorted(
-        {drives.axis_numbers[int(k)] % count for k in np.flatnonzero(~without)} - {k % count for k in numbers}
-    )
+    others = {drives.axis_numbers[int(k)] % count for k in np.flatnonzero(~without)} - {k % count for k in numbers}
     raise RuntimeError(
         f"{'axes' if len(numbers) > 1 else 'axis'} {', '.join(map(str, numbers))}: a phase carries no current (1000h, "
         "open load), so no motor is connected there, or its cable is broken; look at the cable, or tune the other axes "
