@@ -6,14 +6,18 @@ is torn has none at its end. It tells of accidents and of a change in passing; i
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 FORMAT = 2  # of sealed files; those before had neither check sum nor identity
 _CHECK, _SUM = "check", "sha256"
@@ -32,7 +36,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
         OSError: If it cannot be written, with the file and the reason; what was there before is there still.
     """
     if path.exists() and not path.is_file():  # another file in its place would be the end of it
-        with _naming(path), path.open("wb") as device:
+        with naming(path), path.open("wb") as device:
             device.write(_bytes(content))
         return
     with files_to_be({path: content}):
@@ -54,7 +58,7 @@ def files_to_be(contents: Mapping[Path, str | bytes]) -> Iterator[None]:
     partial = {path: path.with_name(f".{path.name}.partial") for path in contents}
     try:
         for path, content in contents.items():
-            with _naming(path):
+            with naming(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with partial[path].open("wb") as file:
                     file.write(_bytes(content))
@@ -62,7 +66,7 @@ def files_to_be(contents: Mapping[Path, str | bytes]) -> Iterator[None]:
                     os.fsync(file.fileno())
         yield
         for path in contents:
-            with _naming(path):
+            with naming(path):
                 partial[path].replace(path)
                 named.append(path)
                 keep_names(path.parent)
@@ -74,9 +78,30 @@ def files_to_be(contents: Mapping[Path, str | bytes]) -> Iterator[None]:
         raise
 
 
+def write_picture(path: Path, figure: Any, dpi: float) -> None:
+    """Write a figure of matplotlib, in the format of the file's ending; raises as `write_whole` does."""
+    memory = io.BytesIO()
+    figure.savefig(memory, format=path.suffix.removeprefix("."), dpi=dpi)
+    write_whole(path, memory.getvalue())
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays as a compressed NumPy file; raises as `write_whole` does."""
+    memory = io.BytesIO()
+    np.savez_compressed(memory, allow_pickle=False, **arrays)
+    write_whole(path, memory.getvalue())
+
+
+def write_table(path: Path, rows: Iterable[Iterable[Any]], lineterminator: str = "\r\n") -> None:
+    """Write rows as CSV; raises as `write_whole` does."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator=lineterminator).writerows(rows)
+    write_whole(path, text.getvalue())
+
+
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Have an error name the file, which it does not where the disk is full."""
+def naming(path: Path) -> Iterator[None]:
+    """Have an error name the file that a block writes, which it does not where the disk is full."""
     try:
         yield
     except OSError as error:

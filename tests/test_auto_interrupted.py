@@ -9,9 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from auto_stages import skip_stages
 from test_auto import gains, quick, standing_in  # noqa: F401
-from test_auto_command import drive_tune
 from test_parity import served
 from test_serve import environment
 from test_serve import served as served_process
@@ -102,28 +100,6 @@ def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
     assert signal.getsignal(signal.SIGINT) is handler
 
 
-@pytest.mark.parametrize(
-    ("stage", "words"),
-    [
-        ("Transaction", "interrupted; nothing was changed"),
-        ("prove", "interrupted; the drives are disabled and have the gains from before"),
-        ("collect", "interrupted; the drives are disabled and have the gains from before"),
-        ("Transaction.__exit__", "interrupted; the drives are disabled and have the new gains: drive-tune undo"),
-    ],
-)
-def test_the_command_ends_with_130_and_says_what_the_drives_have(monkeypatch, tmp_path, stage, words):
-    def pressed(*arguments):
-        raise KeyboardInterrupt
-
-    skip_stages(monkeypatch.setattr, np.array([[1000, 900, 800, 700, 600]]))
-    owner, _, name = stage.rpartition(".")
-    monkeypatch.setattr(getattr(auto_module, owner) if owner else auto_module, name, pressed)
-    done = drive_tune("auto", "--load", "inertia", "--out", tmp_path / "run")
-    assert done.exit_code == 130
-    assert words in done.stderr
-    assert done.stderr.strip().count("\n") == 0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda how: how.name)
 def test_a_real_signal_over_a_served_bus(tmp_path, how):
@@ -152,7 +128,7 @@ def test_a_real_signal_over_a_served_bus(tmp_path, how):
             if process.poll() is None:
                 process.kill()
         assert process.returncode == 130, said
-        assert "interrupted; the drives are disabled and have the gains from before" in said
+        assert "the drives have their state from before, by a second reading" in said
         with CanDrives("tmcm1636", **bus) as drives:
             np.testing.assert_array_equal(gains(drives), before)
             assert is_off(drives)

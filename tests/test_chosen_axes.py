@@ -21,6 +21,7 @@ from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
 AXES, WIRED = 6, (1, 3)
+FULL_STEPS = np.radians(2 * 1.8)  # rad: how far a rotor goes to the field when its axis gets current
 LEFT_OUT = [axis for axis in range(AXES) if axis not in WIRED]
 
 
@@ -90,6 +91,26 @@ def test_auto_on_the_axes_that_have_motors_is_accepted_and_lets_the_others_alone
     assert {row["axis"] for row in json.loads(undone.stdout)["changed"]} == set(WIRED)
     for axis in told["axes"]:
         assert settings_of(drives, axis["axis"])[0x2003, 0] == axis["before"]["run_current"]
+
+
+@pytest.mark.parametrize("command", [("auto",), ("optimise", "--trials", "1", "--sampler", "random")], ids=" ".join)
+def test_axes_without_a_motor_are_named_before_anything_moves(served, tmp_path, command):
+    """It wrote 6060h and ramps of all axes, and failed with advice on 6085h of one that has no motor."""
+    drives, _, options = served
+    drives.write(0x6085, 51200, where=~np.isin(np.arange(AXES), WIRED))  # as it comes from the factory
+    before, modes = [settings_of(drives, axis) for axis in range(AXES)], drives.read(cia402.MODE)
+    angles = drives.machine.rotor_angle.copy()
+    done = drive_tune(*command, *options, "--out", tmp_path / "run")
+    assert done.exit_code == 1, done.output
+    assert done.stderr.strip().splitlines()[-1] == (
+        "drive-tune: axes 0, 2, 4, 5: a phase carries no current (1000h, open load), so no motor is connected there, "
+        "or its cable is broken; look at the cable, or tune the other axes alone (--axis 1 --axis 3)"
+    )
+    assert "the drives have their state from before, by a second reading" in done.stderr
+    assert [settings_of(drives, axis) for axis in range(AXES)] == before
+    assert drives.read(cia402.MODE).tolist() == modes.tolist()
+    np.testing.assert_allclose(drives.machine.rotor_angle, angles, atol=FULL_STEPS)
+    assert (drives.read(cia402.STATUSWORD) & 0x4F == 0x40).all()
 
 
 @pytest.mark.parametrize("command", [("auto",), ("optimise",), ("identify",), ("response",), ("rules",)])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,7 @@ from drive_env.whole_file import files_to_be, write_whole
 from tuning.auto import one_button as auto_module
 from tuning.auto.stages import TriedGains
 from tuning.commands.cli import app as drive_tune
+from tuning.runs import provenance
 from tuning.search import trials_files
 from tuning.snapshot import load_snapshot
 
@@ -254,7 +257,7 @@ def tiny_disk(place, kilobytes):
     try:
         yield place
     finally:
-        subprocess.run(["umount", str(place)], check=True)
+        subprocess.run(["umount", "--lazy", str(place)], check=True)  # a library may still have a file open
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
@@ -293,3 +296,61 @@ def test_a_journal_that_finds_no_room_ends_a_search_and_is_named(tmp_path):
         )  # fmt: skip
         assert (done.exit_code, gains(machine)) == (2, before), done.output
     assert f"{disk / 'journal'}: {SAID}; the drives have their state from before" in done.stderr
+
+
+# Command and options, kB that are left, the file that finds no room, and the option with which it goes on.
+COMMANDS = [
+    ("rank", ("-t", "baseline", "--count", 1), 8, "run/tuners.csv", "--resume"),
+    ("rank", ("-t", "factory", "-t", "baseline", "--count", 1), 24, "run/comparison.png", "--resume"),
+    ("optimise", ("--load", "inertia", "--trials", 1, "--sampler", "random"), 8, "run.unfinished/part-0", ""),
+    ("optimise", ("--load", "inertia", "--trials", 1, "--sampler", "random"), 24, "run/trials.png", "--resume"),
+    ("sweep", ("--config", "small.toml"), 4, "run.unfinished/settings.toml", ""),
+    ("sweep", ("--config", "small.toml"), 0, "run.unfinished/shards", ""),
+    ("response", ("--load", "inertia"), 20, "run/velocity_axis0.png", ""),
+    ("identify", ("--load", "inertia"), 0, "run", ""),
+    ("scope", (), 8, "run.csv", ""),
+    ("jog", ("60 rpm", "--for", 0.1), 32, "run.png", ""),
+    ("train", ("tracking", "--config", "small.yaml", "--load", "gantry"), 8, "run", ""),
+    ("train", ("tracking", "--config", "small.yaml", "--load", "gantry"), 20, "run/checkpoint.zip", ""),
+    ("train", ("tracking", "--config", "small.yaml", "--load", "gantry"), 68, "run/learning_curve.png", "--trust"),
+]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
+@pytest.mark.every(4)
+@pytest.mark.parametrize(("command", "options", "left", "file", "goes_on"), COMMANDS)
+def test_a_command_names_the_file_that_finds_no_room(tmp_path, monkeypatch, command, options, left, file, goes_on):
+    """`sweep`, `optimise` and `train` said "[Errno 28] No space left on device" alone."""
+    monkeypatch.chdir(tmp_path)
+    if command == "train":
+        pytest.importorskip("stable_baselines3")
+    small_runs(tmp_path)
+    app = {"scope": drive_env, "jog": drive_env, "train": drive_agent}.get(command, drive_tune)
+    with tiny_disk(tmp_path / "disk", 256) as disk:
+        ballast, out = disk / "ballast", disk / "run"
+        line = [command, *map(str, options), "--out", str(out)]
+        ballast.write_bytes(bytes(shutil.disk_usage(disk).free - (left << 10)))
+        with node() if app is drive_env else nullcontext((None, [])) as (_, bus):
+            done = CliRunner().invoke(app, [*line, *bus[:4]])
+        assert done.exit_code == 2, done.output
+        said = done.stderr.strip().splitlines()[-1]
+        assert f"{disk / file}: {SAID}" in said and "Errno" not in done.stderr and "Traceback" not in done.stderr
+        there = [path for path in disk.rglob("*") if path != ballast]
+        assert not [path for path in there if path.name.startswith(".") or path.suffix in (".part", ".partial")]
+        assert (goes_on != "") == ("continue" in said) == any(path.is_dir() for path in there), there
+        if goes_on:
+            ballast.unlink()
+            again = ["train", "--resume", str(out), goes_on] if command == "train" else [*line, goes_on]
+            assert CliRunner().invoke(app, again).exit_code == 0
+            assert not (disk / "run.unfinished").exists()
+
+
+def small_runs(folder):
+    """Write files with which a sweep and a training take a moment."""
+    text = (Path(provenance.__file__).parent / "sweep.toml").read_text(encoding="utf-8")
+    (folder / "small.toml").write_text(re.sub(r"count = \d+", "count = 2", text), encoding="utf-8")
+    env = {"num_threads": 1, "duration": 0.01}
+    table = {"n_envs": 4, "n_timesteps": 200, "policy": "MlpPolicy", "normalize": True, "n_steps": 8, "batch_size": 16,
+             "learning_rate": "lin_1e-3", "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.ReLU)",
+             "env_kwargs": env}  # fmt: skip
+    (folder / "small.yaml").write_text(json.dumps({"ServoDrive/Tracking-v0": table, "gantry": {"n_steps": 4}}))

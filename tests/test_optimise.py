@@ -542,7 +542,8 @@ def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkey
     code, error = drive_tune(*arguments, *more)
     assert code == 130
     assert error.splitlines() == [
-        "drive-tune: the drives have their state from before; if not, drive-tune undo obus-before.toml restores it",
+        "drive-tune: the drives have their state from before, by a second reading; drive-tune undo obus-before.toml "
+        "restores it",
         f"drive-tune: interrupted; {says}",
     ]
     assert [int(machine.read(key)[0]) for key in GAIN_OBJECTS] == before

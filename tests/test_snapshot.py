@@ -35,7 +35,6 @@ from tuning.snapshot import (
     check_same_drives,
     file_before,
     load_snapshot,
-    put_back,
     restore,
     take,
 )
@@ -147,26 +146,6 @@ def test_an_axis_that_somebody_else_runs_and_nothing_has_changed_is_left_running
         raise RuntimeError("axis 0 is enabled: disable it")
     assert cia402.matches(target.drives.read(0x6041), cia402.OPERATION_ENABLED).tolist() == [True, False, False]
     assert target.drives.read(CURRENT_LIMIT).tolist() == [7000, 7000, 7000]
-
-
-def test_what_ends_with_an_error_is_put_back_and_says_where_the_file_is(target, tmp_path, capsys):
-    before = take(target)
-    file = tmp_path / "before.toml"
-    with pytest.raises(ValueError, match="no"), put_back(target, file, "drive-tune"):
-        change(target.drives)
-        raise ValueError("no")
-    assert take(target) == before == load_snapshot(file)
-    said = f"the drives have their state from before; if not, drive-tune undo {file} restores it"
-    assert capsys.readouterr().err == f"drive-tune: {said}\n"
-
-
-def test_an_error_after_a_commit_says_that_the_drives_are_others(target, tmp_path, capsys):
-    file = tmp_path / "before.toml"
-    with pytest.raises(ValueError, match="no"), put_back(target, file, "drive-tune") as transaction:
-        change(target.drives)
-        transaction.commit()
-        raise ValueError("no")
-    assert capsys.readouterr().err == f"drive-tune: drive-tune undo {file} restores the state before\n"
 
 
 # --- the file -----------------------------------------------------------------------------------------------------
@@ -694,36 +673,6 @@ def test_a_disk_that_is_full_is_told_with_what_the_drives_have(transaction):
     made.__exit__(OSError, full, None)  # what was kept is not what was before
     made, _ = transaction()
     made.__exit__(OSError, OSError("of no file"), None)
-
-
-@pytest.mark.parametrize(
-    ("committed", "left", "error", "said"),
-    [
-        (False, True, "no", "the drives have their state from before; if not, drive-tune undo {} restores it"),
-        (True, True, "no", "drive-tune undo {} restores the state before"),
-        (False, False, "no", None),  # it was never written
-        (False, True, "see {}", None),  # the error says so
-    ],
-)
-def test_who_fails_says_where_the_file_is(committed, left, error, said, monkeypatch, tmp_path, capsys):
-    file = tmp_path / "before.toml"
-
-    class Made:
-        changed = committed
-
-        def __init__(self, target, path):
-            pass
-
-        def __enter__(self):
-            file.touch() if left else None
-
-        def __exit__(self, *error):
-            return False
-
-    monkeypatch.setattr(module, "Transaction", Made)
-    with pytest.raises(ValueError, match=r"no|see"), put_back(None, file, "drive-agent"):
-        raise ValueError(error.format(file))
-    assert capsys.readouterr().err == ("" if said is None else f"drive-agent: {said.format(file)}\n")
 
 
 def test_a_file_that_does_not_read_back_ends_it_before_anything_is_changed(transaction, monkeypatch):

@@ -7,7 +7,6 @@ A `Transaction` writes the file before anything else happens, so that even a pro
 from __future__ import annotations
 
 import errno
-import sys
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,7 +30,11 @@ from drive_env.master.parameters import (
     Difference,
     check_at_rest,
     check_no_commands,
+    compare,
+    parameters,
     read_parameters,
+    read_these,
+    restorable,
     write_all_or_none,
 )
 from drive_env.safety.envelope import SafetyError
@@ -51,6 +54,9 @@ SWITCH_OFF = 1000  # cycles that switching the voltage off may take
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 STORE = (0x1010, 1)
 DEVICE_OBJECTS = 0x2000  # from here on: what lies below is how drives talk, which their master has in use
+# Set-points with which an axis turns as soon as it is enabled. A program that dies leaves them, and no parameter file
+# has them: they are commands.
+SET_POINTS = (cia402.TARGET_TORQUE, cia402.TARGET_VELOCITY, cia402.TORQUE_OFFSET, cia402.VELOCITY_OFFSET)
 
 
 class SnapshotError(ValueError):
@@ -67,6 +73,8 @@ class Snapshot:
         bus: What opens the drives again, for `CanDrives`; empty for emulated drives.
         stored: Whether the drives stored the change; undoing it is then stored, too.
         identities: What each node said of itself; empty for emulated drives, and where a file does not say.
+        left_out: Of each axis of the nodes that `bus` does not choose, by its number among all of them, what a master
+            borrows of it all the same: PDOs are mapped, and a watchdog is set, for whole nodes.
     """
 
     device: str
@@ -74,6 +82,7 @@ class Snapshot:
     bus: Mapping[str, Any] = field(default_factory=dict)
     stored: bool = False
     identities: tuple[Identity, ...] = ()
+    left_out: Mapping[int, Mapping[Key, int]] = field(default_factory=dict)
 
     def save(self, path: str | Path) -> Path:
         """Write the snapshot as TOML and return its path; the file is complete or absent, also after a power cut.
@@ -106,8 +115,12 @@ class Snapshot:
                 lines.append(f"{key} = {value if isinstance(value, list) else toml(value)}")
         for identity in self.identities:
             lines += ["", "[[node]]", *identity.to_toml()]
-        for axis, values in enumerate(self.axes):
-            lines += ["", f"[[axis]]  # {axis}; index:sub-index, both hexadecimal"]
+        of_axes = [(f"[[axis]]  # {k}; index:sub-index, both hexadecimal", one) for k, one in enumerate(self.axes)]
+        of_axes += [
+            (f"[left_out.{k}]  # borrowed of an axis that is not tuned", one) for k, one in self.left_out.items()
+        ]
+        for title, values in of_axes:
+            lines += ["", title]
             for (index, sub), value in values.items():
                 lines.append(f'"{index:04X}:{sub:02X}" = {value}  # {dictionary.find((index, sub)).name}')
         return "\n".join(lines) + "\n"
@@ -124,7 +137,9 @@ def take(target: Target) -> Snapshot:
 def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
     """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
     identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
-    return Snapshot(device_of(drives).name, _read_axes(drives), address, identities=tuple(identities))
+    return Snapshot(
+        device_of(drives).name, _read_axes(drives), address, identities=tuple(identities), left_out=_borrowed(drives)
+    )
 
 
 def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
@@ -135,6 +150,22 @@ def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
         {key: value for key, value in read_parameters(drives, axis).items() if key not in others}
         for axis in _places(of)
     )
+
+
+def _borrowed(drives: Drives) -> dict[int, dict[Key, int]]:
+    """Return what a master changes of the axes of nodes that are left out, as they are."""
+    bus = drives.bus
+    if bus is None:
+        return {}
+    known, others = bus.description, bus.description.of_further_axes()
+    keys = [
+        (entry.index, entry.sub)
+        for entry in parameters(bus)
+        if (entry.index < DEVICE_OBJECTS or entry.index == cia402.ABORT_CONNECTION_OPTION)
+        and (entry.index, entry.sub) not in others
+        and known.key(entry, 1) != (entry.index, entry.sub)
+    ]
+    return {axis: read_these(bus, keys, axis) for axis in range(bus.num_axes) if axis not in set(drives.axis_numbers)}
 
 
 def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
@@ -159,29 +190,35 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
     if not isinstance(tables, list) or not tables or not isinstance(data.get("device"), str):
         raise SnapshotError(f"{where} is not a file with the state before a change; give one that drive-tune saved")
     known = describe(data["device"], None)
-    dictionary = known.dictionary
-    axes = []
-    for table in tables:
-        if not isinstance(table, dict):
-            raise SnapshotError(f"{where}: {table!r} is not an axis; give a file that drive-tune saved before a change")
-        values = {}
-        for text, value in table.items():
-            index, _, sub = text.partition(":")
-            try:
-                key = int(index, 16), int(sub, 16)
-                entry = dictionary.find(key)
-                check_writable(entry)
-                check_in_range(entry, np.asarray(value))
-            except (ValueError, ObjectAccessError) as error:
-                raise SnapshotError(f"{where}: {text} = {value!r}: {error}") from None
-            values[key] = int(value)
-        check_no_commands(values, where, known.hints)
-        axes.append(values)
+    axes = [_checked_axis(where, table, known) for table in tables]
+    left_out = data.get("left_out", {})
+    if not isinstance(left_out, dict) or not all(name.isdecimal() for name in left_out):
+        raise SnapshotError(f"{where}: left_out must be a table of numbered axes; give a file as drive-tune left it")
+    others = {int(name): _checked_axis(where, table, known) for name, table in left_out.items()}
     check_seal(where, data, unchecked=unchecked)
     nodes = [load_identity(table) for table in data.get("node", []) if isinstance(table, dict)]
     identities = tuple(identity for identity in nodes if identity is not None)
     bus = _checked_bus(where, data.get("bus", {}))
-    return Snapshot(data["device"], tuple(axes), bus, bool(data.get("stored", False)), identities)
+    return Snapshot(data["device"], tuple(axes), bus, bool(data.get("stored", False)), identities, others)
+
+
+def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
+    """Return the parameters of an axis; SnapshotError, or CommandObjectError, for what are none."""
+    if not isinstance(table, dict):
+        raise SnapshotError(f"{file}: {table!r} is not an axis; give a file that drive-tune saved before a change")
+    values = {}
+    for text, value in table.items():
+        index, _, sub = text.partition(":")
+        try:
+            key = int(index, 16), int(sub, 16)
+            entry = known.dictionary.find(key)
+            check_writable(entry)
+            check_in_range(entry, np.asarray(value))
+        except (ValueError, ObjectAccessError) as error:
+            raise SnapshotError(f"{file}: {text} = {value!r}: {error}") from None
+        values[key] = int(value)
+    check_no_commands(values, file, known.hints)
+    return values
 
 
 def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
@@ -223,13 +260,15 @@ def restore(
 ) -> list[list[Difference]]:
     """Bring drives back to a snapshot, axis by axis, each all or none; return what was changed on each.
 
-    The axes must not be enabled.
+    The axes must not be enabled. Set-points of speed and torque are 0 afterwards: no file has them, and with what a
+    program left there an axis would turn once it is enabled.
 
     Args:
         drives: The drives, `EmulatedDrives` or `CanDrives`.
         snapshot: Where to.
         where: Axes to bring back; all by default.
-        whole: Objects of the communication area as well: not while the drives' PDOs are in use.
+        whole: Objects of the communication area as well, and what was borrowed of axes left out, which come last in
+            what is returned: not while the drives' PDOs are in use.
 
     Raises:
         SnapshotError: If the drives are others; NotRestoredError or RollbackError if a drive refuses.
@@ -246,9 +285,35 @@ def restore(
     places = _places(drives)
     for axis in map(int, np.flatnonzero(axes)):
         check_at_rest(single, wanted[axis], places[axis])  # before the first axis is written
+    for key in _set_points(describe(snapshot.device, None)):
+        drives.write(key, 0, where=axes)
     for axis in map(int, np.flatnonzero(axes)):
         changed[axis] = write_all_or_none(single, wanted[axis], places[axis])
+    if whole:
+        changed += [write_all_or_none(single, values, place) for place, values in snapshot.left_out.items()]
     return changed
+
+
+def _set_points(known: Description) -> list[Key]:
+    return [(index, 0) for index in SET_POINTS if known.has(index) and known.dictionary.find(index).access != "wo"]
+
+
+def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Difference]]:
+    """Return what is not as a snapshot says, as (number of the axis, difference), read anew from drives of a bus.
+
+    Set-points of speed and torque that would turn an axis once it is enabled are among them.
+
+    Args:
+        drives: All axes of the nodes.
+        snapshot: What they should have.
+    """
+    known = drives.description
+    parts = snapshot.bus.get("axes", range(known.num_axes))
+    numbers = [node * known.num_axes + part for node in range(len(drives.nodes)) for part in parts]
+    still = dict.fromkeys(_set_points(known), 0)
+    wanted = {axis: restorable(one, known.hints) | still for axis, one in zip(numbers, snapshot.axes, strict=True)}
+    wanted |= {axis: restorable(one, known.hints) for axis, one in snapshot.left_out.items()}
+    return [(axis, change) for axis, values in wanted.items() for change in compare(drives, values, axis)]
 
 
 @contextmanager
@@ -287,28 +352,6 @@ def check_place(file: Path) -> None:
         raise OSError(f"the state before cannot be written to {file}: {place} is a file; choose another place")
     if not writable:
         raise OSError(f"the state before cannot be written to {file}: {place} is not writable; choose another")
-
-
-@contextmanager
-def put_back(target: Target, file: Path, program: str) -> Iterator[Transaction]:
-    """Have the state of drives in a file while a block moves them, and bring it back at the end unless committed.
-
-    If the block fails, a line on stderr says where the file is.
-
-    Args:
-        target: The drives.
-        file: The file to leave.
-        program: Who speaks on stderr.
-    """
-    transaction = Transaction(target, file)
-    try:
-        with transaction:
-            yield transaction
-    except BaseException as error:
-        if file.exists() and str(file) not in str(error):  # no line for a file that could not be written
-            way = f"drive-tune undo {file} restores the state before" if transaction.changed else what_is_left(file)
-            print(f"{program}: {way}", file=sys.stderr)
-        raise
 
 
 def what_is_left(file: Path) -> str:

@@ -376,15 +376,17 @@ def _on_bus(run: _Run, sensor: str | None, before: Path, **where: Any) -> Evalua
     from agents.evaluation.evaluation import GivenDrives
     from agents.evaluation.on_the_bus import lower_profile_velocity, target_for
     from agents.policies.open_policy import find_object
-    from tuning.snapshot import put_back
+    from tuning.snapshot import Transaction
+    from tuning.way_back import way_back
 
     function = None if sensor is None else find_object(sensor)
     with (
+        way_back(before, "drive-agent"),
         target_for(run.environment, run.configuration, run.guard, **where) as target,
-        put_back(target, before, "drive-agent"),
+        Transaction(target, before),
         progress_bar(f"{run.loaded.name} on the bus") as show,
     ):
-        lower_profile_velocity(target.drives)  # put_back restores it, once the axes are off
+        lower_profile_velocity(target.drives)  # the transaction restores it, once the axes are off
         return run.evaluate(show, GivenDrives(target.drives, function, run.guard))
 
 
@@ -479,21 +481,22 @@ def _tell(
         )
     lines += gaps
     if before is not None:
-        from tuning.snapshot import what_is_left
+        from tuning.way_back import what_is_changed
 
-        lines.append(what_is_left(before))
+        lines.append(what_is_changed(before))
     print_lines(lines)
 
 
 def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
     from agents.evaluation import episode_log, evaluation_plots
+    from drive_env.whole_file import write_whole
 
     folder.mkdir(parents=True, exist_ok=True)
     found.save(folder / "report.json")
     episode_log.save(folder / "episodes.npz", found.environment, found.configuration, found.episodes)
     evaluation_plots.save(found, folder)
     if gaps:
-        (folder / "gap.txt").write_text("\n".join(gaps) + "\n", encoding="utf-8")
+        write_whole(folder / "gap.txt", "\n".join(gaps) + "\n")
     if not json:
         print(f"written to {folder}")
 

@@ -85,6 +85,15 @@ def train(
                 fail("interrupted before the first checkpoint: the run cannot be continued, and its files were removed",
                      INTERRUPTED)  # fmt: skip
             fail(f"interrupted; to continue: drive-agent train --resume {folder} --trust", INTERRUPTED)
+        except OSError as error:
+            if error.errno is None or not folder.is_dir():
+                raise
+            if (folder / CHECKPOINT).is_file():
+                left = f"make room, then continue: drive-agent train --resume {folder} --trust"
+            else:
+                clear(folder)
+                left = "this was before the first checkpoint, and the run's files were removed"
+            raise OSError(error.errno, f"{error.strerror}; {left}", error.filename or str(folder)) from None
         print(f"evaluating it in {EPISODES} episodes with seeds not used for training", file=sys.stderr)
         evaluation = judge(bundle)
         figures = {name: evaluation.interval(name)._asdict() for name in evaluation.values}

@@ -79,10 +79,12 @@ def tune(
         if bus and seed is not None:
             raise ValueError("--seed draws an emulated machine; leave it out on a bus")
         from agents.tuner.open_tuner import open_tuner
+        from tuning.way_back import way_back
 
         policy = open_tuner(agent, device, trials)
         folder = new_folder(out, "agent-tune")
         with ExitStack() as stack:
+            stack.enter_context(way_back(folder / "before.toml" if bus else None, "drive-agent"))
             if not bus:
                 target = stack.enter_context(_emulated_node(device, motor, load, seed, supply, travel))
             else:
@@ -244,8 +246,8 @@ def _report(done: TunerRun, folder: Path, json: bool, bus: bool) -> None:
         )  # fmt: skip
     else:
         _print(done, refused, rule)
-        way_back = ", before.toml for `drive-tune undo`" if bus else ""  # an emulated drive ended with this program
-        print_lines([f"written to {folder}: report.html to read, certificate.json{way_back}"])
+        undo = ", before.toml for `drive-tune undo`" if bus else ""  # an emulated drive ended with this program
+        print_lines([f"written to {folder}: report.html to read, certificate.json{undo}"])
     if refused:
         raise typer.Exit(REFUSED)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from agents.evaluation.scores import Episode
 from agents.policies.agent_file import plain
 from agents.policies.guard import PATIENT, GuardedPolicy
+from drive_env.whole_file import write_arrays
 from mechanics.untrusted import parse_json, read_arrays
 
 
@@ -38,13 +39,13 @@ def save(path: Path, environment: str, configuration: dict[str, Any], episodes: 
     """Write episodes to an .npz."""
     about = {"environment": environment, "configuration": plain(configuration)}
     about |= {"seeds": [episode.seed for episode in episodes]}
-    np.savez_compressed(
-        path,
-        about=np.frombuffer(json.dumps(about).encode(), np.uint8),
-        lengths=np.array([len(episode.actions) for episode in episodes]),
-        observations=np.concatenate([episode.observations[:-1] for episode in episodes]).astype(np.float32),
-        actions=np.concatenate([episode.actions for episode in episodes]).astype(np.float32),
-    )
+    arrays = {
+        "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
+        "lengths": np.array([len(episode.actions) for episode in episodes]),
+        "observations": np.concatenate([episode.observations[:-1] for episode in episodes]).astype(np.float32),
+        "actions": np.concatenate([episode.actions for episode in episodes]).astype(np.float32),
+    }
+    write_arrays(path, arrays)
 
 
 def load(path: Path) -> EpisodeRecording:

@@ -24,6 +24,7 @@ from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.master.realtime_section import undisturbed
+from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_json
 
 LANES = 64
@@ -84,7 +85,7 @@ class Evaluation:
         path = Path(path)
         table = {key: value for key, value in vars(self).items() if key != "episodes"}
         table["intervals"] = {name: self.interval(name)._asdict() for name in self.values}
-        path.write_text(json.dumps(plain(table), indent=1), encoding="utf-8")
+        write_whole(path, json.dumps(plain(table), indent=1))
         return path
 
     @classmethod

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation.evaluation import Evaluation
+from drive_env.whole_file import write_picture
 
 BINS = 20
 # Environment -> entry of the observation that is drawn over time, and what it is; None draws the reward.
@@ -52,7 +53,7 @@ def save_gap(first: Evaluation, second: Evaluation, folder: Path) -> Path:
     axis.legend(fontsize=8)
     axis.grid(alpha=0.3)
     path = folder / "gap.png"
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure, 120)
     pyplot.close(figure)
     return path
 
@@ -70,7 +71,7 @@ def _figures(evaluation: Evaluation, path: Path) -> Path:
         axis.axvspan(found.low, found.high, color="C0", alpha=0.2)
         axis.set(xlabel=name, ylabel="episodes", title=f"mean {found.mean:.4g}")
     figure.suptitle(f"{evaluation.policy} on {evaluation.side}: mean and its 95 % interval", fontsize=10)
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure, 120)
     pyplot.close(figure)
     return path
 
@@ -96,6 +97,6 @@ def _episodes(evaluation: Evaluation, path: Path) -> Path:
     axis.set(xlabel="step", title=f"{evaluation.policy} on {evaluation.side}")
     axis.legend(fontsize=8)
     axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure, 120)
     pyplot.close(figure)
     return path

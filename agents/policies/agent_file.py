@@ -7,6 +7,7 @@ versions and a hash of all that. The observation's normaliser is among the array
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
 from collections.abc import Mapping
@@ -81,18 +82,19 @@ class AgentFile:
         Raises:
             BundleError: If it would be larger than MAX_BYTES, or its tables hold what JSON cannot.
         """
+        from drive_env.whole_file import write_whole  # who acts by an agent needs NumPy alone
+
         path = Path(path)
         about = _canonical({**self._about(), "hash": self.hash}).encode()
         arrays = {name: np.ascontiguousarray(self.arrays[name]) for name in sorted(self.arrays)}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(path.name + ".part")  # a run that dies leaves the old file whole
-        with beside.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **{ABOUT: np.frombuffer(about, np.uint8), **arrays})
-        size = beside.stat().st_size
-        if size > MAX_BYTES:
-            beside.unlink()
-            raise BundleError(f"{path} would have {size} bytes and {MAX_BYTES} are allowed; use a smaller network")
-        beside.replace(path)
+        memory = io.BytesIO()
+        np.savez_compressed(memory, allow_pickle=False, **{ABOUT: np.frombuffer(about, np.uint8), **arrays})
+        content = memory.getvalue()
+        if len(content) > MAX_BYTES:
+            raise BundleError(
+                f"{path} would have {len(content)} bytes and {MAX_BYTES} are allowed; use a smaller network"
+            )
+        write_whole(path, content)
         return path
 
     @classmethod

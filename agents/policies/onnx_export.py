@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.policies.agent_file import AgentFile, BundleError
+from drive_env.whole_file import write_whole
 
 OPSET, IR_VERSION = 17, 8  # old enough for the runtimes of the last years
 TOLERANCE = 1e-5  # of an action's range: float32 adds up in another order there
@@ -89,11 +90,8 @@ def export(bundle: AgentFile, path: str | Path) -> float:
     Raises:
         BundleError: If it is larger than TOLERANCE; no file is left then.
     """
-    import onnx
-
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    onnx.save(to_onnx(bundle), str(path))
+    write_whole(path, to_onnx(bundle).SerializeToString())
     worst = compare(bundle, path)
     if worst > TOLERANCE:
         path.unlink()

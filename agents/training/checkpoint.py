@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from agents.training.algorithms import algorithm_class, need
+from drive_env.whole_file import write_whole
 from mechanics.untrusted import MOST_TEXT, parse_json, read_member
 
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
@@ -41,7 +42,6 @@ class UntrustedError(CheckpointError):
 
 def save(path: Path, model: Any, normaliser: Any, run: dict[str, Any]) -> None:
     """Write a checkpoint; the file is whole or not there."""
-    beside = path.with_name(path.name + ".part")
     memory = io.BytesIO()
     model.save(memory)
     with zipfile.ZipFile(memory, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
@@ -51,9 +51,7 @@ def save(path: Path, model: Any, normaliser: Any, run: dict[str, Any]) -> None:
             archive.writestr(NORMALISER, pickle.dumps(normaliser))
         if getattr(model, "replay_buffer", None) is not None:
             archive.writestr(BUFFER, pickle.dumps(model.replay_buffer, protocol=5))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside.write_bytes(memory.getvalue())
-    beside.replace(path)
+    write_whole(path, memory.getvalue())
 
 
 def read_run(path: Path) -> dict[str, Any]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 from pathlib import Path
 
-from drive_env.whole_file import write_whole
+from drive_env.whole_file import write_picture
 
 TERM = "term "  # what columns of reward terms begin with
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
@@ -49,9 +48,7 @@ def draw_learning_curve(table: Path, picture: Path, title: str) -> None:
     for panel in panels:
         panel.grid(color="0.9")
         panel.set_axisbelow(True)
-    memory = io.BytesIO()
-    figure.savefig(memory, dpi=120, format="png")
-    write_whole(picture, memory.getvalue())
+    write_picture(picture, figure, 120)
 
 
 def _number(text: str | None) -> float:

@@ -21,6 +21,7 @@ from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
 from agents.training.train import DivergedError, train
 from agents.training.training_run import TrainingRun
+from drive_env.whole_file import write_whole
 from tuning.runs.provenance import check_study
 
 if TYPE_CHECKING:
@@ -198,8 +199,7 @@ class _Study:
         """Keep what came of a trial, and tell it."""
         for name, content in scored.files.items():
             path = self._folder_of(trial) / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            write_whole(path, content)
         # A training that diverges is a trial that failed: the next ones go elsewhere.
         state = self._states.FAIL if scored.score is None else self._states.COMPLETE
         found = self._study.tell(trial, scored.score, state=state)
@@ -282,7 +282,7 @@ def _in_turn(results: Iterator[tuple[int, _Scored]]) -> Iterator[_Scored]:
 def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, trial: Any) -> None:
     """Write hyper-parameters as a file that `drive-agent train --config` takes."""
     text = yaml.safe_dump({environment: dict(best), "quick": {}, "full": {}}, sort_keys=False)
-    path.write_text(f"# Trial {trial.number}, the best of {len(study.trials)}.\n\n{text}", encoding="utf-8")
+    write_whole(path, f"# Trial {trial.number}, the best of {len(study.trials)}.\n\n{text}")
 
 
 def drawn(algorithm: str, hyperparameters: Mapping[str, Any], trial: Any) -> dict[str, Any]:

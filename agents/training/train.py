@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -98,7 +99,8 @@ def train(
         left = run.total - (model.num_timesteps if resume else 0)
         if left > 0:
             try:
-                model.learn(left, callback=segments, log_interval=1, reset_num_timesteps=not resume)
+                with _without_tracebacks_of_threads():
+                    model.learn(left, callback=segments, log_interval=1, reset_num_timesteps=not resume)
             except ValueError:  # torch's, of a distribution without a mean
                 if is_sound(model):
                     raise
@@ -114,6 +116,17 @@ def train(
     finally:
         torch.set_num_threads(threads)
         env.close()
+
+
+@contextmanager
+def _without_tracebacks_of_threads() -> Iterator[None]:
+    """Let TensorBoard's thread that finds a full disk end without a traceback: the training ends with that error."""
+    before = threading.excepthook
+    threading.excepthook = lambda args: None if isinstance(args.exc_value, OSError) else before(args)
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def clear(folder: str | Path) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from drive_env.whole_file import naming
+
 
 class TrainingTable:
     """Rows of a CSV; the first one says which columns there are.
@@ -32,7 +34,7 @@ class TrainingTable:
         first = not self._columns
         if first:
             self._columns = list(row)
-        with self._path.open("a", newline="", encoding="utf-8") as file:
+        with naming(self._path), self._path.open("a", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._columns, restval="", extrasaction="ignore")
             if first:
                 writer.writeheader()

@@ -6,6 +6,8 @@ import struct
 from pathlib import Path
 from typing import Any
 
+from drive_env.whole_file import naming
+
 # Beside an identifier, and of an error frame (linux/can.h, linux/can/error.h).
 EXTENDED, REMOTE, ERROR, BUS_ERROR = 1 << 31, 1 << 30, 1 << 29, 0x80
 BIT_RATE_SWITCH, ERROR_STATE, FD = 0x01, 0x02, 0x04  # of CAN FD
@@ -66,15 +68,19 @@ class FrameFile:
 
     def __init__(self, path: Path) -> None:
         header, self._encode = FRAME_FILES[path.suffix.lower()]
+        self._path = path
         self._file: Any = path.open("xb")
-        self._file.write(header)
+        with naming(path):
+            self._file.write(header)
 
     def __enter__(self) -> FrameFile:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._file.close()
+        with naming(self._path):
+            self._file.close()
 
     def __call__(self, message: Any) -> None:
         """Write a frame."""
-        self._file.write(self._encode(message))
+        with naming(self._path):
+            self._file.write(self._encode(message))

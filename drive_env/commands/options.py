@@ -141,26 +141,16 @@ def look_first(
     timeout: float | None = None,
 ) -> None:
     """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command."""
-    from drive_env.master.open_drives import default_nodes, is_ethercat
-
-    if is_ethercat(interface):
-        return
-    from drive_env.master.can.port import Port, open_bus
-    from drive_env.master.can.sdo import SdoClient
-    from drive_env.master.description import describe
     from drive_env.master.errors import NoAnswerError
+    from drive_env.master.open_drives import check_answers
 
-    patience = describe(device, eds).answer_timeout if timeout is None else timeout
-    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    named = {"interface": interface, "channel": channel, "nodes": nodes, "bitrate": bitrate}
     try:
-        for node in nodes or default_nodes(interface):
-            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
+        check_answers(device, eds=eds, timeout=timeout, **named)
     except NoAnswerError as error:
         raise NoAnswerError(
             f"{error}; if it is in the NMT state stopped, a run without --dry-run takes it to pre-operational"
         ) from None
-    finally:
-        port.close()
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -283,15 +282,14 @@ def _thin(rows: dict[Any, Any], start: int, every: int) -> tuple[Any, dict[Any, 
 
 def write_table(path: Path, entries: list[Any], labels: list[str], t: Any, rows: dict[Any, Any]) -> None:
     """Write samples as CSV: times [s], then integers of each entry and axis, rows of shape (n, axes)."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        header = ["t [s]"]
-        for entry in entries:
-            unit = f" [{entry.unit}]" if entry.unit else ""
-            header += [f"{entry.label}{unit}" + (f" ({label})" if len(labels) > 1 else "") for label in labels]
-        writer.writerow(header)
-        for k, time in enumerate(t):
-            writer.writerow([f"{time:.3f}", *(int(v) for entry in entries for v in rows[entry][k])])
+    from drive_env import whole_file
+
+    header = ["t [s]"]
+    for entry in entries:
+        unit = f" [{entry.unit}]" if entry.unit else ""
+        header += [f"{entry.label}{unit}" + (f" ({label})" if len(labels) > 1 else "") for label in labels]
+    samples = [[f"{time:.3f}", *(int(v) for entry in entries for v in rows[entry][k])] for k, time in enumerate(t)]
+    whole_file.write_table(path, [header, *samples])
 
 
 def draw(path: Path, entries: list[Any], labels: list[str], scales: list[Scale], t: Any, rows: dict[Any, Any]) -> None:
@@ -300,6 +298,7 @@ def draw(path: Path, entries: list[Any], labels: list[str], scales: list[Scale],
     from matplotlib.figure import Figure
 
     from drive_env.master.quantities import SHOWN, UNITS, find_unit
+    from drive_env.whole_file import write_picture
 
     figure = Figure(figsize=(9.0, 1.2 + 1.9 * len(entries)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -322,4 +321,4 @@ def draw(path: Path, entries: list[Any], labels: list[str], scales: list[Scale],
     if len(labels) > 1:
         panels[0].legend(loc="upper right", fontsize="small", ncols=min(len(labels), 4))
     panels[-1].set_xlabel("time from the trigger [s]" if t[0] < 0.0 else "time [s]")
-    figure.savefig(path, dpi=110)
+    write_picture(path, figure, 110)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.master.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
+from drive_env.whole_file import write_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,11 +98,9 @@ class Trace:
         Raises:
             OSError: If it cannot be written.
         """
-        with Path(path).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["t [s]", *(name for name, _ in self._columns())])
-            columns = [values.tolist() for _, values in self._columns()]
-            writer.writerows(zip((f"{time:.6g}" for time in self.t), *columns, strict=True))
+        head = ["t [s]", *(name for name, _ in self._columns())]
+        columns = [values.tolist() for _, values in self._columns()]
+        write_table(Path(path), [head, *zip((f"{time:.6g}" for time in self.t), *columns, strict=True)])
         return Path(path)
 
     def to_frame(self) -> Any:

@@ -6,6 +6,8 @@ import struct
 from pathlib import Path
 from types import TracebackType
 
+from drive_env.whole_file import naming
+
 MAGIC, ETHERNET_LINK, LARGEST = 0xA1B23C4D, 1, 65_535
 
 
@@ -21,18 +23,21 @@ class PcapLog:
     """
 
     def __init__(self, path: Path, epoch: float = 0.0) -> None:
-        self._epoch = epoch
+        self._epoch, self._path = epoch, path
         self._file = path.open("xb")
-        self._file.write(struct.pack("<IHHiIII", MAGIC, 2, 4, 0, 0, LARGEST, ETHERNET_LINK))
+        with naming(path):
+            self._file.write(struct.pack("<IHHiIII", MAGIC, 2, 4, 0, 0, LARGEST, ETHERNET_LINK))
 
     def add(self, now: float, frame: bytes, _came_back: bool = False) -> None:
         """Write a frame at world time `now` [s]."""
         seconds, nanoseconds = divmod(round((self._epoch + now) * 1e9), 1_000_000_000)
-        self._file.write(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
+        with naming(self._path):
+            self._file.write(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
 
     def close(self) -> None:
         """End the file."""
-        self._file.close()
+        with naming(self._path):
+            self._file.close()
 
     def __enter__(self) -> PcapLog:
         return self

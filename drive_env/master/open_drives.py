@@ -42,3 +42,28 @@ def open_drives(device: str = "tmcm1636", **options: Any) -> BusDrives:
     from drive_env.master.can_drives import CanDrives
 
     return CanDrives(device, **options)
+
+
+def check_answers(device: str = "tmcm1636", **options: Any) -> None:
+    """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command.
+
+    Args:
+        device: Name of a known device.
+        options: As `open_drives` takes them; of those, how the bus is reached, the nodes, and the EDS.
+    """
+    interface = options.get("interface")
+    if is_ethercat(interface):
+        return  # who opens a segment takes its slaves to another state in any case
+    from drive_env.master.can.port import Port, open_bus
+    from drive_env.master.can.sdo import SdoClient
+    from drive_env.master.description import describe
+
+    eds, timeout, bitrate = options.get("eds"), options.get("timeout"), options.get("bitrate")
+    patience = describe(device, eds).answer_timeout if timeout is None else timeout
+    bus = open_bus(interface, options.get("channel"), **({} if bitrate is None else {"bitrate": bitrate}))
+    port = Port(bus)
+    try:
+        for node in options.get("nodes") or default_nodes(interface):
+            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
+    finally:
+        port.close()

@@ -45,6 +45,8 @@ COMMANDS = {
 _DEVICE_OBJECTS = 0x2000  # from here on; what lies below is how a node talks
 _COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
 _MAPPING_ABOVE = 0x200  # the mapping of a PDO lies so far above its communication parameter
+# What sync managers 2 and 3 of EtherCAT carry, and the mappings that are meant: none is changed while it is assigned.
+_ASSIGNMENTS = {0x1C12: range(0x1600, 0x1800), 0x1C13: range(0x1A00, 0x1C00)}
 
 
 class Difference(NamedTuple):
@@ -193,7 +195,12 @@ def _roll_back(drives: BusDrives, before: Mapping[Key, int], axis: int, cause: B
 def _pdos_of(drives: BusDrives, changes: list[Difference]) -> list[Key]:
     """Return all that belongs to the PDOs that change: they are switched off for it, and emptied."""
     bases = {_pdo_of(change.entry.index) for change in changes} - {None}
-    return [(entry.index, entry.sub) for entry in parameters(drives) if _pdo_of(entry.index) in bases]
+    images = {_assignment_of(change.entry.index) for change in changes} - {None}
+    return [
+        (entry.index, entry.sub)
+        for entry in parameters(drives)
+        if _pdo_of(entry.index) in bases or entry.index in images
+    ]
 
 
 def read_these(drives: BusDrives, keys: Iterable[Key], axis: int) -> dict[Key, int]:
@@ -209,12 +216,21 @@ def _write(drives: BusDrives, changes: Mapping[Key, int], before: Mapping[Key, i
 def _in_order(changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator[tuple[Key, int]]:
     """Return the writes: as they come, but a PDO is switched off and emptied, then filled, then switched on."""
     pdos: dict[int, None] = {}
+    images: dict[int, dict[int, None]] = {}
     for (index, sub), value in changes.items():
-        base = _pdo_of(index)
-        if base is None or (base, 1) not in before:
-            yield (index, sub), value
-        else:
+        base, assignment = _pdo_of(index), _assignment_of(index)
+        if base is not None and (base, 1) in before:
             pdos[base] = None
+        elif assignment is not None and (assignment, 0) in before:
+            images.setdefault(assignment, {})
+            if index != assignment:
+                images[assignment][index] = None
+        else:
+            yield (index, sub), value
+    for assignment, mappings in images.items():
+        yield (assignment, 0), 0
+        for index in (*mappings, assignment):
+            yield from _as_list(index, changes, before)
     for base in pdos:
         wanted = {key: changes.get(key, value) for key, value in before.items() if _pdo_of(key[0]) == base}
         mapping = base + _MAPPING_ABOVE
@@ -230,6 +246,22 @@ def _in_order(changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator
                     yield (mapping, sub), wanted[mapping, sub]
             yield (mapping, 0), count
         yield (base, 1), cob_id
+
+
+def _as_list(index: int, changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator[tuple[Key, int]]:
+    """Return the writes of a list, whose entries are changed while it has none."""
+    wanted = {key: changes.get(key, value) for key, value in before.items() if key[0] == index}
+    count = wanted[index, 0]
+    yield (index, 0), 0
+    for key, value in wanted.items():
+        if key[1] and (key[1] <= count or key in changes):
+            yield key, value
+    yield (index, 0), count
+
+
+def _assignment_of(index: int) -> int | None:
+    """Return the assignment of EtherCAT that an object is, or that may have this mapping."""
+    return next((one for one, mappings in _ASSIGNMENTS.items() if index == one or index in mappings), None)
 
 
 def _pdo_of(index: int) -> int | None:

@@ -10,12 +10,10 @@ import typer
 
 from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
-    INTERRUPTED,
     REFUSED,
     Json,
     TargetOptions,
     errors_as_exit_codes,
-    fail,
     print_json,
     progress_bar,
     takes,
@@ -49,42 +47,25 @@ def auto(
     report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
+        from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files
         from tuning.runs import provenance
+        from tuning.way_back import way_back
 
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
-        with drive.open() as target:
+        file = folder / BEFORE if drive.bus else None
+        result: Result | StepperResult
+        with way_back(file, "drive-tune"), drive.open() as target:
             if target.device.gains.is_open_loop:
-                _stepper(target, folder, store, json)
-                return
-            result = _run(target, folder, drive.seed, store)
-            _report(target, result, folder, json)
+                with progress_bar("commissioning") as show:
+                    result = commission_to_files(target, folder, lambda what, share: show(share), keep=store)
+                _report_stepper(target, result, folder, json)
+            else:
+                with progress_bar("tuning") as show:
+                    result = auto_to_files(target, folder, lambda what, share: show(share), seed=drive.seed, keep=store)
+                _report(target, result, folder, json)
         if not result.accepted.all():
             raise typer.Exit(REFUSED)
-
-
-def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
-    from tuning.auto.run_to_files import BEFORE, auto_to_files
-
-    try:
-        with progress_bar("tuning") as show:
-            return auto_to_files(target, folder, lambda what, share: show(share), seed=seed, keep=store)
-    except KeyboardInterrupt:
-        fail(f"interrupted; {_left_behind(target, folder / BEFORE)}", INTERRUPTED)
-
-
-def _stepper(target: Target, folder: Path, store: bool, json: bool) -> None:
-    """Commission an open-loop stepper."""
-    from tuning.auto.run_to_files import BEFORE, commission_to_files
-
-    try:
-        with progress_bar("commissioning") as show:
-            result = commission_to_files(target, folder, lambda what, share: show(share), keep=store)
-    except KeyboardInterrupt:
-        fail(f"interrupted; {_left_behind(target, folder / BEFORE)}", INTERRUPTED)
-    _report_stepper(target, result, folder, json)
-    if not result.accepted.all():
-        raise typer.Exit(REFUSED)
 
 
 def _report_stepper(target: Target, result: StepperResult, folder: Path, json: bool) -> None:
@@ -132,22 +113,6 @@ def _not_kept(target: Target) -> str:
     if not target.bus or can_store(target):
         return ""
     return "; the drive has no 1010h: it has the settings until it is switched off (`drive-env backup` keeps them)"
-
-
-def _left_behind(target: Target, file: Path) -> str:
-    """Return the state of the drives after Ctrl-C, which may come at any time."""
-    import numpy as np
-
-    from tuning.snapshot import load_snapshot
-
-    if not file.exists():
-        return "nothing was changed"
-    before = load_snapshot(file)
-    if all(
-        np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in target.device.gains.keys
-    ):
-        return f"the drives are disabled and have the gains from before; if not, drive-tune undo {file} restores them"
-    return f"the drives are disabled and have the new gains: drive-tune undo {file} restores the state before"
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:

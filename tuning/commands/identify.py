@@ -18,12 +18,12 @@ from tuning.commands.options import (
     TargetOptions,
     before_as_json,
     errors_as_exit_codes,
+    file_of,
     print_json,
     progress_bar,
     takes,
     tell_before,
     unchanged,
-    way_back,
 )
 from tuning.identify.estimate import TITLES, interval
 
@@ -57,11 +57,11 @@ def identify(
             check_writable(out)
         drive.check()
         drive.check_linear_model()
-        file = way_back(drive, "identify", None if out is None else out.with_suffix(""))
+        file = file_of(drive, "identify", None if out is None else out.with_suffix(""))
         from drive_env.whole_file import write_whole
         from tuning.identify.identification import identify as run
 
-        with drive.open() as target, unchanged(target, file), progress_bar("identifying") as show:
+        with unchanged(drive, file) as (target, _), progress_bar("identifying") as show:
             found = run(target, progress=lambda what, share: show(share))
             numbers = target.axis_numbers
         rows = [{"axis": axis} | row(one) for axis, one in zip(numbers, found, strict=True)]

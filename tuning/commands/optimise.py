@@ -167,13 +167,14 @@ def _on_machine(
     from tuning.runs import unfinished
 
     machine = drive.machine() | {"num_machines": copies}
-    try:
-        found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
-    except KeyboardInterrupt:
-        kept = what_an_interrupt_leaves(folder) if settings.journal is None else _kept_in(settings.journal)
-        fail(kept, INTERRUPTED)
     options = _named(drive) | {"load": drive.load, "copies": copies, "searches": searches}
-    _save(found, settings, folder, options)
+    with unfinished.telling_what_is_kept(folder):
+        try:
+            found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
+        except KeyboardInterrupt:
+            kept = what_an_interrupt_leaves(folder) if settings.journal is None else _kept_in(settings.journal)
+            fail(kept, INTERRUPTED)
+        _save(found, settings, folder, options)
     _report(found, settings, folder, None, f"an emulated {drive.load}", options, json)
     unfinished.discard(folder)
 
@@ -181,16 +182,17 @@ def _on_machine(
 def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
     """Search on the drives of a bus, write and print what was found."""
     from tuning.snapshot import file_before
+    from tuning.way_back import way_back
 
     before = file_before("optimise", folder)
-    with drive.open() as target:
-        given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
-        options = _named(drive) | given | {key: value for key, value in target.bus.items() if key != "axes"}
-        try:
+    try:
+        with way_back(before, "drive-tune"), drive.open() as target:
+            given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
+            options = _named(drive) | given | {key: value for key, value in target.bus.items() if key != "axes"}
             found = _search_bus(target, settings, before, folder, options)
-        except KeyboardInterrupt:
-            lost = "interrupted; the trials made so far are lost: on a bus they are kept only with --journal FILE"
-            fail(lost if settings.journal is None else _kept_in(settings.journal), INTERRUPTED)
+    except KeyboardInterrupt:
+        lost = "interrupted; the trials made so far are lost: on a bus they are kept only with --journal FILE"
+        fail(lost if settings.journal is None else _kept_in(settings.journal), INTERRUPTED)
     _report(found, settings, folder, before, "the bus", options, json)
 
 
@@ -255,11 +257,11 @@ def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options:
     """
     from tuning.search.optimise import optimise as search
     from tuning.search.trial_bench import leave_oscillations_to_trials
-    from tuning.snapshot import put_back
+    from tuning.snapshot import Transaction
 
     leave_oscillations_to_trials(target.drives)
     with (
-        put_back(target, before, "drive-tune") as transaction,
+        Transaction(target, before) as transaction,
         progress_bar(f"{settings.trials} trials by {settings.sampler}") as show,
     ):
         try:

@@ -6,7 +6,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -301,8 +301,10 @@ def open_target(drive: DriveOptions) -> Target:
     """Return what a command's options name, drives on a bus or emulated ones, without asking.
 
     Raises:
-        ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer.
+        ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer, or
+            another master commands it.
     """
+    from drive_env.commands.scope import refuse_other_masters
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     drive.check()
@@ -313,6 +315,8 @@ def open_target(drive: DriveOptions) -> Target:
     options: dict[str, Any] = {} if drive.bitrate is None else {"bitrate": drive.bitrate}
     if drive.lockstep:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
+    # Two tuners take each other's answers, and the second would keep the first one's trial as the state before.
+    refuse_other_masters(drive.interface, drive.channel, drive.nodes, drive.bitrate)
     return on_bus(
         drive.device,
         drive.motor_name,
@@ -327,7 +331,7 @@ def open_target(drive: DriveOptions) -> Target:
     )
 
 
-def way_back(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:
+def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:
     """Return the file for the state before of drives on a bus, None for emulated ones; raises as `file_before` does."""
     if not drive.bus:
         return None
@@ -337,15 +341,17 @@ def way_back(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | 
 
 
 @contextmanager
-def unchanged(target: Target, file: Path | None) -> Iterator[Transaction | None]:
-    """Save the state before to a file, if there is one, and restore at the end what is not committed."""
-    if file is None:
-        yield None
-        return
-    from tuning.snapshot import put_back
+def unchanged(drive: DriveOptions, file: Path | None) -> Iterator[tuple[Target, Transaction | None]]:
+    """Open drives, with their state before in a file if there is one, and restore at the end what is not committed."""
+    from tuning.snapshot import Transaction
+    from tuning.way_back import way_back
 
-    with put_back(target, file, "drive-tune") as transaction:
-        yield transaction
+    with (
+        way_back(file, "drive-tune"),
+        drive.open() as target,
+        nullcontext() if file is None else Transaction(target, file) as transaction,
+    ):
+        yield target, transaction
 
 
 def before_as_json(file: Path | None) -> dict[str, str]:
@@ -354,11 +360,11 @@ def before_as_json(file: Path | None) -> dict[str, str]:
 
 
 def tell_before(file: Path | None) -> None:
-    """Print where the state before is, once everything is restored."""
+    """Print what drives of a bus have other than before, and the line that restores it."""
     if file is not None:
-        from tuning.snapshot import what_is_left
+        from tuning.way_back import what_is_changed
 
-        print(what_is_left(file))
+        print(what_is_changed(file))
 
 
 @contextmanager

@@ -93,9 +93,10 @@ def rank(
                 "count": count,
                 "trials": trials,
             } | provenance.versions()
-            comparison = _compare(machines, compared, settings, folder, resume, workers, cluster)
-            with provenance.new_folder(folder) as partial:
-                save(comparison, partial, settings)
+            with unfinished.telling_what_is_kept(folder):
+                comparison = _compare(machines, compared, settings, folder, resume, workers, cluster)
+                with provenance.new_folder(folder) as partial:
+                    save(comparison, partial, settings)
             unfinished.discard(folder)
             _report(comparison, folder, left_out, json)
         except KeyboardInterrupt:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,12 +18,12 @@ from tuning.commands.options import (
     before_as_json,
     errors_as_exit_codes,
     fail,
+    file_of,
     print_json,
     progress_bar,
     takes,
     tell_before,
     unchanged,
-    way_back,
 )
 from tuning.identify.estimate import TITLES
 
@@ -73,8 +72,8 @@ def response(
             )
         drive.check()
         drive.check_linear_model()
-        file = way_back(drive, "response", out)
-        with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
+        file = file_of(drive, "response", out)
+        with unchanged(drive, file) as (target, _), progress_bar("shaking") as show:
             measured = measure(target, loop, signal=Signal(signal, low, high, resolution), traced=trace, progress=show)
             numbers = target.axis_numbers
         if out is not None:
@@ -98,6 +97,7 @@ def _axes(measured: MeasuredLoop) -> range:
 def _write(folder: Path, measured: MeasuredLoop, numbers: Sequence[int]) -> None:
     import numpy as np
 
+    from drive_env.whole_file import write_table
     from tuning.response.bode import write_bode
     from tuning.runs.provenance import new_folder
 
@@ -105,18 +105,17 @@ def _write(folder: Path, measured: MeasuredLoop, numbers: Sequence[int]) -> None
         for axis in _axes(measured):
             name = f"{measured.loop}_axis{numbers[axis]}"
             write_bode(partial / f"{name}.png", measured, axis)
-            with (partial / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-                table = csv.writer(file)
-                table.writerow(COLUMNS)
-                for k, f in enumerate(measured.f):
-                    L = measured.open_loop[k, axis]
-                    known = bool(np.isfinite(L)) and L != 0.0
-                    gain = 20.0 * math.log10(abs(L)) if known else math.nan
-                    phase = math.degrees(np.angle(L)) if known else math.nan
-                    source = "emulator's trace" if measured.traced[k] else "bus"
-                    trusted = int(measured.trusted[k, axis])
-                    row = (f"{gain:.4f}", f"{phase:.3f}", f"{measured.coherence[k, axis]:.4f}", trusted, source)
-                    table.writerow((f"{f:g}", *row))
+            rows: list[Sequence[object]] = [COLUMNS]
+            for k, f in enumerate(measured.f):
+                L = measured.open_loop[k, axis]
+                known = bool(np.isfinite(L)) and L != 0.0
+                gain = 20.0 * math.log10(abs(L)) if known else math.nan
+                phase = math.degrees(np.angle(L)) if known else math.nan
+                source = "emulator's trace" if measured.traced[k] else "bus"
+                trusted = int(measured.trusted[k, axis])
+                row = (f"{gain:.4f}", f"{phase:.3f}", f"{measured.coherence[k, axis]:.4f}", trusted, source)
+                rows.append((f"{f:g}", *row))
+            write_table(partial / f"{name}.csv", rows)
 
 
 def _as_json(measured: MeasuredLoop, numbers: Sequence[int]) -> list[dict[str, Any]]:

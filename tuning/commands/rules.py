@@ -81,7 +81,7 @@ def rules(
         if drive.bus:
             check_place(file)  # written before the motor turns; of emulated drives, before their gains change
         before = file if drive.bus else None
-        with drive.open() as target, unchanged(target, before) as transaction:
+        with unchanged(drive, before) as (target, transaction):
             with progress_bar("identifying") as show:
                 plants = identified_plants(target, show)
             known = [plant for plant in plants if not isinstance(plant, str)]

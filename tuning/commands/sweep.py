@@ -80,9 +80,12 @@ def sweep(
 
             if resume and out is None:
                 raise ValueError("--resume needs --out: the folder into which the run was to write")
+            from tuning.runs.unfinished import telling_what_is_kept
+
             folder = provenance.run_folder("sweep") if out is None else out
             try:
-                _sweep(config, overrides, folder, workers, cluster, resume)
+                with telling_what_is_kept(folder):
+                    _sweep(config, overrides, folder, workers, cluster, resume)
             except KeyboardInterrupt:
                 fail(what_an_interrupt_leaves(folder), INTERRUPTED)
 

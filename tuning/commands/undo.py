@@ -75,7 +75,7 @@ def _restore(
 ) -> tuple[list[tuple[int, Any]], int]:
     """Return what was changed as (axis, difference), and how many parameters another connection has read anew."""
     from drive_env.master.open_drives import open_drives
-    from drive_env.master.parameters import compare, list_differences, restorable
+    from drive_env.master.parameters import list_differences, restorable
     from tuning import snapshot as snapshots
     from tuning.target import of_nodes
 
@@ -84,19 +84,20 @@ def _restore(
     with open_drives(snapshot.device, safety=False, **address) as drives:
         snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)
         chosen = drives if axes is None else of_nodes(drives, axes)
-        numbers = chosen.axis_numbers
+        numbers = [*chosen.axis_numbers, *snapshot.left_out]
         changed = snapshots.restore(chosen, snapshot)
         if store:
             snapshots.store(chosen)
-    verified = 0
     with open_drives(snapshot.device, safety=False, **address) as drives:
-        for axis, values in zip(numbers, snapshot.axes, strict=True):
-            wanted = restorable(values, drives.description.hints)
-            verified += len(wanted)
-            if left := compare(drives, wanted, axis):
-                fail(
-                    f"axis {axis} does not have the values that were written, by a second reading: "
-                    f"{list_differences(left)}; is another master writing to it? End it, then restore {file} again",
-                    REFUSED,
-                )
+        left = snapshots.differences(drives, snapshot)
+        hints = drives.description.hints
+        verified = sum(len(restorable(one, hints)) for one in (*snapshot.axes, *snapshot.left_out.values()))
+    if left:
+        first = left[0][0]
+        fail(
+            f"axis {first} does not have the values that were written, by a second reading: "
+            f"{list_differences([change for axis, change in left if axis == first])}; is another master writing to it? "
+            f"End it, then restore {file} again",
+            REFUSED,
+        )
     return [(axis, change) for axis, changes in zip(numbers, changed, strict=True) for change in changes], verified

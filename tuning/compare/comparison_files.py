@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from drive_env.whole_file import write_table, write_whole
 from tuning.compare.against_best import RivalRow, all_rivals
 from tuning.compare.comparison import Comparison, MachineRow, TunerRow
 from tuning.compare.comparison_picture import draw
@@ -19,7 +19,7 @@ def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> N
     _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
     _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
     _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
-    (folder / "settings.toml").write_text(settings_text(settings), encoding="utf-8", newline="\n")
+    write_whole(folder / "settings.toml", settings_text(settings))
     draw(comparison, folder / "comparison.png")
 
 
@@ -35,13 +35,10 @@ def _toml(value: Any) -> str:
 
 
 def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        names = [field.name for field in fields(kind)]
-        # A mapping has a column for each of its names, which are those of the first row.
-        table = [_columns({name: getattr(row, name) for name in names}) for row in rows]
-        writer.writerow(table[0] if table else names)
-        writer.writerows([[_cell(value) for value in row.values()] for row in table])
+    names = [field.name for field in fields(kind)]
+    # A mapping has a column for each of its names, which are those of the first row.
+    table = [_columns({name: getattr(row, name) for name in names}) for row in rows]
+    write_table(path, [table[0] if table else names, *([_cell(value) for value in row.values()] for row in table)])
 
 
 def _columns(row: Mapping[str, Any]) -> dict[str, Any]:

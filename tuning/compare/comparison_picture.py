@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drive_env.whole_file import write_picture
 from tuning.compare.comparison import WORSE as WORSE_FROM
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def draw(comparison: Comparison, path: Path) -> None:
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     score.set_ylim(-0.6, len(tuners) - 0.4)
-    figure.savefig(path, dpi=120)
+    write_picture(path, figure, 120)
 
 
 def _bars(axes: Axes, values: list[float], label: str, *, whole: bool = False) -> None:

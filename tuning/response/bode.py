@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.whole_file import write_picture
 from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
 from tuning.response.measured_loop import COHERENT, MeasuredLoop
 
@@ -57,7 +58,7 @@ def bode_figure(response: MeasuredLoop, axis: int = 0, plant: Plant | None = Non
 
 def write_bode(path: Path, response: MeasuredLoop, axis: int = 0, plant: Plant | None = None) -> None:
     """Write `bode_figure` to a file; its ending decides the format: .png, .svg, .pdf."""
-    bode_figure(response, axis, plant).savefig(path, dpi=120)
+    write_picture(path, bode_figure(response, axis, plant), 120)
 
 
 def _model(response: MeasuredLoop, axis: int, plant: Plant | None) -> tuple[Floats, Complex] | None:

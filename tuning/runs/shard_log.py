@@ -11,12 +11,14 @@ import io
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.whole_file import naming
 from mechanics.untrusted import MOST_ARRAYS, parse_json, read_arrays
 from tuning.runs import provenance
 
@@ -52,8 +54,13 @@ class ShardLog:
         self._file.truncate(end)
         self._file.seek(end)
         if end == 0:
-            self._file.write(json.dumps({"run": self._key, "sources": provenance.SOURCES}).encode() + b"\n")
-            self._flush()
+            try:
+                self._write(json.dumps({"run": self._key, "sources": provenance.SOURCES}).encode() + b"\n")
+            except OSError:
+                with suppress(OSError):  # what found no room is tried once more
+                    self._file.close()
+                self.path.unlink()
+                raise
 
     def append(self, shard: int, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Add the result of a shard; once this returns it survives the process."""
@@ -62,13 +69,13 @@ class ShardLog:
         content = data.getvalue()
         header = {"shard": shard, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
         self.holds_results = True
-        self._file.write(json.dumps(header).encode() + b"\n" + content)
-        self._flush()
+        self._write(json.dumps(header).encode() + b"\n" + content)
         self.done[shard] = dict(arrays)
 
     def close(self) -> None:
         """Close the file; it stays."""
-        self._file.close()
+        with suppress(OSError):  # what found no room is tried once more, and was told
+            self._file.close()
 
     def __enter__(self) -> ShardLog:
         return self
@@ -76,9 +83,11 @@ class ShardLog:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _flush(self) -> None:
-        self._file.flush()
-        os.fsync(self._file.fileno())
+    def _write(self, frame: bytes) -> None:
+        with naming(self.path):
+            self._file.write(frame)
+            self._file.flush()
+            os.fsync(self._file.fileno())
 
     def _read(self) -> int:
         """Read the complete frames and return where they end."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -27,6 +26,7 @@ from drive_env.drives.trace import Trace
 from drive_env.phase_current import run_and_standby
 from drive_env.trials.open_loop import ENCODER, LOST, NO_WINDOW, TOOTH
 from drive_env.trials.positioning import wrapped
+from drive_env.whole_file import write_picture, write_table, write_whole
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
 from tuning.runs import metrics, provenance
@@ -113,20 +113,17 @@ class SweepResult:
         from tuning.runs import plots
 
         with provenance.new_folder(folder) as partial:
-            with (partial / "results.csv").open("w", newline="", encoding="utf-8") as file:
-                self._write_csv(file)
-            plots.heat_map(self).savefig(partial / "heatmap.png")
-            plots.best_response(self).savefig(partial / "best_response.png")
-            settings = provenance.HEADER + self.experiment.to_toml(provenance.versions())
-            (partial / "settings.toml").write_text(settings, encoding="utf-8")
+            self._write_csv(partial / "results.csv")
+            for name, figure in (("heatmap", plots.heat_map(self)), ("best_response", plots.best_response(self))):
+                write_picture(partial / f"{name}.png", figure, figure.dpi)
+            write_whole(partial / "settings.toml", provenance.HEADER + self.experiment.to_toml(provenance.versions()))
         return Path(folder)
 
-    def _write_csv(self, file: Any) -> None:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(self.columns)
+    def _write_csv(self, path: Path) -> None:
         # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
         columns = [column.astype(int) if column.dtype == bool else column for column in self.columns.values()]
-        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        write_table(path, [list(self.columns), *rows], lineterminator="\n")
 
 
 class Shard(NamedTuple):

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from drive_env.whole_file import write_whole
 from tuning.runs.shard_log import ShardLog, ShardLogError
 
 SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part-"
@@ -45,15 +46,34 @@ def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[Sh
     place = unfinished_folder(folder)
     if place.exists() and not resume:
         raise ShardLogError(f"{place} holds an unfinished run; continue it with --resume, or remove it")
+    is_new = not place.exists()
     place.mkdir(parents=True, exist_ok=True)
-    with ShardLog(place / SHARDS, settings) as log:
-        if not (place / SETTINGS).exists():
-            (place / SETTINGS).write_text(settings, encoding="utf-8", newline="\n")
+    try:
+        begun = ShardLog(place / SHARDS, settings)
+    except OSError:
+        if is_new:
+            discard(folder)
+        raise
+    with begun as log:
         try:
+            if not (place / SETTINGS).exists():
+                write_whole(place / SETTINGS, settings)
             yield log
         finally:
             if not log.holds_results and not has_parts(log):
                 discard(folder)
+
+
+@contextmanager
+def telling_what_is_kept(folder: str | Path) -> Iterator[None]:
+    """Have the error of a file that cannot be written, as on a full disk, say how a run in this folder goes on."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None or not unfinished_folder(folder).exists():
+            raise
+        why = f"{error.strerror}; the completed part is kept: make room, then continue with --out {folder} --resume"
+        raise OSError(error.errno, why, error.filename) from None
 
 
 def has_parts(log: ShardLog) -> bool:

@@ -25,6 +25,7 @@ from drive_env.trials.method import method_of
 from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, longer_way, wrapped, write_profile
 from drive_env.trials.score import TRIP
 from tuning.auto.fallback_gains import FallbackGains
+from tuning.identify.connected_motors import check_motors
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
 from tuning.stop_causes import told_causes
 from tuning.target import Target
@@ -133,6 +134,7 @@ class TrialBench:
         present = read_gains(target)
         gains = self.method.keep(self.method.first(target.supply), present)
         write_gains(drives, gains)  # before anything is enabled: the drives may have any
+        check_motors(target.drives)
         self._trials.recover(self._where)
         drives.advance(CALM)
         self.identified, self._origin = self._moved(gains)

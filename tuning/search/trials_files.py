@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drive_env.devices import find_device
-from drive_env.whole_file import write_whole
+from drive_env.whole_file import write_picture, write_whole
 from mechanics.untrusted import read_toml
 from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
 from tuning.search.trial_bench import OBJECTIVES
@@ -94,9 +94,7 @@ def save(
     lines += ["", "[machine]", *_lines(machine)]
     lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
     write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
-    picture = io.BytesIO()
-    trials_figure(found, settings, machine["device"]).savefig(picture, dpi=120)
-    write_whole(folder / "trials.png", picture.getvalue())
+    write_picture(folder / "trials.png", trials_figure(found, settings, machine["device"]), 120)
 
 
 def titles(device: str, gains: tuple[str, ...] | None) -> dict[str, str]:

@@ -1,0 +1,74 @@
+"""What a command that changes drives of a bus says at its end: what is changed still, and the line that restores it.
+
+It is not what the run believes: the drives are opened anew, once the run has closed them, and compared with the file.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.held_signals import held_signals
+from drive_env.master.errors import BusError
+from drive_env.master.open_drives import check_answers, open_drives
+from drive_env.master.parameters import Difference, list_differences
+from tuning.snapshot import Snapshot, differences, load_snapshot
+from tuning.target import LOCKSTEP_PATIENCE
+
+
+@contextmanager
+def way_back(file: Path | None, program: str) -> Iterator[None]:
+    """Say on stderr, if a block that changes drives fails, what is changed still and the line that restores it.
+
+    Args:
+        file: The file with the state before, which the block writes before it changes anything; None for emulated
+            drives, which end with the program. The block opens the drives and closes them: only then is given back
+            what they borrowed.
+        program: Who speaks on stderr.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if file is not None and file.exists():
+            print(f"{program}: {what_is_changed(file)}", file=sys.stderr)
+        elif file is not None and isinstance(error, KeyboardInterrupt):
+            print(f"{program}: nothing was changed", file=sys.stderr)
+        raise
+
+
+def what_is_changed(file: Path) -> str:
+    """Return what drives of a bus, asked anew, have other than a file with their state before says, and the way back.
+
+    A node that is silent is not woken: it may be stopping by itself (docs/safety.md).
+    """
+    with held_signals():  # a second Ctrl-C would hide the line that matters
+        try:
+            found = read_anew(load_snapshot(file))
+        except (BusError, ObjectAccessError, OSError, RuntimeError, ValueError) as error:
+            why = str(error).partition(";")[0]
+            return (
+                f"what is changed still is not known: {why}. Once it answers, drive-tune undo {file} restores the "
+                "state before"
+            )
+    if not found:
+        return f"the drives have their state from before, by a second reading; drive-tune undo {file} restores it"
+    several = len({axis for axis, _ in found}) > 1
+    told = [f"{f'axis {axis}: ' if several else ''}{list_differences([one])}" for axis, one in found[:TOLD]]
+    more = f" and {len(found) - TOLD} more" if len(found) > TOLD else ""
+    return f"changed still: {', '.join(told)}{more}; drive-tune undo {file} restores the state before"
+
+
+TOLD = 5  # differences that a line names
+
+
+def read_anew(snapshot: Snapshot) -> list[tuple[int, Difference]]:
+    """Return what the drives of a snapshot have other than it says, as `differences`; raise if they do not answer."""
+    address = {name: value for name, value in snapshot.bus.items() if name != "axes"}
+    if address.get("pace") == "lockstep":
+        address["timeout"] = LOCKSTEP_PATIENCE
+    check_answers(snapshot.device, **address)
+    with open_drives(snapshot.device, safety=False, **address) as drives:
+        return differences(drives, snapshot)
