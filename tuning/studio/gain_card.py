@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.devices import find_device
 from drive_env.gains import as_chip, gains_in_si, per_chip
 from tuning.certificate.certificate import SI_UNITS
 from tuning.studio import tune_jobs
@@ -59,7 +58,7 @@ class GainCard:
 
     def __init__(self, panel: TunePanel) -> None:
         self._panel = panel
-        self._device = find_device(panel.device)
+        self._device = panel.device
         self._shown: tuple[int, ...] = ()
         self._is_setting = False
         self.wanted: list[int] = []  # as the sliders stand, before they are let go
