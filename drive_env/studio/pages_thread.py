@@ -7,6 +7,7 @@ thread of its own.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
@@ -40,11 +41,8 @@ class PagesThread:
             await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(_awaited(send(message)), here))
 
         there = _awaited(self._app(scope, receive_there, send_there))
-        try:
+        with contextlib.suppress(asyncio.CancelledError):  # the server ends, and waits for no page that computes
             await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(there, self.loop))
-        except asyncio.CancelledError:
-            if scope["type"] != "lifespan":  # that of the pages is over once they have said so, or are not waited for
-                raise
 
     def close(self) -> None:
         """End the thread once it is through with what it does; nobody waits for it."""

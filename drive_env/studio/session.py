@@ -418,7 +418,8 @@ class Session:
             return
         try:
             drives.advance(PIECE if drives.time_waits else BUS_IDLE)
-            states.refresh(drives, self.recorder)
+            for told in states.refresh(drives, self.recorder):
+                self.say("warning", told)
             drives.emergencies()
         except JobStoppedError:
             pass
