@@ -120,7 +120,9 @@ def test_two_hosts_or_two_origins_are_refused(twice, kind):
     assert sent[0].get("status") == 400 or sent[0]["type"] == "websocket.close"
 
 
-@pytest.mark.parametrize("origin", ["http://[", "http://]", "\x00", f"//{HOST}/http://", "file://", "chrome-extension://x"])
+@pytest.mark.parametrize(
+    "origin", ["http://[", "http://]", "\x00", f"//{HOST}/http://", "file://", "chrome-extension://x"]
+)
 def test_an_origin_that_is_none_is_refused(origin):
     assert ask(gate(), host=HOST, origin=origin)[0].get("status") == 403
 

@@ -424,7 +424,9 @@ def test_a_jog_whose_page_is_silent_ends_though_a_job_waits_in_a_call(session):
         jogs(session, "page")
         goes_on = threading.Event()
         hung = session.do(lambda drives: goes_on.wait(20), "hangs", page="other")
-        until(lambda: cia402.state_of(int(session._real.read(cia402.STATUSWORD)[0])) is not State.OPERATION_ENABLED, 5.0)
+        drives = session._real  # the truth: no job could tell it now
+        enabled = cia402.OPERATION_ENABLED
+        until(lambda: not cia402.matches(int(drives.read(cia402.STATUSWORD)[0]), enabled), 5.0)
         assert not hung.done()
         goes_on.set()
         with pytest.raises(JobEndedError):

@@ -125,24 +125,28 @@ def fetched(url, patience):
 def test_quick_stop_does_not_wait_for_a_page_that_computes(driver, bench, way):
     """A settings.toml of 40 kB kept the quick stop for 47 s."""
     world, made = bench
+    took = []
     for _ in range(5):  # beside others the processor comes late: the quickest of some tells what the studio takes
-        turning(driver, bench)
+        tab = turning(driver, bench)
         with busy(made) as still:
+            if speed(world) < 0.8 * SPEED:  # stopped, since beats came late
+                tab.release()
+                continue
             begun = time.monotonic()
             if way == "request":  # the second way, without a page
                 asked = urllib.request.Request(made.page("/studio/quick-stop"), method="POST")
                 urllib.request.urlopen(asked, timeout=10.0).close()
             elif way == "space":
-                Tab(driver, made).key(" ")
+                tab.key(" ")
             else:
                 driver.execute_script("document.querySelector('.studio-stop').click()")
             until(lambda: speed(world) < 1.0, "rest", 10.0, step=0.001)
-            took = time.monotonic() - begun
-            assert still(), f"the stop came {took:.1f} s late, with the page"
-            Tab(driver, made).release()
-        if took < AT_ONCE:
+            took.append(time.monotonic() - begun)
+            assert still(), f"the stop came with the page, after {took[-1]:.1f} s"
+            tab.release()
+        if took[-1] < AT_ONCE:
             return
-    raise AssertionError(f"the quickest stop took {took:.3f} s")
+    raise AssertionError(f"the stops took {took} s")
 
 
 def test_a_release_does_not_wait_for_a_page_that_computes(driver, bench):

@@ -51,8 +51,8 @@ def to_counts(drives: Drives, current: Any) -> NDArray[np.int64]:
 def at_current_limit_at_rest(current: Any, limit: Any, moved: Any, near: int) -> NDArray[np.bool_]:
     """Return which axes take the current of their limit though they do not turn.
 
-    Something holds such an axis, a weight is too heavy for it, or its encoder stands still while its motor may turn: the
-    drive itself sees no fault in that.
+    Something holds such an axis, a weight is too heavy for it, or its encoder stands still while its motor may turn;
+    the drive itself sees no fault in that.
 
     Args:
         current: 6077h.

@@ -37,8 +37,8 @@ MODE_NAMES = {
 }  # fmt: skip
 NO_FAULT = ("fault_reset", "error_reset")
 AT_LIMIT = (
-    "the current is at its limit, and the axis does not turn: something holds it, its load is too heavy, or its encoder "
-    "stands still while the motor may turn; disable it and look"
+    "the current is at its limit, and the axis does not turn: something holds it, its load is too heavy, or its "
+    "encoder stands still while the motor may turn; disable it and look"
 )
 
 

@@ -2,8 +2,8 @@
 
 Pages hand in jobs, functions of the drives; one runs at a time. Between jobs time passes: an emulated machine lives in
 real time, drives of a bus are sampled. What stops a motor does not wait for a job: `stop_now` acts from any thread, and
-the job that is under way ends at its next call. A job that moves axes belongs to the page that handed it in: it lasts no
-longer than that page, and one that fails leaves nothing in motion.
+the job that is under way ends at its next call. A job that moves axes belongs to the page that handed it in: it lasts
+no longer than that page, and one that fails leaves nothing in motion.
 """
 
 from __future__ import annotations
