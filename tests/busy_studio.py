@@ -15,9 +15,11 @@ from drive_env.studio.page import StudioPage
 def attach(web, session):
     @web.get("/busy/{seconds}")
     async def compute(seconds: float) -> str:
+        print("a page begins to compute")
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             sum(range(1000))
+        print("a page has computed")
         return "done"
 
 
