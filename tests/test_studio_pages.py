@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import socket
 import threading
 import time
@@ -156,3 +158,38 @@ def test_a_page_of_another_port_shows_nothing_of_the_studio_in_a_frame(made, pat
         driver.switch_to.default_content()
         refusals = [row["message"] for row in driver.get_log("browser") if "frame" in row["message"].lower()]
         assert refusals, "the browser says that it was refused"
+
+
+# --- texts of others --------------------------------------------------------------------------------------------------
+EVIL = """<img src=x onerror="window.hacked = 1">' onclick='window.hacked = 1"""
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_no_text_of_an_eds_a_run_or_a_settings_file_is_taken_for_html(bus, tmp_path, monkeypatch):
+    names = re.compile(rb"(?m)^ParameterName=.*$")
+    (tmp_path / "vendor.eds").write_bytes(names.sub(lambda line: line[0] + EVIL.encode(), VENDOR.read_bytes()))
+    run = tmp_path / "runs" / "<img src=x onerror=window.hacked=1>"
+    run.mkdir(parents=True)
+    (run / "settings.toml").write_text(f"{json.dumps(EVIL)} = {json.dumps(EVIL)}")
+    (run / "<b onclick=alert()>.csv").write_text(EVIL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(HERE.parent))
+    with studio("--eds", str(tmp_path / "vendor.eds"), "--channel", bus) as made, chromium() as driver:
+        tab = Tab(driver, made)
+        for page in PAGES:
+            tab.open(page)
+            time.sleep(1.5)  # values, rows and charts come
+            if page == "/dictionary":
+                tab.type("search", "actual")
+                time.sleep(1.0)
+            opened = "[...document.querySelectorAll('.q-expansion-item .q-item, .studio-row button')].slice(0, 6)"
+            driver.execute_script(f"{opened}.forEach((one) => one.click())")
+            time.sleep(1.0)
+            assert "onerror" in driver.execute_script("return document.body.innerText") or page in ("/tune", "/machine")
+            assert driver.execute_script("return window.hacked") is None, page
+            assert not tab.all("img[src=x], [onclick], [onerror]"), page
+        tab.open("/axes")
+        driver.execute_script("emitEvent('studio_command', 999999)")  # told as an error, in a line of the page
+        time.sleep(1.0)
+        assert driver.execute_script("return window.hacked") is None
