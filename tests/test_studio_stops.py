@@ -209,6 +209,26 @@ def test_a_move_ends_with_its_page_though_another_one_is_there(driver, bench):
         assert abs(turns) < 5.0 * STOPS
 
 
+def test_a_step_that_is_played_ends_with_its_page_though_another_one_is_there(driver, bench):
+    """Its set-points go out in one call, which takes ten seconds."""
+    world, made = bench
+    tuner = Tab(driver, made).open("/tune")
+    with another_tab(driver) as mine:
+        Tab(driver, made).open("/scope")
+        driver.switch_to.window(mine)
+        for name, text in (("travel", "free"), ("step-rpm", "300"), ("step-hold", "5000")):
+            tuner.type(name, text)
+        for _ in range(4):
+            tuner.press("record-step")
+            with suppress(AssertionError):
+                until(lambda: speed(world) > 0.8 * SPEED, "the speed of the step", 6.0, step=0.01)
+                break
+        else:
+            raise AssertionError(f"{tuner.told()}, {made.output}")
+        driver.get("about:blank")
+        stands_within(world, STOPS)
+
+
 @contextmanager
 def another_tab(driver):
     """Open one more tab and stay in it; yield the one before, and close the new one at the end."""

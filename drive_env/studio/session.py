@@ -64,7 +64,7 @@ class SessionEvent:
     text: str
 
 
-@dataclass
+@dataclass(eq=False)
 class Job:
     """A function of the drives, and what becomes of it.
 
@@ -457,19 +457,31 @@ class Session:
 
     def _end_if_left(self, job: Job) -> None:
         """End a job that moves axes and whose page is gone, or silent, and stop what it moves."""
-        assert self._drives is not None
-        if job.page and self._drives.moved.any() and (why := self.presence.why_gone(job.page)):
+        if why := self._why_left(job):
+            assert self._drives is not None
             job.stopped = why
             self.say("warning", f"stopped: {job.title}: {why}")
             self._stop(self._drives.moved)
 
+    def _why_left(self, job: Job | None) -> str:
+        """Return why nobody is there for a job that moves axes; "" where somebody is, or nothing moves by it."""
+        drives = self._drives
+        moves = job is not None and drives is not None and not job.stopped and drives.moved.any()
+        return self.presence.why_gone(job.page) if moves and job is not None and job.page else ""
+
     def _watch_pages(self) -> None:
-        """Stop everything where the drives' thread does not stop what is overdue: a call of its takes too long."""
-        before: set[int] = set()
+        """Stop everything where the drives' thread does not stop what is overdue: a call of its takes too long.
+
+        On a bus set-points are played in one call, however long that takes.
+        """
+        before: set[object] = set()
         while not self._ended.wait(WATCH):
-            now = self.presence.untaken()
+            now: set[object] = set(self.presence.untaken())
+            job = self._current
+            if why := self._why_left(job):
+                now.add(job)
             if before & now:
-                self.stop_now("the page of a motion is gone, or silent")
+                self.stop_now(why or "the page of a motion is gone, or silent")
             before = now
 
     def _why_stopped(self) -> str:
