@@ -39,12 +39,12 @@ PATIENCE = 120.0  # s: a cold cache compiles for a minute
 
 
 class StudioProcess:
-    """A studio that is served by a process of its own."""
+    """A studio that is served by a process of its own; `program` is what Python runs, `drive-env` by default."""
 
-    def __init__(self, *options):
+    def __init__(self, *options, program=("-c", PROGRAM)):
         environment = dict(os.environ, PYTHONUNBUFFERED="1")
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, "studio", "--no-browser", "--port", "0", *options],
+            [sys.executable, *program, "studio", "--no-browser", "--port", "0", *options],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment,
         )  # fmt: skip
         self.lines = []

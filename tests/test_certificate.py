@@ -8,7 +8,8 @@ import io
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields as dataclass_fields
+from dataclasses import is_dataclass, replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -232,6 +233,40 @@ def test_the_report_needs_nothing_from_anywhere(certificate):
         picture = imread(io.BytesIO(base64.b64decode(coded)))[:, :, :3]
         assert min(picture.shape[:2]) > 400
         assert len(np.unique((picture * 255).astype(int).reshape(-1, 3), axis=0)) > 20
+
+
+def test_no_text_of_a_certificate_is_taken_for_html(certificate):
+    """What drives, files and people wrote is text: emergencies, names of motors and devices, reasons, notes."""
+    evil = "<script>alert(1)</script><img src=x onerror='alert(1)'>\" onclick='alert(1)"
+    spoilt = spoil(certificate, evil)
+    assert spoilt != certificate
+    found = Tags()
+    found.feed(to_html(spoilt))
+    assert "script" not in found.names and not found.handlers
+    assert found.names.count("img") == len(re.findall("<img alt=", to_html(certificate)))
+
+
+def spoil(value, evil):
+    """Return a value with something added to each text in it that is not a name the report knows."""
+    if is_dataclass(value):
+        kept = ("device", "verdict", "loop", "quantity", "kind", "unit")
+        fields = {one.name: getattr(value, one.name) for one in dataclass_fields(value) if one.init}
+        return replace(value, **{name: x if name in kept else spoil(x, evil) for name, x in fields.items()})
+    if isinstance(value, dict):
+        return {name: spoil(x, evil) for name, x in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(spoil(x, evil) for x in value)
+    return value + evil if isinstance(value, str) else value
+
+
+class Tags(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.names, self.handlers = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.names.append(tag)
+        self.handlers += [name for name, _ in attributes if name.startswith("on")]
 
 
 def test_the_report_says_everything_that_the_certificate_holds(certificate):

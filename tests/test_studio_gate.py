@@ -16,13 +16,16 @@ from typer.testing import CliRunner
 from drive_env.commands import studio
 from drive_env.commands.cli import app
 from drive_env.studio.gate import COOKIE, StudioGate, checked_token, is_loopback, new_token
+from drive_env.studio.runs_page import HEADERS
 from drive_env.studio.server import address, listen
 
 TOKEN = "a-token-of-sixteen"
+PASSED = {"type": "passed"}
+HOST = "127.0.0.1:29640"
 
 
 def ask(gate, kind="http", path="/axes", query="", **headers):
-    """Return what the gate sends, or "passed"."""
+    """Return what the gate sends, or what is behind it; a header of two values is two headers."""
     sent = []
 
     async def receive():
@@ -33,7 +36,11 @@ def ask(gate, kind="http", path="/axes", query="", **headers):
 
     scope = {
         "type": kind, "path": path, "query_string": query.encode(),
-        "headers": [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()],
+        "headers": [
+            (name.replace("_", "-").encode(), one.encode())
+            for name, value in headers.items()
+            for one in (value if isinstance(value, tuple) else (value,))
+        ],
     }  # fmt: skip
     asyncio.run(gate(scope, receive, send))
     return sent
@@ -41,14 +48,14 @@ def ask(gate, kind="http", path="/axes", query="", **headers):
 
 def gate(host="127.0.0.1", token=None):
     async def behind(scope, receive, send):
-        await send("passed")
+        await send(PASSED)
 
     return StudioGate(behind, host, 29640, token)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:29640", "localhost:29640", "LOCALHOST:29640", "[::1]:29640"])
 def test_a_name_of_this_computer_may_come(host):
-    assert ask(gate(), host=host) == ["passed"]
+    assert ask(gate(), host=host) == [PASSED]
 
 
 @pytest.mark.parametrize(
@@ -58,7 +65,7 @@ def test_a_name_of_this_computer_may_come(host):
 def test_a_name_that_is_not_ours_is_refused(host, kind):
     """A page of another site that has pointed its own name at this computer: DNS rebinding."""
     sent = ask(gate(), kind, host=host)
-    assert "passed" not in sent
+    assert PASSED not in sent
     assert sent[0].get("status") == 421 or sent[0]["type"] == "websocket.close"
 
 
@@ -66,18 +73,18 @@ def test_a_name_that_is_not_ours_is_refused(host, kind):
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:8000", "https://localhost:1"])
 def test_a_page_of_another_site_is_refused(origin, kind):
     sent = ask(gate(), kind, host="127.0.0.1:29640", origin=origin)
-    assert "passed" not in sent
+    assert PASSED not in sent
 
 
 def test_our_own_page_may_come():
-    assert ask(gate(), "websocket", host="127.0.0.1:29640", origin="http://127.0.0.1:29640") == ["passed"]
+    assert ask(gate(), "websocket", host="127.0.0.1:29640", origin="http://127.0.0.1:29640") == [PASSED]
 
 
 @pytest.mark.parametrize("kind", ["http", "websocket"])
 @pytest.mark.parametrize("cookie", ["", f"{COOKIE}=wrong", f"other={TOKEN}", f"{COOKIE}={TOKEN}x"])
 def test_without_the_token_nobody_comes(kind, cookie):
     sent = ask(gate("0.0.0.0", TOKEN), kind, host="machine:29640", cookie=cookie)
-    assert "passed" not in sent
+    assert PASSED not in sent
     assert sent[0].get("status") == 401 or sent[0]["type"] == "websocket.close"
 
 
@@ -88,7 +95,7 @@ def test_the_token_in_the_address_becomes_a_cookie():
     assert "HttpOnly" in headers["set-cookie"]
     cookie = headers["set-cookie"].partition(";")[0]
     for kind in ("http", "websocket"):
-        assert ask(gate("0.0.0.0", TOKEN), kind, host="machine:29640", cookie=cookie) == ["passed"]
+        assert ask(gate("0.0.0.0", TOKEN), kind, host="machine:29640", cookie=cookie) == [PASSED]
 
 
 def test_a_wrong_token_in_the_address_is_refused():
@@ -98,6 +105,74 @@ def test_a_wrong_token_in_the_address_is_refused():
 def test_the_token_does_not_let_another_site_in():
     sent = ask(gate("0.0.0.0", TOKEN), host="machine:29640", cookie=f"{COOKIE}={TOKEN}", origin="http://evil.example")
     assert sent[0]["status"] == 403
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+@pytest.mark.parametrize(
+    "twice",
+    [{"host": (HOST, HOST)}, {"host": ("evil.example", HOST)},
+     {"host": HOST, "origin": ("http://evil.example", f"http://{HOST}")},
+     {"host": HOST, "origin": (f"http://{HOST}", f"http://{HOST}")}],
+)  # fmt: skip
+def test_two_hosts_or_two_origins_are_refused(twice, kind):
+    sent = ask(gate(), kind, **twice)
+    assert PASSED not in sent
+    assert sent[0].get("status") == 400 or sent[0]["type"] == "websocket.close"
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://[", "http://]", "\x00", f"//{HOST}/http://", "file://", "chrome-extension://x"]
+)
+def test_an_origin_that_is_none_is_refused(origin):
+    assert ask(gate(), host=HOST, origin=origin)[0].get("status") == 403
+
+
+@pytest.mark.parametrize("kind", ["http", "websocket"])
+@pytest.mark.parametrize("token", [None, TOKEN])
+@pytest.mark.parametrize(
+    "path", ["//evil.example/", "///evil.example", "/\\evil.example/", "/axes\r\nset-cookie: a=b", "/a\x00b", "/\x7f"]
+)
+def test_an_address_that_leads_elsewhere_or_breaks_a_header_is_refused(path, token, kind):
+    """A redirect to //evil.example was one to evil.example; a line break in a redirect was a traceback."""
+    where, query = ("0.0.0.0", f"token={token}") if token else ("127.0.0.1", "")
+    for cookie in ("", f"{COOKIE}={TOKEN}"):
+        sent = ask(gate(where, token), kind, path, query, host=HOST, cookie=cookie)
+        assert PASSED not in sent
+        assert sent[0].get("status") == 400 or sent[0]["type"] == "websocket.close"
+
+
+def test_a_redirect_writes_the_address_as_it_was_asked_for():
+    sent = ask(gate("0.0.0.0", TOKEN), path="/größe und mehr", query=f"token={TOKEN}", host=HOST)
+    assert dict(sent[0]["headers"])[b"location"] == b"/gr%C3%B6%C3%9Fe%20und%20mehr"
+
+
+# --- frames -------------------------------------------------------------------------------------------------------
+def framed(message):
+    """Return X-Frame-Options and Content-Security-Policy of an answer, each as often as it is there."""
+    names = (b"x-frame-options", b"content-security-policy")
+    return [value for wanted in names for name, value in message["headers"] if name.lower() == wanted]
+
+
+def answering(headers=()):
+    async def behind(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": list(headers)})
+
+    return StudioGate(behind, "127.0.0.1", 29640, None)
+
+
+def test_nobody_shows_an_answer_in_a_frame():
+    """A click for the page around it would have been one of ours."""
+    nobody = [b"DENY", b"frame-ancestors 'none'"]
+    assert framed(ask(answering(), host=HOST)[0]) == nobody
+    assert framed(ask(answering(), host="evil.example")[0]) == nobody  # what is refused
+    assert framed(ask(gate("0.0.0.0", TOKEN), host=HOST)[0]) == nobody
+    assert framed(ask(gate("0.0.0.0", TOKEN), host=HOST, query=f"token={TOKEN}")[0]) == nobody
+
+
+def test_reports_are_shown_in_frames_of_our_own():
+    own = {name.lower().encode(): value.encode() for name, value in HEADERS.items()}
+    options, policy = framed(ask(answering(own.items()), host=HOST)[0])
+    assert options == b"SAMEORIGIN" and policy.endswith(b"frame-ancestors 'self'")
 
 
 @pytest.mark.parametrize(("host", "is_it"), [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.cia402 import State
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import at_current_limit_at_rest
 from drive_env.master.description import describe
 from drive_env.studio import dictionary_jobs, motion_jobs, presence
 from drive_env.studio.errors import JobEndedError
@@ -23,13 +26,21 @@ FIRST = np.array([True])
 
 @pytest.fixture
 def session():
-    made = Session(lambda: EmulatedDrives(load="inertia", num_threads=1), "a machine", describe("tmcm1636", None))
+    with opened("inertia") as made:
+        yield made
+
+
+@contextmanager
+def opened(load):
+    made = Session(lambda: EmulatedDrives(load=load, num_threads=1), "a machine", describe("tmcm1636", None))
     made.presence.beat("page")
     made.start()
     until(lambda: made.state != "opening", 120.0)
     assert made.state == "open", made.failure
-    yield made
-    made.close()
+    try:
+        yield made
+    finally:
+        made.close()
 
 
 def until(condition, patience=10.0):
@@ -288,6 +299,141 @@ def test_a_target_lasts_as_long_as_its_page_is_there(session, monkeypatch):
         assert speed_of(session) == 0
 
 
+# --- jobs belong to their page ------------------------------------------------------------------------------------
+def moves_far(session):
+    return motion_jobs.move(session, 0, "900 rev", "300 rpm", relative=True)
+
+
+def homes(session):
+    """To a switch that is 35 revolutions away."""
+
+    def job(drives):
+        drives.write(0x6098, 17)
+        drives.write((0x6099, 1), 300_000)
+        drives.write((0x6099, 2), 30_000)
+        drives.write(0x609A, 3_000_000)
+        motion_jobs.home(0)(drives)
+
+    return job
+
+
+def plays_for_long(session):
+    """As a step that is recorded, or a tuner's experiment."""
+
+    def job(drives):
+        drives.write(cia402.TARGET_VELOCITY, 0)
+        motion.enable(drives, mode="csv")
+        drives.record([cia402.VELOCITY_ACTUAL], 60.0, play={cia402.TARGET_VELOCITY: np.full(60_000, 300_000)})
+
+    return job
+
+
+def turns_and_waits(session):
+    """Another package's page that knows nothing of all this."""
+
+    def job(drives):
+        motion.enable(drives, mode="pv")
+        drives.write(cia402.TARGET_VELOCITY, 300_000)
+        drives.advance(60.0)
+
+    return job
+
+
+JOBS = [(moves_far, "inertia"), (homes, "belt"), (plays_for_long, "inertia"), (turns_and_waits, "inertia")]
+
+
+def truly(session):
+    """Return the speed of the machine itself [rad/s]."""
+    return abs(float(session.glimpse(lambda machine: machine.rotor_speed[0], 10.0)))
+
+
+@pytest.mark.parametrize("way", ["closed", "silent"])
+@pytest.mark.parametrize(("made", "load"), JOBS)
+def test_a_job_that_moves_ends_with_its_page_though_another_one_is_there(made, load, way):
+    with opened(load) as session, Beats(session, "other"):
+        with Beats(session):
+            session.do(motion_jobs.enable(0, "pp"), "enable").result(10)
+            future = session.do(made(session), "a job that moves", page="page")
+            until(lambda: truly(session) > 15.0 or future.done())
+            assert not future.done(), future.exception()
+        if way == "closed":
+            session.presence.leave("page")
+        with pytest.raises(JobEndedError, match=f"stopped: its page was {way}"):
+            future.result(10)
+        until(lambda: truly(session) < 0.1, 3.0)
+        assert state_of(session) is not State.OPERATION_ENABLED
+        assert any(f"a job that moves: its page was {way}" in event.text for event in session.events)
+
+
+def test_a_job_of_a_page_that_is_gone_moves_nothing(session):
+    """It waited for another one, and its page was closed meanwhile."""
+    with Beats(session, "other"):
+        session.do(motion_jobs.enable(0, "pp"), "enable").result(10)
+        session.presence.leave("page")
+        first = session.do(lambda drives: drives.advance(0.3), "another page's", page="other")
+        second = session.do(moves_far(session), "waits", page="page")
+        first.result(10)
+        with pytest.raises(JobEndedError, match="its page was closed"):
+            second.result(10)
+        assert truly(session) < 0.1
+
+
+def test_a_page_that_is_closed_ends_no_job_that_only_reads_and_stops_no_jog_of_another(session):
+    with Beats(session, "other") as other:
+        other.held = jogs(session, "other")
+        until(lambda: truly(session) > 20.0)
+        reads = session.do(lambda drives: drives.advance(0.5) or drives.num_axes, "reads", page="closed already")
+        assert reads.result(10) == 1
+        assert truly(session) > 20.0
+
+
+def test_a_page_that_is_closed_does_not_keep_its_axis_from_being_disabled(session):
+    with Beats(session, "other"):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        session.do(motion_jobs.disable(0), "disable", page="closed already").result(10)
+        assert state_of(session) is State.SWITCH_ON_DISABLED
+
+
+@pytest.mark.parametrize("error", [ValueError("not this"), TimeoutError("not reached")])
+def test_a_job_that_fails_leaves_nothing_in_motion(session, error):
+    """A move that was not there within 600 s had failed, and moved on."""
+
+    def job(drives):
+        motion.enable(drives, mode="pv")
+        drives.write(cia402.TARGET_VELOCITY, 300_000)
+        drives.advance(0.3)
+        raise error
+
+    with Beats(session):
+        with pytest.raises(type(error)):
+            session.do(job, "fails", page="page").result(10)
+        until(lambda: truly(session) < 0.1, 3.0)
+
+
+def test_a_job_that_fails_before_it_moves_stops_nothing(session):
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pp"), "enable").result(10)
+        with pytest.raises(ValueError, match="parsecs"):
+            session.do(motion_jobs.move(session, 0, "900 parsecs", "", relative=True), "move", page="page").result(10)
+        assert state_of(session) is State.OPERATION_ENABLED
+
+
+def test_a_jog_whose_page_is_silent_ends_though_a_job_waits_in_a_call(session):
+    """Nothing looks after the pages in the drives' thread meanwhile."""
+    with Beats(session, "other"):
+        jogs(session, "page")
+        goes_on = threading.Event()
+        hung = session.do(lambda drives: goes_on.wait(20), "hangs", page="other")
+        drives = session._real  # the truth: no job could tell it now
+        enabled = cia402.OPERATION_ENABLED
+        until(lambda: not cia402.matches(int(drives.read(cia402.STATUSWORD)[0]), enabled), 5.0)
+        assert not hung.done()
+        goes_on.set()
+        with pytest.raises(JobEndedError):
+            session.do(lambda drives: drives.advance(1.0), "after").result(10)
+            raise JobEndedError
+
+
 def test_a_transition_that_enables_moves_to_no_target_of_before(session):
     with Beats(session):
         session.do(motion_jobs.select_mode(0, "pv"), "mode").result(10)
@@ -364,6 +510,32 @@ def test_faults_have_cause_and_remedy(session):
         fault = session.axes[0].faults[-1]
         assert fault.text.name == "undervoltage"
         assert len(fault.text.cause) > 10 and len(fault.text.remedy) > 10
+
+
+def test_a_current_at_its_limit_at_rest_is_told(session):
+    """An encoder that stands still: 7 A, "target reached", no fault."""
+
+    def jam(drives):
+        drives.write(0x6065, 0x7FFFFFFF)
+        motion.enable(drives, mode="pp")
+        drives.machine.fault("encoder_stuck")
+        motion.start_move(drives, 65_536, relative=True)
+
+    with Beats(session):
+        session.do(jam, "jam", page="page").result(20)
+        until(lambda: session.axes[0].is_at_limit, 20.0)
+        limit = int(session.do(lambda drives: drives.read(Role.CURRENT_LIMIT)[0], "read").result(10))
+        assert abs(float(session.axes[0].motion[-1].value)) > 0.95e-3 * limit
+        assert any("the current is at its limit" in event.text for event in session.events)
+        session.do(motion_jobs.disable(0), "disable").result(20)
+        until(lambda: not session.axes[0].is_at_limit)
+
+
+def test_an_axis_that_accelerates_at_its_limit_or_stands_at_ease_is_not_told():
+    limited = at_current_limit_at_rest(
+        current=[3000, -2900, 3000, 100, 3000], limit=[3000, 3000, 3000, 3000, 0], moved=[0, 3, 5000, 0, 0], near=5
+    )
+    assert limited.tolist() == [True, True, False, False, False]
 
 
 def test_a_backup_is_restored_where_a_machine_has_fewer_axes_than_its_device():

@@ -24,7 +24,7 @@ def job():
         made.asked.append(asked)
         return np.zeros(1, np.int64)
 
-    drives = SimpleNamespace(read=call, write=call, time_waits=True)
+    drives = SimpleNamespace(read=call, write=call, time_waits=True, num_axes=1)
     recorder = SimpleNamespace(period=0.001)
     made.drives = SharedDrives(drives, recorder, lambda: None, list, lambda: False, lambda: made.stopped)
     return made

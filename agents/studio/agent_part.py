@@ -37,14 +37,14 @@ def build(panel: TunePanel) -> None:
 
         async def start() -> None:
             try:
-                policy = open_tuner(str(agent.value), panel.device, int(trials.value) if trials.value else None)
+                policy = open_tuner(str(agent.value), panel.device.name, int(trials.value) if trials.value else None)
             except Exception as error:
                 panel.visitor.say(sentence(error), "error")
                 return
             name = str(agent.value)
             store = not panel.desk.is_emulated
             await panel.tuner.start(
-                f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device)
+                f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device.name)
             )
 
         ui.button("Run the agent", icon="smart_toy", on_click=start).props("unelevated no-caps data-test=run-agent")

@@ -10,7 +10,7 @@ from nicegui.events import GenericEventArguments
 from drive_env import cia402
 from drive_env.cia402 import State
 from drive_env.studio import motion_jobs
-from drive_env.studio.axis_states import MODE_NAMES, AxisState, ShownQuantity
+from drive_env.studio.axis_states import AT_LIMIT, MODE_NAMES, AxisState, ShownQuantity
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.state_diagram import ARROWS, diagram
@@ -118,12 +118,16 @@ def _motion_card(visitor: Visitor) -> None:
         values = _Values()
         with ui.row().classes("studio-bits"):
             bits = [(ui.label(f"○ {name}").classes("studio-bit"), name, bit) for name, bit in BITS]
+        with ui.element("div").classes("studio-fault").props('data-test=at-limit role="status"') as limit:
+            ui.label(f"▲ {AT_LIMIT[0].upper()}{AT_LIMIT[1:]}.").classes("studio-strong")
+        limit.set_visibility(False)
 
     def show() -> None:
         state = visitor.state
         if state is None:
             return
         values.show(state.motion)
+        limit.set_visibility(state.is_at_limit)
         for label, name, bit in bits:
             is_set = state.has_bit(bit)
             label.set_text(f"{'●' if is_set else '○'} {name}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,8 @@ from drive_env.cia402 import State
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
+from drive_env.drives import motion
+from drive_env.drives.currents import at_current_limit_at_rest
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.master.quantities import SHOWN, UNITS, Scale, find_unit
@@ -23,6 +27,7 @@ if TYPE_CHECKING:
 
 SLOW = 0.5  # s between two readings of what changes slowly
 QUICK = 0.08  # s between two pictures of what is sampled
+HELD = 0.5  # s for which the current is at its limit, and the axis at rest, until that is told
 SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
 INPUTS = ("negative limit switch", "positive limit switch", "home switch")  # bits 0 to 2 of 60FDh
 MODE_NAMES = {
@@ -31,6 +36,10 @@ MODE_NAMES = {
     "cst": "cyclic synchronous torque",
 }  # fmt: skip
 NO_FAULT = ("fault_reset", "error_reset")
+AT_LIMIT = (
+    "the current is at its limit, and the axis does not turn: something holds it, its load is too heavy, or its "
+    "encoder stands still while the motor may turn; disable it and look"
+)
 
 
 @dataclass(frozen=True)
@@ -72,6 +81,7 @@ class AxisState:
         faults: Emergencies since the last reset.
         inputs: Switches by name, and whether they are active.
         slow: Temperatures, DC link and the like.
+        is_at_limit: Whether its current is at the limit though it does not turn.
     """
 
     axis: int
@@ -84,6 +94,7 @@ class AxisState:
     faults: tuple[AxisFault, ...] = ()
     inputs: dict[str, bool] = field(default_factory=dict)
     slow: tuple[ShownQuantity, ...] = ()
+    is_at_limit: bool = False
 
     @property
     def is_enabled(self) -> bool:
@@ -125,20 +136,25 @@ class AxisStates:
         self._slow_at = self._quick_at = -1e9
         self._slow_entries = [entry for entry in description.dictionary if _is_slow(entry, description)]
         self._unreadable: set[Key] = set()
+        self._limit_key = description.role(Role.CURRENT_LIMIT)
+        self._limit: Any = None  # of the current, shape (num_axes,); None where the drive tells none
+        self._stood: Any = None  # positions at the look before
+        self._held_since = [math.inf] * drives.num_axes  # since when each is at its limit [s]
         modes = self._modes(drives)
         self.axes: tuple[AxisState, ...] = tuple(
             AxisState(axis, axis_label(drives, description, axis), modes=modes) for axis in range(drives.num_axes)
         )
 
-    def refresh(self, drives: Drives, recorder: ScopeRecorder) -> None:
-        """Look at the newest samples, and read what is due besides."""
+    def refresh(self, drives: Drives, recorder: ScopeRecorder) -> list[str]:
+        """Look at the newest samples, and read what is due besides; return what there is to tell."""
         now = time.monotonic()
         if now - self._slow_at > SLOW:
             self._slow_at = now
             self._read_slow(drives)
         if now - self._quick_at > QUICK:
             self._quick_at = now
-            self._read_quick(drives, recorder)
+            return self._read_quick(drives, recorder)
+        return []
 
     def hear(self, message: EmergencyMessage) -> tuple[str, str]:
         """Take note of an emergency; return how grave it is, and what it says."""
@@ -169,7 +185,7 @@ class AxisStates:
             return every
         return tuple(name for name in every if bits >> (cia402.MODES[name] - 1) & 1) or every
 
-    def _read_quick(self, drives: Drives, recorder: ScopeRecorder) -> None:
+    def _read_quick(self, drives: Drives, recorder: ScopeRecorder) -> list[str]:
         newest = recorder.newest()
         missing = [key for key in self.sampled if key not in newest]
         newest |= {key: drives.read(key) for key in missing}
@@ -178,10 +194,29 @@ class AxisStates:
             quantities = tuple(self._quantity(key, int(newest[key][axis]), axis) for key in self.sampled[1:])
             state = cia402.state_of(status)
             self._replace(axis, status=status, state=state, motion=quantities)
+        return self._note_limits(newest)
+
+    def _note_limits(self, newest: Mapping[Key, Any]) -> list[str]:
+        """Take note of axes whose current is at its limit though they do not turn; return what is new of that."""
+        position, current = newest.get((cia402.POSITION_ACTUAL, 0)), newest.get((cia402.TORQUE_ACTUAL, 0))
+        if self._limit is None or position is None or current is None:
+            return []
+        before, self._stood = position if self._stood is None else self._stood, position
+        limited = at_current_limit_at_rest(current, self._limit, position - before, motion.NEAR)
+        told, now = [], time.monotonic()
+        for axis in self.axes:
+            held = bool(limited[axis.axis]) and axis.is_live
+            self._held_since[axis.axis] = min(self._held_since[axis.axis], now) if held else math.inf
+            is_at_limit = now - self._held_since[axis.axis] >= HELD
+            if is_at_limit and not axis.is_at_limit:
+                told.append(f"{axis.name}: {AT_LIMIT}")
+            self._replace(axis.axis, is_at_limit=is_at_limit)
+        return told
 
     def _read_slow(self, drives: Drives) -> None:
         shown = self._try(drives, (cia402.MODE_DISPLAY, 0))
         inputs = self._try(drives, (cia402.DIGITAL_INPUTS, 0))
+        self._limit = None if self._limit_key is None else self._try(drives, self._limit_key)
         slow = {(e.index, e.sub): self._try(drives, (e.index, e.sub)) for e in self._slow_entries}
         names = {number: name for name, number in cia402.MODES.items()}
         for axis in range(drives.num_axes):

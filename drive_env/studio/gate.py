@@ -1,8 +1,9 @@
 """Who may use the studio: the host that is asked for, where a page comes from, and the token of other addresses.
 
 A page of another site must not command drives by the browser of whoever visits it: its requests carry its own Origin,
-and a name that it has pointed at this computer (DNS rebinding) is no host of ours. Where the studio is open to the
-network a token is asked for once, by the address that is printed, and kept in a cookie.
+and a name that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show a page of ours in a
+frame, where a click meant for it would be one of ours. Where the studio is open to the network a token is asked for
+once, by the address that is printed, and kept in a cookie.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import ipaddress
 import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, quote, urlencode, urlsplit
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Any]]
@@ -24,6 +25,9 @@ QUERY = "token"
 TOKEN_BYTES = 16  # of chance: 22 characters
 LEAST_TOKEN = 12  # characters
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
+ONCE = ("host", "origin")  # headers that two readers of a request could take for different ones if there were two
+FRAME_OPTIONS = b"x-frame-options"
+NO_FRAMES = [(FRAME_OPTIONS, b"DENY"), (b"content-security-policy", b"frame-ancestors 'none'")]
 
 
 def is_loopback(host: str) -> bool:
@@ -73,8 +77,10 @@ class StudioGate:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        refusal = self.refusal(headers)
+        send = _unframed(send)
+        given = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
+        headers = dict(given)
+        refusal = self.refusal(headers) or _malformed(scope["path"], [name for name, _ in given])
         if not refusal and self._token is not None and not self._has_cookie(headers):
             if scope["type"] == "http" and self._asks_in(scope):
                 await _redirect(scope, self._token, send)
@@ -97,7 +103,7 @@ class StudioGate:
                 f"There is no studio named {host or 'nothing'}: open the address that drive-env studio has printed.",
             )
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin.lower()).netloc != host:
+        if origin is not None and _place_of(origin) != host:
             return 403, f"Pages of {origin} may not use this studio."
         return None
 
@@ -116,6 +122,37 @@ class StudioGate:
         return self._token is not None and hmac.compare_digest(given.encode(), self._token.encode())
 
 
+def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
+    """Return why a request is refused by its shape: what browsers never send, and others may read differently."""
+    if twice := [name for name in ONCE if names.count(name) > 1]:
+        return 400, f"The request has {names.count(twice[0])} {twice[0].capitalize()} headers; it may have one."
+    if path.startswith("//") or "\\" in path or not path.isprintable():
+        return 400, "There is no such address: it begins with two slashes, or has a backslash or a control character."
+    return None
+
+
+def _place_of(origin: str) -> str:
+    """Return host and port of an origin, "" of what is none."""
+    try:
+        found = urlsplit(origin.lower())
+    except ValueError:
+        return ""
+    return found.netloc if found.scheme in ("http", "https") else ""
+
+
+def _unframed(send: Send) -> Send:
+    """Return a way to answer that lets no page show the answer in a frame, unless it says itself who may."""
+
+    async def answer(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            headers = list(message.get("headers", ()))
+            if all(name.lower() != FRAME_OPTIONS for name, _ in headers):
+                message = {**message, "headers": [*headers, *NO_FRAMES]}
+        await send(message)
+
+    return answer
+
+
 def _with_port(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
@@ -123,7 +160,7 @@ def _with_port(host: str, port: int) -> str:
 async def _redirect(scope: Scope, token: str, send: Send) -> None:
     """Give the cookie, and have the token vanish from the address."""
     query = [(k, v) for k, v in parse_qsl(scope["query_string"].decode("latin-1")) if k != QUERY]
-    where = scope["path"] + (f"?{urlencode(query)}" if query else "")
+    where = quote(scope["path"]) + (f"?{urlencode(query)}" if query else "")
     headers = [
         (b"location", where.encode()),
         (b"set-cookie", f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Lax".encode()),

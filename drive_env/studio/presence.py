@@ -1,7 +1,8 @@
 """Which browser pages are there, and what each has set in motion: a motion lasts as long as its page says so.
 
 A page sends a beat every tenth of a second, and which button it holds. A page that is closed says goodbye, or its
-connection ends; one whose browser sleeps, or whose computer does, is silent. Times are of the monotonic clock [s].
+connection ends; one whose browser sleeps, or whose computer does, is silent. What moves by a job lasts as long as the
+page that began it. Times are of the monotonic clock [s].
 """
 
 from __future__ import annotations
@@ -121,6 +122,22 @@ class Presence:
             for motion in overdue:
                 del self._motions[motion.number]
             return overdue
+
+    def untaken(self) -> set[int]:
+        """Return the motions that `take_overdue` would return."""
+        now = time.monotonic()
+        with self._lock:
+            motions = self._motions.values()
+            return {one.number for one in motions if one.why or now - one.beat > (HOLD if one.held else ASLEEP)}
+
+    def why_gone(self, page: str) -> str:
+        """Return why nothing goes on that a page has begun; empty while it is there, and awake."""
+        now = time.monotonic()
+        with self._lock:
+            beat = self._beats.get(page)
+        if beat is None:
+            return "its page was closed"
+        return f"its page was silent for {now - beat:.1f} s" if now - beat > ASLEEP else ""
 
     def pages(self) -> int:
         """Return how many pages are there."""

@@ -22,7 +22,8 @@ REPORTS = (".html",)
 EVENTS = "events.out.tfevents."  # what TensorBoard's files begin with
 # What a page of a run may do: show its own text, styles and pictures; no script, no form, nothing of elsewhere.
 POLICY = (
-    "sandbox; default-src 'none'; img-src data: 'self'; media-src 'self'; style-src 'unsafe-inline'; font-src data:"
+    "sandbox; default-src 'none'; img-src data: 'self'; media-src 'self'; style-src 'unsafe-inline'; font-src data:; "
+    "frame-ancestors 'self'"
 )
 
 
@@ -95,12 +96,16 @@ def confined(name: str, root: Path = RUNS) -> Path:
     """Return a path inside the folder of runs.
 
     Raises:
-        ValueError: For one that leads out of it, by dots or by a link.
+        ValueError: For one that leads out of it, by dots or by a link, or that the file system takes for no name.
     """
     base = root.resolve()
-    path = (base / name).resolve()
-    if path == base or not path.is_relative_to(base) or "\0" in name:
-        raise ValueError(f"{name} is not in {root}")
+    try:
+        path = (base / name).resolve()
+        if path == base or not path.is_relative_to(base):
+            raise ValueError(f"{name} is not in {root}")
+        path.exists()
+    except (OSError, RuntimeError, UnicodeError) as error:  # a name that is too long, or a ring of links
+        raise ValueError(f"{name[:100]} is no name of a file in {root}: {error}") from None
     return path
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 from fastapi import FastAPI
 from fastapi.responses import FileResponse, PlainTextResponse, Response
 from nicegui import run, ui
@@ -34,6 +36,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
     "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "SAMEORIGIN",  # the page Runs shows reports in frames
 }
 
 
@@ -46,7 +49,7 @@ def attach(web: FastAPI, session: Session) -> None:
             found = confined(path, RUNS)
         except ValueError:
             found = None
-        if found is None or not found.is_file():
+        if found is None or not found.is_file() or not os.access(found, os.R_OK):
             return PlainTextResponse("There is no such file of a run.", 404, HEADERS)
         return FileResponse(found, media_type=media_type(found), headers=HEADERS)
 

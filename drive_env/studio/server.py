@@ -1,7 +1,12 @@
-"""The web server of the studio: its pages, the life line of each, and the quick stop that waits for nothing."""
+"""The web server of the studio: its pages, the life line of each, and the quick stop that waits for nothing.
+
+The event loop of the server takes requests and computes nothing. It hears the life lines and the quick stop itself;
+everything else goes to the pages, in a thread of their own (`pages_thread.py`), which may be busy as long as they like.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import json
@@ -9,6 +14,7 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
@@ -19,10 +25,12 @@ import uvicorn
 from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
 from nicegui import Client, app, ui
 
+from drive_env.safety.supervisor import SWITCH_INTERVAL
 from drive_env.studio import motion_jobs
 from drive_env.studio.gate import StudioGate, is_loopback
 from drive_env.studio.layout import frame
 from drive_env.studio.page import StudioPage
+from drive_env.studio.pages_thread import PagesThread, Receive, Scope, Send
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
@@ -33,6 +41,8 @@ PORT = 29640  # no service is registered there
 LOOPBACK = "127.0.0.1"
 GRACE = 1  # s that browsers get to close at the end
 RECONNECT = 3.0  # s
+LONGEST_END = 4.0  # s that the pages get to end: one that computes is not waited for
+QUICK_STOP, LIFE = "/studio/quick-stop", "/studio/life"
 
 
 class Studio:
@@ -77,7 +87,7 @@ class Studio:
             while True:
                 message = json.loads(await line.receive_text())
                 self._hear(page, message, held)
-        except (WebSocketDisconnect, ValueError, KeyError, TypeError):
+        except (WebSocketDisconnect, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             pass
         finally:
             presence.leave(page)
@@ -141,20 +151,41 @@ class StudioServer(uvicorn.Server):
         self.force_exit = self.should_exit and sig == signal.SIGINT
         self.should_exit = True
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the connections and the pages, and go on without what does not end."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(super().shutdown(sockets), LONGEST_END)
 
-def web_app(studio: Studio, host: str, port: int, token: str | None) -> FastAPI:
-    """Return the whole application."""
+
+def web_app(studio: Studio, host: str, port: int, token: str | None) -> StudioGate:
+    """Return the whole application: behind the gate, what waits for no page, and the pages."""
+    own, pages = _stops(studio), PagesThread(_pages(studio))
+
+    async def behind(scope: Scope, receive: Receive, send: Send) -> None:
+        await (own if scope.get("path") in (QUICK_STOP, LIFE) else pages)(scope, receive, send)
+
+    return StudioGate(behind, host=host, port=port, token=token)
+
+
+def _stops(studio: Studio) -> FastAPI:
+    """Return what waits for no page: the quick stop, and the life lines."""
     web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
-    @web.post("/studio/quick-stop")
-    def quick_stop() -> dict[str, bool]:
+    @web.post(QUICK_STOP)
+    async def quick_stop() -> dict[str, bool]:
         studio.session.stop_now("the button or the space bar of a page")
         return {"stopped": True}
 
-    @web.websocket("/studio/life")
+    @web.websocket(LIFE)
     async def life(line: WebSocket, page: str = "") -> None:
         await studio.live(line, page)
 
+    return web
+
+
+def _pages(studio: Studio) -> FastAPI:
+    """Return the pages."""
+    web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     for page in studio.pages:
         if page.attach is not None:
             page.attach(web, studio.session)
@@ -165,7 +196,6 @@ def web_app(studio: Studio, host: str, port: int, token: str | None) -> FastAPI:
     # NiceGUI looks for its server among all objects there are, and one of python-canopen's cannot be looked at.
     web.router.lifespan_context = _lifespan
     logging.getLogger("nicegui").addFilter(SLOW_PAGES)
-    web.add_middleware(StudioGate, host=host, port=port, token=token)  # type: ignore[arg-type]
     return web
 
 
@@ -233,6 +263,8 @@ def serve_studio(
     server = StudioServer(config, session.stop_now)
     hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed ends it as Ctrl-C does
     before = None if hang_up is None else signal.getsignal(hang_up)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(min(interval, SWITCH_INTERVAL))  # a page that computes gives the interpreter up that soon
     if hang_up is not None and before is not signal.SIG_IGN:
         signal.signal(hang_up, server.handle_exit)
     session.when_not_opened = lambda: server.handle_exit(signal.SIGTERM)
@@ -249,5 +281,6 @@ def serve_studio(
         end.cancel()
         session.close()
         sock.close()
+        sys.setswitchinterval(interval)
         if hang_up is not None:
             signal.signal(hang_up, before)

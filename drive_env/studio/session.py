@@ -2,7 +2,8 @@
 
 Pages hand in jobs, functions of the drives; one runs at a time. Between jobs time passes: an emulated machine lives in
 real time, drives of a bus are sampled. What stops a motor does not wait for a job: `stop_now` acts from any thread, and
-the job that is under way ends at its next call.
+the job that is under way ends at its next call. A job that moves axes belongs to the page that handed it in: it lasts
+no longer than that page, and one that fails leaves nothing in motion.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ STOP_WAIT = 3.0  # s that axes get to come to rest before their voltage is taken
 KEPT = 200  # events
 TOLD_ONCE = 0.5  # s within which one more wish to stop is the same one
 PATIENCE = 10.0  # s for the thread to end
+WATCH = 0.2  # s between two looks whether the drives' thread has stopped what is overdue
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,13 @@ class SessionEvent:
     text: str
 
 
-@dataclass
+@dataclass(eq=False)
 class Job:
     """A function of the drives, and what becomes of it.
 
     Attributes:
         title: What it does, in a few words.
-        page: The page that wants it.
+        page: The page that wants it; what moves by it stops when that page is gone. "" for no page.
         paced: Whether emulated time passes in real time meanwhile.
         quiet: Whether pages do not show it.
         progress: Share that is done, None where it is not known.
@@ -145,11 +147,14 @@ class Session:
         self._told_reason = ""
         self._is_left = False  # whether an axis was switched off since no page is there
         self._thread = threading.Thread(target=self._run, name="drive studio", daemon=True)
+        self._ended = threading.Event()
+        self._watch = threading.Thread(target=self._watch_pages, name="drive studio watch", daemon=True)
 
     # --- for pages, any thread ----------------------------------------------------------------------------------
     def start(self) -> None:
         """Open the drives."""
         self._thread.start()
+        self._watch.start()
 
     def close(self) -> None:
         """Stop what moves, close the drives, end the thread."""
@@ -161,6 +166,7 @@ class Session:
             self._waiting.notify_all()
         if self._thread.is_alive():
             self._thread.join(PATIENCE)
+        self._ended.set()
 
     def do(
         self, function: Callable[[Drives], T], title: str, *, page: str = "", paced: bool = True, quiet: bool = False
@@ -170,7 +176,7 @@ class Session:
         Args:
             function: What to do; it may let time pass, and is ended by an exception when somebody stops it.
             title: What it does, in a few words: "Move axis 0".
-            page: Who wants it.
+            page: Who wants it; what moves by it stops when that page is gone. "" for no page.
             paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
             quiet: Whether pages do not show it: one of many that only read.
 
@@ -205,8 +211,8 @@ class Session:
     def stop_now(self, reason: str) -> None:
         """Quick-stop every axis at once, and end the job that is under way and those that wait.
 
-        It does not wait for the job: emulated axes are commanded here, between two pieces of time; those of a bus by
-        the supervisor of their envelope.
+        It does not wait for the job, nor long for anything else: those of a bus are commanded by the supervisor of
+        their envelope; emulated axes here, or by whoever lets their time pass, before the next piece of it.
         """
         with self._waiting:
             self._stop_asked = reason
@@ -220,9 +226,11 @@ class Session:
             return
         if real.safety is not None:
             real.safety.stop_at_once(reason)
-        elif real.time_waits:
-            with shared.lock:
+        elif real.time_waits and shared.lock.acquire(timeout=PIECE):
+            try:
                 _stop_live(real)
+            finally:
+                shared.lock.release()
 
     def end_job(self, reason: str) -> None:
         """End the job that is under way, and stop every axis: it may have set any in motion."""
@@ -384,12 +392,14 @@ class Session:
             with self._waiting:
                 self._current = None
             return
-        drives.paced = job.paced
+        drives.paced, drives.moved = job.paced, np.zeros(self.num_axes, bool)
         try:
             result = job.function(drives)
         except (KeyboardInterrupt, SystemExit) as error:  # which would end the event loop that waits for it
             job.future.set_exception(JobEndedError(f"stopped: {error or job.stopped}"))
         except BaseException as error:
+            if drives.moved.any() and not job.stopped:
+                self._stop(drives.moved)
             job.future.set_exception(JobEndedError(f"stopped: {job.stopped}") if job.stopped else error)
         else:
             job.future.set_result(result)
@@ -408,7 +418,8 @@ class Session:
             return
         try:
             drives.advance(PIECE if drives.time_waits else BUS_IDLE)
-            states.refresh(drives, self.recorder)
+            for told in states.refresh(drives, self.recorder):
+                self.say("warning", told)
             drives.emergencies()
         except JobStoppedError:
             pass
@@ -437,10 +448,41 @@ class Session:
             self._is_left = False
         elif self._is_any_live():
             self._leave_alone(job)
+        if job is not None and not job.stopped:
+            self._end_if_left(job)
         if job is not None and job.stopped and not job.is_told:
             job.is_told = True
             self._await_rest()
             raise JobStoppedError(job.stopped)
+
+    def _end_if_left(self, job: Job) -> None:
+        """End a job that moves axes and whose page is gone, or silent, and stop what it moves."""
+        if why := self._why_left(job):
+            assert self._drives is not None
+            job.stopped = why
+            self.say("warning", f"stopped: {job.title}: {why}")
+            self._stop(self._drives.moved)
+
+    def _why_left(self, job: Job | None) -> str:
+        """Return why nobody is there for a job that moves axes; "" where somebody is, or nothing moves by it."""
+        drives = self._drives
+        moves = job is not None and drives is not None and not job.stopped and drives.moved.any()
+        return self.presence.why_gone(job.page) if moves and job is not None and job.page else ""
+
+    def _watch_pages(self) -> None:
+        """Stop everything where the drives' thread does not stop what is overdue: a call of its takes too long.
+
+        On a bus set-points are played in one call, however long that takes.
+        """
+        before: set[object] = set()
+        while not self._ended.wait(WATCH):
+            now: set[object] = set(self.presence.untaken())
+            job = self._current
+            if why := self._why_left(job):
+                now.add(job)
+            if before & now:
+                self.stop_now(why or "the page of a motion is gone, or silent")
+            before = now
 
     def _why_stopped(self) -> str:
         """Return why the present job was stopped, "" if it was not."""

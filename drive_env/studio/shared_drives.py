@@ -43,7 +43,17 @@ Key = tuple[int, int]
 
 T = TypeVar("T")
 
-CONTROLWORDS = (cia402.CONTROLWORD, (cia402.CONTROLWORD, 0), "Controlword")  # as they may be called
+# Objects as they may be called.
+CONTROLWORDS = (cia402.CONTROLWORD, (cia402.CONTROLWORD, 0), "Controlword")
+SET_POINTS = frozenset(
+    one
+    for index, name in (
+        (cia402.TARGET_POSITION, "Target position"), (cia402.TARGET_VELOCITY, "Target velocity"),
+        (cia402.TARGET_TORQUE, "Target torque"), (cia402.VL_TARGET_VELOCITY, "vl target velocity"),
+        (cia402.VELOCITY_OFFSET, "Velocity offset"), (cia402.TORQUE_OFFSET, "Torque offset"),
+    )
+    for one in (index, (index, 0), name)
+)  # fmt: skip
 
 
 def _operates(value: ArrayLike) -> bool:
@@ -70,6 +80,8 @@ class SharedDrives:
     Attributes:
         lock: Held while emulated drives are called: a stop from another thread waits for a piece at most.
         paced: Whether emulated time passes as fast as real time; otherwise as fast as it can.
+        moved: Axes that the present job may have set in motion, shape (num_axes,): by a controlword that has them
+            operate, or by a set-point.
     """
 
     def __init__(
@@ -83,6 +95,7 @@ class SharedDrives:
     ) -> None:
         self.lock = threading.RLock()
         self.paced = True
+        self.moved: Mask = np.zeros(drives.num_axes, bool)
         self._drives = drives
         self._recorder = recorder
         self._look = look
@@ -142,11 +155,20 @@ class SharedDrives:
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object of every axis, or of some."""
+        operates = name in CONTROLWORDS and _operates(value)
+        before, moves = self.moved, self.moved | (True if where is None else where)
+        self.moved = moves if operates else before  # before the look, which keeps a page that is gone from it
         self._look()
-        if name in CONTROLWORDS and _operates(value) and (reason := self._stopped()):
+        if operates and (reason := self._stopped()):
             raise JobStoppedError(reason)
-        with self.lock:
-            self._calling(lambda: self._drives.write(name, value, where=where))
+        try:
+            with self.lock:
+                self._calling(lambda: self._drives.write(name, value, where=where))
+        except SafetyError:  # it was not sent
+            self.moved = before
+            raise
+        if name in SET_POINTS:
+            self.moved = moves
 
     def advance(self, duration: float) -> None:
         """Let time pass [s], whole communication cycles; it is recorded."""
@@ -164,6 +186,8 @@ class SharedDrives:
         period: float = 0.001,
     ) -> Trace:
         """Let time pass [s] while objects are recorded and played, as `Drives.record`; the recorder sees it, too."""
+        if play:
+            self.moved = np.ones(self.num_axes, bool)
         self._look()
         asked = tuple(object_names(objects))
         if self._drives.time_waits:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, TypeVar
 
-from nicegui import Client, background_tasks, ui
+from nicegui import Client, core, ui
 
 from drive_env.drives.interface import Drives
 from drive_env.studio.sentences import sentence
@@ -57,8 +58,13 @@ class Visitor:
             return None
 
     def hand_in(self, function: Callable[[Drives], T], title: str) -> None:
-        """Have a job run without waiting for it; the page shows it if it fails. For the event loop's thread."""
-        background_tasks.create(self.do(function, title), name=title)
+        """Have a job run without waiting for it; the page shows it if it fails. Any thread may call it."""
+
+        def tell(done: Future[T]) -> None:
+            if not done.cancelled() and (error := done.exception()) is not None and core.loop is not None:
+                core.loop.call_soon_threadsafe(self.say, f"{title}: {sentence(error)}", "error")
+
+        self.session.do(function, title, page=self.id).add_done_callback(tell)
 
     def say(self, text: str, kind: str = "info") -> None:
         """Show a line on the page: info, warning, error or done."""

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.devices import find_device
 from drive_env.gains import as_chip, gains_in_si, per_chip
 from tuning.certificate.certificate import SI_UNITS
 from tuning.studio import tune_jobs
@@ -59,7 +58,7 @@ class GainCard:
 
     def __init__(self, panel: TunePanel) -> None:
         self._panel = panel
-        self._device = find_device(panel.device)
+        self._device = panel.device
         self._shown: tuple[int, ...] = ()
         self._is_setting = False
         self.wanted: list[int] = []  # as the sliders stand, before they are let go
@@ -88,9 +87,9 @@ class GainCard:
         with ui.element("div").classes("studio-gain"):
             ui.label(gain.title).classes("name")
             slider = ui.slider(min=0, max=STOPS, value=0, step=1)
-            slider.props(f'aria-label="{name}" data-test=slider-{gain.name}')
+            slider.props["aria-label"], slider.props["data-test"] = name, f"slider-{gain.name}"
             number = ui.number("raw", min=0, max=gain.highest, step=1, format="%d").props("dense outlined")
-            number.props(f'aria-label="{name}, 0 to {gain.highest}" data-test=gain-{gain.name}')
+            number.props["aria-label"], number.props["data-test"] = f"{name}, 0 to {gain.highest}", f"gain-{gain.name}"
             unit = ui.label("").classes("unit")
         slider.on_value_change(lambda event: self._slides(column, int(event.value)))
         slider.on("change", lambda event: self._apply(column, value_at(int(event.args), gain.highest)))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from nicegui import ui
 
-from drive_env.devices import find_device
 from drive_env.gains import check_linear_model
 from drive_env.studio import charts
 from tuning.response.margins import Margins, margins
@@ -90,7 +89,7 @@ class ResponseCard:
         panel = self._panel
         with panel.card("Frequency response", "response"):
             try:
-                check_linear_model(find_device(panel.device))
+                check_linear_model(panel.device)
             except ValueError as error:
                 ui.label(str(error)).classes("studio-hint")
                 return

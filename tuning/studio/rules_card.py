@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.devices import find_device
 from drive_env.gains import check_linear_model
 from tuning.identify.estimate import TITLES, interval
 from tuning.rules.rules_by_name import MEANINGS
@@ -50,7 +49,7 @@ class RulesCard:
         panel = self._panel
         with panel.card("Identification and rules", "rules"):
             try:
-                check_linear_model(find_device(panel.device))
+                check_linear_model(panel.device)
             except ValueError as error:
                 ui.label(str(error)).classes("studio-hint")
                 return
@@ -88,7 +87,7 @@ class RulesCard:
         if isinstance(plant, str):
             ui.label(f"No rule proposes gains: {plant}")
             return
-        known = find_device(self._panel.device)
+        known = self._panel.device
         ui.label("What each rule would give, with the margins of the velocity loop by the model").classes(
             "studio-label"
         )

@@ -60,6 +60,7 @@ class StepCard:
                 self._hold = ui.number("Held [ms]", value=100, min=10, max=5000).props("dense outlined")
                 self._turns = ui.number("Distance [turns]", value=0.5, min=0.001).props("dense outlined")
                 self._rpm.props("data-test=step-rpm")
+                self._hold.props("data-test=step-hold")
                 self._turns.props("data-test=step-turns")
                 ui.button("Record", icon="fiber_manual_record", on_click=self._record).props(
                     "unelevated no-caps data-test=record-step"

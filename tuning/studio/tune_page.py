@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from drive_env.devices import find_device
 from drive_env.motors import MOTORS, find_motor
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
@@ -32,19 +31,40 @@ assert tuple(COUPLING) == AXES
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page."""
-    TunePanel(session, visitor).build()
+    """Make the page, or say why there is no tuning for these drives."""
+    if session.description.device is not None:
+        TunePanel(session, visitor).build()
+        return
+    with card("Tune", "unknown"):
+        ui.label(
+            f"{session.description.name} is known by its EDS alone, which says neither which objects are gains nor in "
+            "what units it counts: there is no tuning for it. Make it a device (the page on file formats, section "
+            "Device), and start the studio with --device."
+        ).props("data-test=no-tuning")
+
+
+def card(title: str, name: str) -> ui.card:
+    """Return a card with a heading."""
+    made = ui.card().classes(f"studio-card card-{name}")
+    with made:
+        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
+    return made
 
 
 class TunePanel:
     """The controls of one page; parts of other packages get it.
 
     Args:
-        session: The drives.
+        session: The drives, of a device that is known.
         visitor: The page.
+
+    Attributes:
+        device: What they are.
     """
 
     def __init__(self, session: Session, visitor: Visitor) -> None:
+        assert session.description.device is not None
+        self.device = session.description.device
         self.session = session
         self.visitor = visitor
         self.desk: TuneDesk = desk_of(session)
@@ -58,21 +78,16 @@ class TunePanel:
         return self.visitor.axis
 
     @property
-    def device(self) -> str:
-        """Name of the device."""
-        return self.session.description.name
-
-    @property
     def motor(self) -> Any:
         """The motor that is turned, as far as it is known."""
         made = self.session.glimpse(lambda machine: machine.drives.motor)
-        return made or find_motor(self.desk.entries.motor or find_device(self.device).default_motor)
+        return made or find_motor(self.desk.entries.motor or self.device.default_motor)
 
     @property
     def supply(self) -> float:
         """Supply voltage [V] that gains in SI are computed with."""
         given = self.desk.entries.supply
-        return float(find_device(self.device).supply_of(self.motor)) if given is None else given
+        return float(self.device.supply_of(self.motor)) if given is None else given
 
     @property
     def rated_rpm(self) -> float:
@@ -81,15 +96,6 @@ class TunePanel:
 
     def build(self) -> None:
         """Make it."""
-        try:
-            find_device(self.device)
-        except ValueError:
-            with self.card("Tune", "unknown"):
-                ui.label(
-                    f"{self.device} is known by its EDS alone, which says neither which objects are gains nor in what "
-                    "units it counts: make it a device (the page on file formats, section Device)."
-                )
-            return
         ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
         with ui.element("div").classes("studio-tune"):
             with ui.element("div").classes("studio-stack"):
@@ -108,10 +114,7 @@ class TunePanel:
 
     def card(self, title: str, name: str) -> ui.card:
         """Return a card with a heading."""
-        made = ui.card().classes(f"studio-card card-{name}")
-        with made:
-            ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
-        return made
+        return card(title, name)
 
     def gains_slide(self) -> None:
         """Show what the sliders would make of the response."""
@@ -141,7 +144,7 @@ class TunePanel:
         with self.card("Machine", "machine"):
             with ui.row().classes("studio-buttons"):
                 if not emulated:
-                    names, usual = sorted(MOTORS), find_device(self.device).default_motor
+                    names, usual = sorted(MOTORS), self.device.default_motor
                     motor = ui.select(names, value=desk.entries.motor or usual, label="Motor", with_input=True)
                     motor.props("dense outlined").classes("grow")
                     motor.on_value_change(lambda event: setattr(desk.entries, "motor", str(event.value or "")))

@@ -1,0 +1,53 @@
+"""The thread of the pages: what a page computes delays other pages, but neither the quick stop nor a page's life line.
+
+The web server takes requests in one event loop, in which nothing is computed; the pages live in another one, of a
+thread of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Any]]
+Send = Callable[[Any], Awaitable[None]]
+
+
+class PagesThread:
+    """An ASGI application that passes everything on to another one, which runs in the event loop of this thread.
+
+    Args:
+        app: The other one.
+    """
+
+    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]]) -> None:
+        self._app = app
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever, name="drive studio pages", daemon=True)
+        self._thread.start()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Have the other application answer a request."""
+        here = asyncio.get_running_loop()
+
+        async def receive_there() -> Any:
+            return await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(_awaited(receive()), here))
+
+        async def send_there(message: Any) -> None:
+            await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(_awaited(send(message)), here))
+
+        there = _awaited(self._app(scope, receive_there, send_there))
+        with contextlib.suppress(asyncio.CancelledError):  # the server ends, and waits for no page that computes
+            await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(there, self.loop))
+
+    def close(self) -> None:
+        """End the thread once it is through with what it does; nobody waits for it."""
+        self.loop.call_soon_threadsafe(self.loop.stop)
+
+
+async def _awaited(what: Awaitable[Any]) -> Any:
+    return await what
