@@ -6,6 +6,7 @@ means is its reader's matter.
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import math
@@ -17,7 +18,7 @@ import tomllib
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 MOST_TEXT = 16_000_000  # bytes of a JSON, YAML, EDS or MJCF: the largest that we write has some 100 kB
 MOST_TOML = 4_000_000  # bytes; tomllib reads about 1 MB/s
 MOST_RECORDING = 500_000_000  # bytes of a log of frames or samples: an hour of a full bus has some 300 MB
+MOST_LINE = 1_000_000  # letters of a line of a CSV
 MOST_ARRAYS = 500_000_000  # bytes of the arrays in an .npz, unpacked
 MOST_ENTRIES = 10_000  # arrays in an .npz
 DEEPEST = 40  # tables and lists in one another
@@ -156,6 +158,24 @@ def parse_json(text: str | bytes) -> Any:
 def read_json(path: str | Path) -> Any:
     """Return the value in a JSON file; raises as `parse_json` and `read_text`."""
     return parse_json(read_text(path))
+
+
+def read_rows(path: str | Path) -> Iterator[list[str]]:
+    """Give the rows of a CSV line by line.
+
+    Raises:
+        UntrustedFileError: As `check_size`, and for a line of more than MOST_LINE letters.
+        csv.Error: If it is no CSV; UnicodeDecodeError, OSError as reading a file does.
+    """
+    check_size(Path(path), MOST_RECORDING)
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        yield from csv.reader(iter(lambda: _short(path, file.readline(MOST_LINE + 1)), ""))
+
+
+def _short(path: str | Path, line: str) -> str:
+    if len(line) > MOST_LINE:
+        raise UntrustedFileError(f"{path} has a line of more than {MOST_LINE} letters; is it the right file?")
+    return line
 
 
 def check_table(value: Any) -> None:

@@ -120,7 +120,8 @@ MAY_READ = {
     "agents.training.search": "files that were written a moment ago, in a folder of its own",
     "agents.training.training_table": "CSV of a text that was read within limits",
     "agents.training.learning_curve": "CSV of a text that was read within limits",
-    "tuning.runs.pools": "no file: dask.distributed's own way, between processes of one user",
+    "agents.policies.onnx_policy": "a file that has been read, and acted within limits in mechanics/limited_child.py",
+    "drive_env.commands.recorded_frames": "in mechanics/limited_child.py",
     "tuning.runs.shard_log": "frame by frame, each with its length",
 }
 
