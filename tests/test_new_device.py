@@ -443,7 +443,7 @@ def test_a_resolution_that_no_position_could_be_held_by_is_told_and_not_taken(tm
 @pytest.mark.parametrize("factory", [(4096, 0), (0, 1), (0, 0), (0, 5), (4294967295, 0)])
 @pytest.mark.filterwarnings("error")
 def test_a_resolution_with_a_0_is_that_of_the_motor_s_encoder(tmp_path, factory):
-    """The folder could not be served: what has 0 revolutions was divided by them."""
+    """With factory values the drive divided by its 0 revolutions."""
     text = BASE + RESOLUTION
     for sub, value in enumerate(factory, 1):
         text = put(text, f"608Fsub{sub}", DefaultValue=value, LowLimit="0")
@@ -455,9 +455,8 @@ def test_a_resolution_with_a_0_is_that_of_the_motor_s_encoder(tmp_path, factory)
         for sub in (1, 2):
             with pytest.raises(ObjectAccessError):
                 drives.write((0x608F, sub), 0)
-        world = World(lockstep=True)
-        world.add(drives, [NODE])
-        world.close()
+    with emulated(str(made.folder), commissioned=False) as drives:
+        assert drives.read(Role.POSITION_SCALE)[0] == find_motor(MOTOR).encoder_counts
 
 
 @pytest.mark.parametrize(
