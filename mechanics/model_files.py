@@ -37,7 +37,8 @@ def hash_of_model(mjcf: Path) -> str:
     digest = hashlib.sha256()
     seen: dict[Path, None] = {}
     waiting = [mjcf]
-    folders, named = {"": None}, {}
+    folders: dict[str, None] = {"": None}
+    named: dict[tuple[Path, str], bool] = {}  # whether it is MJCF again
     while waiting:
         path = waiting.pop()
         if path in seen:

@@ -35,7 +35,7 @@ class HyperparameterError(ValueError):
     """A file of hyper-parameters is wrong; the message says where."""
 
 
-class _DifferentNames(yaml.SafeLoader):
+class _DifferentNames(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """PyYAML's safe reader, which drops the first of a name that stands twice; this one refuses it."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -43,7 +43,8 @@ class _DifferentNames(yaml.SafeLoader):
         for name, count in Counter(names).items():
             if count > 1:
                 raise yaml.YAMLError(f"the name {name[:100]!r} stands twice in one table; leave one of them")
-        return super().construct_mapping(node, deep)
+        table: dict[Any, Any] = super().construct_mapping(node, deep)
+        return table
 
 
 def load(
