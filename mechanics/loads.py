@@ -7,10 +7,8 @@ from math import pi
 from pathlib import Path
 
 from mechanics.load import Combination, Contact, Friction, Load, Parameter, Roll, Switch
-from mechanics.model import resolve
+from mechanics.model import MODELS, resolve
 from mechanics.near_names import did_you_mean
-
-MODELS = Path(__file__).parent / "models"
 
 
 def _friction(element: str, unit: str = "rad", **bounds: tuple[float, float]) -> tuple[Parameter, ...]:

@@ -1,18 +1,27 @@
-"""From a load's MJCF to MuJoCo models: what it lacks is named, what it means is found, copies are put side by side."""
+"""From a load's MJCF to MuJoCo models: what it lacks is named, what it means is found, copies are put side by side.
+
+MuJoCo compiles our own models here, and those of others in a process with limits (limited_child.py), which hands the
+compiled model back: a file of a line may ask for 10^9 bodies.
+"""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+from collections import OrderedDict
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.limited_child import call_limited
 from mechanics.load import Combination, Friction, Load
+from mechanics.model_files import hash_of_model
 
 Floats = NDArray[np.float64]
 
+MODELS = Path(__file__).parent / "models"  # ours
 # Copies in one model. mj_step per copy: 1154 ns alone, 318 in 8, 204 in 64, 199 in 128 (two-mass shaft); a multiple of
 # 8, so that every group of machines but the last fills its drives' records.
 COPIES_PER_MODEL = 64
@@ -26,6 +35,7 @@ CONSTRAINED_PACKING_BOUND = 1e-9
 _MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were seen to use 194 each
 _MEMORY_PER_CONSTRAINED_COPY = 400_000
 _MEMORY_FIXED = 65536
+_MOST_KEPT = 8  # models of others that are kept as they were compiled, each alone
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
@@ -33,9 +43,17 @@ def read_model(load: Load) -> mujoco.MjModel:
     """Return the load's model alone, as its file has it.
 
     Raises:
-        ValueError: If there is no such file, MuJoCo cannot read it, or it has other joints than hinges and slides.
+        ValueError: If there is no such file, it takes in files from elsewhere, it exceeds a limit, MuJoCo cannot read
+            it, or it has other joints than hinges and slides.
     """
-    return _checked(load, _spec(load).compile)
+    if _is_ours(load.mjcf):
+        return _checked(load, _spec(load).compile)
+    key = load.name, _hash_of(load.mjcf)
+    kept = _kept.pop(key, None)
+    _kept[key] = kept = _compiled_elsewhere(load, None) if kept is None else kept
+    while len(_kept) > _MOST_KEPT:
+        _kept.popitem(last=False)
+    return copy.copy(kept)  # whoever asked may change it
 
 
 def resolve(load: Load) -> Load:
@@ -108,7 +126,27 @@ def copies_per_model(load: Load, machines: int = 1) -> int:
 
 def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
     """Return a model of `copies` copies of the load; elements of copy k are named with the prefix `k/`."""
-    single = read_model(load)
+    if _is_ours(load.mjcf):
+        return _packed(load, copies)
+    _hash_of(load.mjcf)
+    return _compiled_elsewhere(load, copies)
+
+
+def check_model(mjcf: Path) -> None:
+    """Raise ValueError unless a model may be compiled in this process: it is ours, or was within the limits elsewhere.
+
+    Raises:
+        ValueError: As `read_model`, whatever its joints are.
+    """
+    if not _is_ours(mjcf):
+        key = "", _hash_of(mjcf)
+        if key not in _harmless:
+            call_limited(f"the model {mjcf}", _compile_alone, mjcf)
+            _harmless.add(key)
+
+
+def _packed(load: Load, copies: int) -> mujoco.MjModel:
+    single = _checked(load, _spec(load).compile)
     packed = mujoco.MjSpec()
     constrained = is_constrained(single)
     packed.memory = _MEMORY_FIXED + (_MEMORY_PER_CONSTRAINED_COPY if constrained else _MEMORY_PER_COPY) * copies
@@ -207,6 +245,46 @@ def _copy(load: Load, shift: int) -> mujoco.MjSpec:
         geom.contype = _signed(geom.contype << shift)
         geom.conaffinity = _signed(geom.conaffinity << shift)
     return child
+
+
+_kept: OrderedDict[tuple[str, str], mujoco.MjModel] = OrderedDict()
+_harmless: set[tuple[str, str]] = set()
+
+
+def _is_ours(mjcf: Path) -> bool:
+    return mjcf.parent == MODELS
+
+
+def _hash_of(mjcf: Path) -> str:
+    """Return the hash of a model's files; ValueError as `hash_of_model`, and if there is none."""
+    if not mjcf.exists():
+        raise ValueError(f"there is no model file {str(mjcf)!r}")
+    try:
+        return hash_of_model(mjcf)
+    except OSError as error:
+        raise ValueError(f"the model file {str(mjcf)!r} cannot be read: {error.strerror}") from None
+
+
+def _compiled_elsewhere(load: Load, copies: int | None) -> mujoco.MjModel:
+    """Return the model of a load alone, or packed, which another process has compiled."""
+    content = call_limited(f"the model {load.mjcf}", _compile_to_bytes, load, copies)
+    return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": content})
+
+
+def _compile_to_bytes(load: Load, copies: int | None) -> bytes:
+    model = _checked(load, _spec(load).compile) if copies is None else _packed(load, copies)
+    mujoco.MjData(model)  # a file may ask for memory here, too
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return content.tobytes()
+
+
+def _compile_alone(mjcf: Path) -> bytes:
+    try:
+        mujoco.MjData(mujoco.MjModel.from_xml_path(str(mjcf)))
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {str(mjcf)!r}: {' '.join(str(error).split())}") from None
+    return b""
 
 
 def _spec(load: Load) -> mujoco.MjSpec:

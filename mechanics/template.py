@@ -16,6 +16,7 @@ from mechanics.friction import FrictionModel
 from mechanics.load import Combination, Friction, Load
 from mechanics.load_values import body_numbers, check_places
 from mechanics.model import compile_packed, is_constant, is_constrained, is_varying, motion_of, read_model
+from mechanics.untrusted import read_bytes
 
 Floats = NDArray[np.float64]
 _INDICES = NDArray[np.int64]
@@ -219,7 +220,7 @@ def template_of(load: Load, copies: int) -> Template:
     Raises:
         ValueError: As `Template`.
     """
-    content = load.mjcf.read_bytes() if load.mjcf.is_file() else b""
+    content = read_bytes(load.mjcf) if load.mjcf.is_file() else b""
     if not content or re.search(rb"<include|<replicate|file\s*=", content):
         return Template(load, copies)
     key = (repr(load), content, copies)

@@ -6,30 +6,47 @@ means is its reader's matter.
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import math
 import re
+import stat
+import sys
 import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_TEXT = 16_000_000  # bytes of a TOML, JSON, YAML or EDS: the largest that we write has some 100 kB
+MOST_TEXT = 16_000_000  # bytes of a JSON, YAML, EDS or MJCF: the largest that we write has some 100 kB
+MOST_TOML = 4_000_000  # bytes; tomllib reads about 1 MB/s
 MOST_RECORDING = 500_000_000  # bytes of a log of frames or samples: an hour of a full bus has some 300 MB
+MOST_LINE = 1_000_000  # letters of a line of a CSV
 MOST_ARRAYS = 500_000_000  # bytes of the arrays in an .npz, unpacked
 MOST_ENTRIES = 10_000  # arrays in an .npz
 DEEPEST = 40  # tables and lists in one another
-# A dotted key of so many parts, for which tomllib takes memory that grows with the square of their number.
-_PART = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
-_LONG_KEY = re.compile(rf"{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{DEEPEST}}}")
 MOST_VALUES = 1_000_000  # in a table, each mention of a YAML alias counted
+MOST_TOML_VALUES = 200_000  # and parts of keys: each part of a dotted key is a table
+
+# What tomllib takes no heed of is looked for before it begins: its memory grows with the square of a key's parts. Each
+# pattern goes through a text once, whatever is in it: what it has taken it never gives back, and a string that does not
+# end ends with the text.
+_TOML_STRINGS = re.compile(
+    r'''"""(?:[^"\\]++|\\(?:.|\Z)|"(?!""))*+(?:"{3,5}|\Z)'''
+    r"""|'''(?:[^']++|'(?!''))*+(?:'{3,5}|\Z)"""
+    r"""|"(?:[^"\\\n]++|\\[^\n]?)*+"?|'[^'\n]*+'?|\#[^\n]*+""",
+    re.DOTALL,
+)
+_TOML_PART = r"""(?:[A-Za-z0-9_-]++|")"""
+_LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_TOML_PART}(?:[ \t]*+\.[ \t]*+{_TOML_PART}){{{DEEPEST}}}")
+_BRACKET = re.compile(r"[\[\]{}]")
 
 _CONTAINERS = (Mapping, list, tuple)
 
@@ -49,17 +66,24 @@ class TooLargeError(UntrustedFileError):
 
 
 def check_size(path: Path, most: int) -> None:
-    """Raise UntrustedFileError for a file of more than `most` bytes; OSError if it cannot be looked at."""
-    size = path.stat().st_size
-    if size > most:
-        raise TooLargeError(f"{path} has {size / 1e6:.0f} MB, and {most / 1e6:.0f} MB are read; is it the right file?")
+    """Raise UntrustedFileError for what is no file or has more than `most` bytes; OSError if it cannot be looked at.
+
+    To open a pipe waits for whoever writes into it, and a device may have no end.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):  # opening a folder fails by itself
+        raise UntrustedFileError(f"{path} is a pipe or a device; give a file, copied from it if need be")
+    if found.st_size > most:
+        raise TooLargeError(
+            f"{path} has {found.st_size / 1e6:.0f} MB, and {most / 1e6:.0f} MB are read; is it the right file?"
+        )
 
 
 def read_bytes(path: str | Path, most: int = MOST_TEXT) -> bytes:
     """Return a file's bytes.
 
     Raises:
-        UntrustedFileError: If there are more than `most`; a device without end (/dev/zero) has more.
+        UntrustedFileError: If it has more than `most`, or is a pipe or a device.
         OSError: If it cannot be read.
     """
     check_size(Path(path), most)
@@ -70,9 +94,16 @@ def read_bytes(path: str | Path, most: int = MOST_TEXT) -> bytes:
     return content
 
 
-def read_text(path: str | Path) -> str:
+def read_start(path: str | Path, count: int) -> bytes:
+    """Return the first `count` bytes of a file, however long it is; UntrustedFileError for a pipe or a device."""
+    check_size(Path(path), sys.maxsize)
+    with Path(path).open("rb") as file:
+        return file.read(count)
+
+
+def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
     """Return the text of a UTF-8 file with one end of lines; raises as `read_bytes`, and UnicodeDecodeError."""
-    return io.TextIOWrapper(io.BytesIO(read_bytes(path)), encoding="utf-8").read()
+    return io.TextIOWrapper(io.BytesIO(read_bytes(path, most)), encoding="utf-8").read()
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -82,16 +113,15 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         tomllib.TOMLDecodeError: If it is none, or passes a limit; UnicodeDecodeError, OSError as reading a file does.
     """
     try:
-        return parse_toml(read_text(path))
+        return parse_toml(read_text(path, MOST_TOML))
     except UntrustedFileError as error:
         raise tomllib.TOMLDecodeError(str(error)) from None
 
 
 def parse_toml(text: str) -> dict[str, Any]:
     """Return the table in a text; raises tomllib.TOMLDecodeError if it is not TOML or exceeds a limit."""
-    if _LONG_KEY.search(text):
-        raise tomllib.TOMLDecodeError(_too_deep())
     try:
+        _check_toml(text)
         table = tomllib.loads(text)
         check_table(table)
     except tomllib.TOMLDecodeError:
@@ -104,12 +134,21 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value in a text; raises ValueError if it is not JSON, has NaN, or exceeds a limit.
+    """Return the value in a text.
 
-    JSON has neither NaN nor Infinity, though Python's reader takes both.
+    JSON has neither NaN nor Infinity, though Python's reader takes both. Of a name that stands twice in one table
+    Python's reader drops the first: what a person reads there would not be what a program reads.
+
+    Raises:
+        ValueError: If it is not JSON, has NaN, a name twice in one table, or exceeds a limit.
     """
     try:
-        value = json.loads(text, parse_constant=_no_constant, parse_float=_finite)
+        text = text if isinstance(text, str) else text.decode("utf-8-sig")
+        if sum(map(text.count, ",[{")) > 2 * MOST_VALUES:  # values and containers, before there is memory for them
+            raise UntrustedFileError(_too_many())
+        value = json.loads(
+            text, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_table_of_different_names
+        )
     except RecursionError:
         raise UntrustedFileError(_too_deep()) from None
     check_table(value)
@@ -119,6 +158,24 @@ def parse_json(text: str | bytes) -> Any:
 def read_json(path: str | Path) -> Any:
     """Return the value in a JSON file; raises as `parse_json` and `read_text`."""
     return parse_json(read_text(path))
+
+
+def read_rows(path: str | Path) -> Iterator[list[str]]:
+    """Give the rows of a CSV line by line.
+
+    Raises:
+        UntrustedFileError: As `check_size`, and for a line of more than MOST_LINE letters.
+        csv.Error: If it is no CSV; UnicodeDecodeError, OSError as reading a file does.
+    """
+    check_size(Path(path), MOST_RECORDING)
+    with Path(path).open(newline="", encoding="utf-8") as file:
+        yield from csv.reader(iter(lambda: _short(path, file.readline(MOST_LINE + 1)), ""))
+
+
+def _short(path: str | Path, line: str) -> str:
+    if len(line) > MOST_LINE:
+        raise UntrustedFileError(f"{path} has a line of more than {MOST_LINE} letters; is it the right file?")
+    return line
 
 
 def check_table(value: Any) -> None:
@@ -133,7 +190,7 @@ def check_table(value: Any) -> None:
             inside = one.values() if isinstance(one, Mapping) else one
             count += len(one)
             if count > MOST_VALUES:
-                raise UntrustedFileError(f"it holds more than {MOST_VALUES} values")
+                raise UntrustedFileError(_too_many())
             below.extend(item for item in inside if isinstance(item, _CONTAINERS))
         if not below:
             return
@@ -152,6 +209,8 @@ def read_arrays(source: str | Path | BinaryIO, most: int = MOST_ARRAYS) -> dict[
         OSError: If it cannot be read.
     """
     name = source if isinstance(source, str | Path) else "the data"
+    if isinstance(source, str | Path):
+        check_size(Path(source), MOST_ARRAYS)
     try:
         with zipfile.ZipFile(source) as archive:
             members = archive.infolist()
@@ -176,6 +235,7 @@ def read_member(path: str | Path, name: str, most: int = MOST_TEXT) -> bytes:
         UntrustedFileError: If it is no .zip, is damaged, or the member has more than `most` bytes.
         OSError: If it cannot be read.
     """
+    check_size(Path(path), sys.maxsize)
     try:
         with zipfile.ZipFile(path) as archive:
             if name not in archive.namelist():
@@ -186,6 +246,16 @@ def read_member(path: str | Path, name: str, most: int = MOST_TEXT) -> bytes:
             return _unpacked(archive, member)
     except (UntrustedFileError, KeyError):
         raise
+    except _DAMAGED as error:
+        raise UntrustedFileError(f"{path} is not a complete .zip: {_one_line(error)}") from None
+
+
+def member_names(path: str | Path) -> list[str]:
+    """Return the names of the members of a .zip; raises as `read_member`."""
+    check_size(Path(path), sys.maxsize)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.namelist()
     except _DAMAGED as error:
         raise UntrustedFileError(f"{path} is not a complete .zip: {_one_line(error)}") from None
 
@@ -215,6 +285,36 @@ def _array(content: bytes) -> NDArray[Any]:
 
 def _one_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _check_toml(text: str) -> None:
+    """Raise UntrustedFileError for what would take tomllib memory or time far beyond the length of the text."""
+    if len(text) > MOST_TOML:
+        raise TooLargeError(f"it has {len(text) / 1e6:.0f} MB, and {MOST_TOML / 1e6:.0f} MB of TOML are read")
+    bare = _TOML_STRINGS.sub('"', text)  # what stands in strings and comments nests nothing
+    if _LONG_KEY.search(bare):
+        raise UntrustedFileError(_too_deep())
+    if sum(map(bare.count, ",=.[{")) > MOST_TOML_VALUES:
+        raise UntrustedFileError(_too_many(MOST_TOML_VALUES))
+    depth = 0
+    for bracket in _BRACKET.findall(bare):
+        depth += 1 if bracket in "[{" else -1
+        if depth > DEEPEST:
+            raise UntrustedFileError(_too_deep())
+
+
+def _table_of_different_names(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the table of a JSON object; UntrustedFileError if a name stands in it twice."""
+    pairs = list(pairs)
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        name = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise UntrustedFileError(f"the name {name[:100]!r} stands twice in one table; leave one of them")
+    return table
+
+
+def _too_many(most: int = MOST_VALUES) -> str:
+    return f"it holds more than {most} values"
 
 
 def _too_deep() -> str:

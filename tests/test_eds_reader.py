@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 from pathlib import Path
 
 import canopen
@@ -13,6 +14,7 @@ from drive_env.dictionary.eds_file import parse_eds
 from drive_env.dictionary.eds_values import node_id_sum, number_of
 from drive_env.dictionary.entries import ObjectDictionary, eds_file, read_eds
 from drive_env.master.description import describe
+from mechanics.untrusted import UntrustedFileError
 
 FOLDER = Path(__file__).parent / "data" / "eds"
 SHIPPED = sorted((Path(__file__).parents[1] / "drive_env" / "devices").glob("*/*.eds"))
@@ -210,3 +212,47 @@ def test_a_dirty_file_describes_a_drive_to_the_master(path):
     assert rows(read_eds(path, 5)) != known
     assert found.num_axes == (2 if "fjord" in path.stem else 1)
     assert found.dictionary.find("Statusword").bits == 16
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+def compact(count, of="254"):
+    """Return so many arrays that are described once."""
+    return HEAD + "".join(entry(f"{0x2000 + k:04X}", kind="0x8", CompactSubObj=of) for k in range(count))
+
+
+def test_an_eds_of_8_kb_cannot_describe_more_entries_than_drives_have():
+    """100 arrays made 25,502 objects, and 400 did not end."""
+    assert len(parse_eds(compact(70)).sections) > 17_000
+    for count in (100, 400):
+        begun = time.process_time()
+        with pytest.raises(
+            UntrustedFileError, match=r"describes more than 20000 entries .*leave out those that you do not"
+        ):
+            parse_eds(compact(count))
+        assert time.process_time() - begun < 10.0
+    with pytest.raises(UntrustedFileError, match="more than 20000 entries"):
+        parse_eds(HEAD + "".join(f"[{0x2000 + k // 16:04X}sub{k % 16:X}]\n" for k in range(20_001)))
+
+
+@pytest.mark.parametrize("count", ["0xFFFFFFFF", "1000000000000", "255", "-1"])
+def test_an_array_has_at_most_254_members(count):
+    """A count of ten digits was counted to its end."""
+    sections, repairs = parse_eds(compact(1, count))
+    assert not any("sub" in name for name in sections)
+    assert [one.what for one in repairs if "CompactSubObj" in one.what] == [
+        f"CompactSubObj={count} is no number of sub-objects, 1 to 254"
+    ]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["[" + " " * 300_000 + "x", "[1000sub" + "_" * 300_000 + "x]", "A=" + " ;" * 300_000,
+     "DefaultValue=" + "9" * 300_000,
+     "DefaultValue=0x" + "9" * 300_000, "DefaultValue=$NODEID" + "+1" * 300_000,
+     "[OptionalObjects]\n" + "".join(f"{k}=0x1001\n" for k in range(30_000))],
+)  # fmt: skip
+def test_a_long_line_takes_time_that_grows_as_it_does(line):
+    """Milliseconds; a bracket with 300,000 spaces took hours."""
+    begun = time.process_time()
+    parse_eds(HEAD + entry(DefaultValue=None) + line)
+    assert time.process_time() - begun < 20.0

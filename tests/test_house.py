@@ -94,6 +94,67 @@ def test_a_class_has_its_name_alone():
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
 
 
+# Calls that read a file, or make something of what was read, without a limit. All go through mechanics/untrusted.py;
+# what else may read, and why it meets nothing that somebody else wrote.
+READERS = {
+    "tomllib.load", "tomllib.loads", "json.load", "json.loads", "yaml.load", "yaml.safe_load", "pickle.load",
+    "pickle.loads", "np.load", "np.fromfile", "np.loadtxt", "np.genfromtxt", "zipfile.ZipFile", "zipfile.is_zipfile",
+    "csv.reader", "csv.DictReader", "can.LogReader", "canopen.import_od", "ET.parse", "ET.fromstring",
+    "read_text", "read_bytes", "open", "from_file", "from_string", "from_xml_path", "from_xml_string",
+    "from_binary_path", "InferenceSession", "torch.load",
+}  # fmt: skip
+MAY_READ = {
+    "mechanics.untrusted": "the readers themselves",
+    "mechanics.model": "MuJoCo: ours here, those of others in mechanics/limited_child.py",
+    "mechanics.limited_child": "what its parent asks, /proc",
+    "drive_env.pictures.scene": "MuJoCo: what mechanics/model.py has let pass",
+    "mechanics.compiled": "sources of ours",
+    "tuning.runs.provenance": "sources of ours",
+    "mechanics.kernel_files": "the cache of kernels, in a folder of the user's own; pickles, as Numba's are",
+    "drive_env.cores": "/proc and /sys",
+    "drive_env.whole_file": "the text that is about to be written",
+    "drive_env.devices.new_device": "the template of ours",
+    "drive_env.dictionary.entries": "the text of a file that was read within limits; EdsText.read_text",
+    "agents.training.checkpoint": "pickles of a writer who is trusted (--trust)",
+    "agents.training.hyperparameters": "YAML of a text that was read within limits",
+    "agents.training.search": "files that were written a moment ago, in a folder of its own",
+    "agents.training.training_table": "CSV of a text that was read within limits",
+    "agents.training.learning_curve": "CSV of a text that was read within limits",
+    "agents.policies.onnx_policy": "a file that has been read, and acted within limits in mechanics/limited_child.py",
+    "drive_env.commands.recorded_frames": "in mechanics/limited_child.py",
+    "tuning.runs.shard_log": "frame by frame, each with its length",
+}
+
+
+def readers_in(tree: ast.Module) -> set[str]:
+    """The calls of a module that are in READERS; a file that is opened to be written is none."""
+    found = set()
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        names = ast.unparse(node.func).split(".")
+        whole = ".".join(names[-2:])
+        plain = names[-1] if len(names) > 1 else whole  # of a method, which object it is of does not matter
+        modes = [one.value for one in node.args if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+        if plain == "open" and (any(set(mode) & set("wax") for mode in modes) or not (modes or node.keywords)):
+            continue  # written; or a method of that name that opens something else
+        if plain == "open" and any(one.arg == "is_bootstrap" for one in node.keywords):
+            continue  # a mailbox
+        if plain in ("read_text", "read_bytes") and len(names) == 1:
+            continue  # ours
+        found |= {whole, plain} & READERS
+    return found
+
+
+def test_what_is_read_goes_through_the_readers_with_limits():
+    found = {name: calls for name, tree in modules().items() if (calls := readers_in(tree))}
+    ours = {name: calls for name, calls in found.items() if not name.startswith("research.")}
+    assert {name: calls for name, calls in ours.items() if name not in MAY_READ} == {}, (
+        "read it by mechanics/untrusted.py, or say in MAY_READ why nobody else's file can be there"
+    )
+    assert set(MAY_READ) <= set(ours), "reads nothing now: take it from the list"
+
+
 @cache
 def commands() -> set[str]:
     """The functions that are commands of our programs, by file and name."""

@@ -440,6 +440,47 @@ def test_a_resolution_that_no_position_could_be_held_by_is_told_and_not_taken(tm
         assert abs(drives.read(0x6064)[0] - 4096) < 82
 
 
+@pytest.mark.parametrize("factory", [(4096, 0), (0, 1), (0, 0), (0, 5), (4294967295, 0)])
+@pytest.mark.filterwarnings("error")
+def test_a_resolution_with_a_0_is_that_of_the_motor_s_encoder(tmp_path, factory):
+    """With factory values the drive divided by its 0 revolutions."""
+    text = BASE + RESOLUTION
+    for sub, value in enumerate(factory, 1):
+        text = put(text, f"608Fsub{sub}", DefaultValue=value, LowLimit="0")
+    made, told = made_of(tmp_path, text)
+    assert told["608Fh"] == "has no factory value: the counts of the motor's encoder"
+    assert "makes no scale of positions: it is " in made.text()
+    with emulated(str(made.folder)) as drives:
+        assert drives.read(Role.POSITION_SCALE)[0] == find_motor(MOTOR).encoder_counts
+        for sub in (1, 2):
+            with pytest.raises(ObjectAccessError):
+                drives.write((0x608F, sub), 0)
+    with emulated(str(made.folder), commissioned=False) as drives:
+        assert drives.read(Role.POSITION_SCALE)[0] == find_motor(MOTOR).encoder_counts
+
+
+@pytest.mark.parametrize(
+    ("changes", "object_", "ratio"),
+    [({"6091sub1": 1, "6091sub2": 4294967295}, "6092h over 6091h", "154618822620000 : 1"),
+     ({"6092sub1": 4294967295}, "6092h over 6091h", "4294967295 : 1"),
+     ({"60A8": "0xF7410000"}, "60A8h", "3.6e+11 : 1")],
+)  # fmt: skip
+def test_a_scale_of_which_32_bits_hold_no_8_turns_is_told_and_not_taken(tmp_path, changes, object_, ratio):
+    """With 6091h of 1 : 4294967295 an axis never moved, and nothing said why."""
+    text = BASE + ("" if "60A8" in changes else FEED_36000)
+    for section, value in changes.items():
+        text = put(text, section, DefaultValue=value)
+    made, told = made_of(tmp_path, text)
+    assert (
+        told[object_]
+        == f"{ratio} is not taken: positions of 32 bits hold fewer than 8 turns of more than 268435456 units"
+    )
+    with emulated(str(made.folder)) as drives:
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, 4096)
+        assert abs(drives.read(0x6064)[0] - 4096) < 82
+
+
 INTERPOLATION = (
     entry("60C1", "Interpolation data", kind="0x8", data_type=None, access=None, SubNumber=2)
     + entry("60C1sub0", "Entries", data_type="0x5", access="ro", DefaultValue=1)

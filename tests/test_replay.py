@@ -564,7 +564,7 @@ def test_columns_of_one_object_are_its_axes_wherever_they_stand(tmp_path):
         (b"\n", r"the first line must begin with 't \[s\]', as drive-env scope writes it"),
         (b"t [s]\n" + b"0\n" * 12, r"the first line must begin with 't \[s\]'"),
         (b"t [s],6064h:00 P\n" + b"0.1\n" * 12, "every line needs a time and 1 whole numbers|at least 10 lines of 2 v"),
-        (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1\n" * 12, r"needs at least 10 lines of 3 values each"),
+        (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1\n" * 12, r"needs a time and 2 whole numbers: line 2 has 2"),
         (b"t [s],6064h:00 P,606Ch:00 V\n" + b"0,1,x\n" * 12, r"every line needs a time and 2 whole numbers: invalid"),
     ],
 )  # fmt: skip

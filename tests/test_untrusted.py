@@ -1,14 +1,18 @@
 """Files that anybody may have written: too large, too deep, of another kind. A line comes of it, never gigabytes."""
 
+import contextlib
 import io
 import itertools
 import json
 import os
 import resource
+import struct
 import subprocess
 import sys
+import time
 import tomllib
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +21,23 @@ from typer.testing import CliRunner
 
 from agents.commands.cli import app as agent_app
 from agents.evaluation import episode_log
+from agents.policies import onnx_policy
 from agents.policies.agent_file import AgentFile, BundleError
+from agents.studio.event_curves import read_curves
 from agents.training import hyperparameters
 from drive_env.bus.config import BusConfigError, load_bus
+from drive_env.commands import recorded_frames
 from drive_env.commands.cli import app as env_app
+from drive_env.dictionary.entries import read_eds
 from drive_env.envs.configuration import configured
 from drive_env.envs.randomisation import Distributions
 from drive_env.envs.tracking import TrackingConfig
+from drive_env.motors import find_motor
 from drive_env.node.store import Store
 from drive_env.pictures.demonstration import DemonstrationError, load_demonstration
+from drive_env.studio import runs_folder
+from drive_env.trials.replay import read_log
+from drive_env.whole_file import content_hash
 from mechanics import untrusted
 from mechanics.untrusted import UntrustedFileError, parse_json, parse_toml, read_arrays, read_bytes, read_toml
 from tuning.certificate import certificate, certificate_files
@@ -42,19 +54,69 @@ DEEP_JSON = "[" * DEEP + "]" * DEEP
 DIGITS = "a = " + "9" * 5000  # more than Python turns into a number
 
 
+# Whose keys tomllib takes 5 s and 1.6 GB for; the scan that looks for them took 91 s for the last.
+HOSTILE_TOML = {
+    "brackets": DEEP_TOML,
+    "dotted key": DEEP_KEYS,
+    "quoted parts": ".".join(['"\\""'] * 20_000) + " = 1",
+    "parts apart": " . ".join(["'.'"] * 20_000) + " = 1",
+    "title": f"[{'.'.join('a' * 20_000)}]",
+    "inline": "a = " + "{a = " * 20_000,
+    "digits": DIGITS,
+    "many": "a = [" + "0," * 1_100_000 + "]",
+    "many tables": "".join(f"k{k}.{'.'.join('a' * 38)} = 1\n" for k in range(20_000)),
+}
+LONG_TOML = {"identifier": "a" * 1_000_000, "text": "a = '" + "." * 1_000_000 + "'", "open": '"' * 999_998,
+             "escaped": '"""' + '\\"""' * 200_000, "spaces": "a" + " " * 1_000_000, "dots": "a ." * 100_000,
+             "broken parts": (".".join("a" * 39) + "\n") * 2500}  # fmt: skip
+
+
 @pytest.mark.every(3)
-@pytest.mark.parametrize("text", [DEEP_TOML, DEEP_KEYS, DIGITS, "a = [" + "0," * 1_100_000 + "]"])
+@pytest.mark.parametrize("text", HOSTILE_TOML.values(), ids=HOSTILE_TOML)
 def test_toml_within_limits(text):
     with pytest.raises(tomllib.TOMLDecodeError) as told:
         parse_toml(text)
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize("text", [DEEP_JSON, "[NaN]", "[-Infinity]", "[1e999]", '{"a":' * DEEP])
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("text", [text for text in HOSTILE_TOML.values() if text is not DIGITS])
+def test_what_would_be_large_is_refused_before_tomllib_begins(text, monkeypatch, memory):
+    monkeypatch.setattr(tomllib, "loads", lambda text: pytest.fail("tomllib began"))
+    with pytest.raises(tomllib.TOMLDecodeError, match="more than"):
+        parse_toml(text)
+
+
+@pytest.mark.parametrize("text", LONG_TOML.values(), ids=LONG_TOML)
+def test_the_scan_takes_time_that_grows_as_the_text_does(text):
+    """A million letters: milliseconds. A scan that begins anew at each letter takes hours."""
+    begun = time.process_time()
+    with contextlib.suppress(UntrustedFileError):
+        untrusted._check_toml(text)
+    assert time.process_time() - begun < 20.0
+
+
+def test_dots_in_strings_and_comments_nest_nothing():
+    text = 'a = "%s"  # %s\nb = """\n%s"""\n' % ((".".join("a" * 50),) * 2 + ("[" * 50,))
+    assert parse_toml(text) == {"a": ".".join("a" * 50), "b": "[" * 50}
+
+
+@pytest.mark.parametrize(
+    "text", [DEEP_JSON, "[NaN]", "[-Infinity]", "[1e999]", '{"a":' * DEEP, "[" + "[]," * 3_000_000]
+)
 def test_json_within_limits(text):
     with pytest.raises(ValueError) as told:
         parse_json(text)
     assert "\n" not in str(told.value)
+
+
+DOUBLED = '{"a": 1, "b": {"axes": [1], "axes": [2]}}'
+
+
+@pytest.mark.parametrize("text", [DOUBLED, DOUBLED.encode(), '[{"a":1,"\\u0061":1}]'])
+def test_a_name_that_stands_twice_is_refused(text):
+    with pytest.raises(UntrustedFileError, match=r"the name '(axes|a)' stands twice in one table"):
+        parse_json(text)
 
 
 def test_what_is_within_the_limits_is_read():
@@ -69,14 +131,27 @@ def test_what_is_within_the_limits_is_read():
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no such device here")
 def test_a_file_without_end_is_refused():
-    with pytest.raises(UntrustedFileError, match="more than 16 MB"):
+    with pytest.raises(UntrustedFileError, match="/dev/zero is a pipe or a device; give a file"):
         read_bytes("/dev/zero")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with a name here")
+@pytest.mark.parametrize(
+    "read",
+    [read_toml, untrusted.read_json, untrusted.read_text, lambda path: untrusted.read_start(path, 10), read_arrays,
+     lambda path: untrusted.read_member(path, "a"), find_motor, read_eds, lambda path: Store(path, "tmcm1636")],
+)  # fmt: skip
+def test_a_pipe_is_refused_before_it_is_opened(read, tmp_path):
+    """Nobody writes into it: whoever opens it waits without end."""
+    os.mkfifo(tmp_path / "pipe.toml")
+    with pytest.raises(ValueError, match="is a pipe or a device"):
+        read(tmp_path / "pipe.toml")
 
 
 def test_a_file_that_is_too_large_is_refused_unread(tmp_path):
     with (tmp_path / "large.toml").open("wb") as file:
         file.truncate(1 << 40)  # a hole: takes no room
-    with pytest.raises(tomllib.TOMLDecodeError, match="has 1099512 MB, and 16 MB are read"):
+    with pytest.raises(tomllib.TOMLDecodeError, match="has 1099512 MB, and 4 MB are read"):
         read_toml(tmp_path / "large.toml")
 
 
@@ -313,6 +388,7 @@ LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("1: {n_envs: 1}", "section 1 must be a table"),
         ("ServoDrive/Tracking-v0: {n_envs: .inf, n_timesteps: 1, policy: x}", "n_envs must be a whole number"),
         ("ServoDrive/Tracking-v0: {n_envs: .nan, n_timesteps: 1, policy: x}", "n_envs must be a whole number"),
+        ("a: {n_envs: 1, n_envs: 2}", "the name 'n_envs' stands twice in one table"),
         ("a: b: c", "cannot be read as YAML: mapping values are not allowed here"),
         (f"ServoDrive/Tracking-v0: {{x: '{'[' * 3000}'}}", "nests too deep|cannot be read"),
         ("ServoDrive/Tracking-v0: {x: 'dict(a={[]: 1})'}", "cannot be read: unhashable type"),
@@ -339,4 +415,112 @@ def test_a_device_without_end_is_no_file_of_anybody(tmp_path):
     found = subprocess.run(
         [sys.executable, "-c", program, "serve", "--config", "/dev/zero"], capture_output=True, text=True, timeout=60
     )
-    assert found.returncode == 2 and "more than 16 MB" in found.stderr
+    assert found.returncode == 2 and "is a pipe or a device" in found.stderr
+
+
+def test_a_certificate_that_says_two_things_is_not_unchanged(tmp_path):
+    """A person reads the first of two values, the program the last; `verify` called it unchanged."""
+    data = {"format": certificate.FORMAT, "passed": False}
+    whole = json.dumps(data | {certificate.HASH: content_hash(data)})
+    path = tmp_path / "certificate.json"
+    path.write_text(whole)
+    assert certificate_files.is_unchanged(path)
+    path.write_text(whole.replace('"passed": false', '"passed": true, "passed": false'))
+    with pytest.raises(certificate.CertificateError, match="the name 'passed' stands twice in one table"):
+        certificate_files.is_unchanged(path)
+    found = CliRunner().invoke(tune_app, ["verify", str(path)])
+    assert found.exit_code == 2 and "'passed' stands twice" in found.output.replace("\n", " ")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with a name here")
+@pytest.mark.parametrize(
+    "text", [".".join("a" * 20_000) + " = 1", DEEP_TOML[:190_000], "a" * 190_000 + " = 1"], ids=["keys", "deep", "long"]
+)
+def test_a_run_of_others_is_shown_whatever_is_in_it(text, tmp_path):
+    """A settings.toml of 40 kB held the page's thread, and with it the quick stop, for 47 s."""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "settings.toml").write_text(text)
+    (run / "config.toml").write_text("known = 1\n")
+    (run / "certificate.json").write_text(DOUBLED)
+    os.mkfifo(run / "args.toml")
+    os.mkfifo(run / "events.out.tfevents.1")
+    begun = time.process_time()
+    (found,) = runs_folder.list_runs(tmp_path)
+    assert runs_folder.settings_of(found, tmp_path).get("known") == "1"
+    assert runs_folder.certificate_of(found, tmp_path) == {}
+    assert time.process_time() - begun < 5.0
+    with pytest.raises(UntrustedFileError, match="is a pipe or a device"):
+        runs_folder.text_of(run / "args.toml")
+    pytest.importorskip("tensorboard")
+    assert read_curves(run) == {}
+
+
+# --- what is read in a process with limits ----------------------------------------------------------------------------
+def blf_bomb(path, megabytes):
+    """A log of Vector's whose one container is zeros."""
+    packed = zlib.compress(bytes(megabytes * 1_000_000), 9)
+    container = struct.pack("<H6xL4x", 2, megabytes * 1_000_000) + packed
+    whole = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(container), 10) + container
+    head = struct.pack(
+        "<4sLBBBBBBBBQQLL8H8H72x", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1, 144 + len(whole), 0, 0, 0, *[1] * 16
+    )
+    path.write_bytes(head + whole)
+    return path
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
+def test_a_log_of_frames_that_unpacks_without_end_is_refused(tmp_path, monkeypatch):
+    """600 kB that unpack to 600 MB: of 500 MB that are read 500 GB could come."""
+    monkeypatch.setattr(recorded_frames, "MEMORY", 400_000_000)
+    path = blf_bomb(tmp_path / "frames.blf", 600)
+    assert path.stat().st_size < 700_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(
+        UntrustedFileError, match=r"the log .*frames\.blf takes more than 0.4 GB of memory to read"
+    ) as told:
+        recorded_frames.read_frames(path, everything=True)
+    assert "\n" not in str(told.value)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+def test_a_recorded_move_has_lines_of_a_length(tmp_path):
+    (tmp_path / "move.csv").write_text("t [s]," + "," * 1_100_000)
+    with pytest.raises(UntrustedFileError, match="has a line of more than 1000000 letters"):
+        read_log(tmp_path / "move.csv")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
+@pytest.mark.parametrize(("kind", "told"), [("numbers", "more than 2 GB of memory"), ("rounds", "more than 1 s")])
+def test_an_onnx_model_acts_once_within_limits_before_it_is_loaded(kind, told, tmp_path, monkeypatch):
+    """10^11 numbers of 200 bytes took 400 GB, 10^15 rounds of a loop held the drives' cycle without end."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    monkeypatch.setattr(onnx_policy, "ACTION_TIME", 1.0)
+    make, floats, constant = onnx.helper, onnx.TensorProto.FLOAT, onnx.numpy_helper.from_array
+    value = make.make_tensor_value_info
+    if kind == "numbers":
+        nodes = [make.make_node("ConstantOfShape", ["n"], ["zeros"]),
+                 make.make_node("ReduceSum", ["zeros"], ["sum"], keepdims=0),
+                 make.make_node("Add", ["observation", "sum"], ["action"])]  # fmt: skip
+        numbers = [constant(np.array([10**11]), "n")]
+    else:
+        inner = [make.make_node("Identity", ["on"], ["still"]), make.make_node("Identity", ["x"], ["y"])]
+        inputs = [
+            value("k", onnx.TensorProto.INT64, []),
+            value("on", onnx.TensorProto.BOOL, []),
+            value("x", floats, None),
+        ]
+        body = make.make_graph(
+            inner, "body", inputs, [value("still", onnx.TensorProto.BOOL, []), value("y", floats, None)]
+        )
+        nodes = [make.make_node("Loop", ["n", "yes", "observation"], ["action"], body=body)]
+        numbers = [constant(np.array(10**15), "n"), constant(np.array(True), "yes")]
+    graph = make.make_graph(
+        nodes, "g", [value("observation", floats, ["rows", 4])], [value("action", floats, None)], numbers
+    )
+    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)])
+    model.ir_version = 8
+    onnx.save(model, str(tmp_path / "agent.onnx"))
+    with pytest.raises(BundleError, match=told):
+        onnx_policy.OnnxPolicy(tmp_path / "agent.onnx")

@@ -11,6 +11,7 @@ from agents.evaluation.evaluation import Evaluation, environments_for, evaluate,
 from agents.evaluation.scores import Episode
 from agents.policies.open_policy import names_a_file, opened
 from agents.training.tasks import configuration_of, environment_name, make_environments
+from mechanics.untrusted import MOST_ARRAYS, read_bytes
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
@@ -32,7 +33,7 @@ class Written(NamedTuple):
     @classmethod
     def of(cls, text: str, trust: bool) -> Written:
         """Return what a text names."""
-        return cls(text, Path(text).read_bytes() if names_a_file(text) else None, trust)
+        return cls(text, read_bytes(text, MOST_ARRAYS) if names_a_file(text) else None, trust)
 
     def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:
         """Return the policy, or the baseline, in an environment with these options."""

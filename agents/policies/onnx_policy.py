@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -10,37 +11,36 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.policies.agent_file import BundleError
 from agents.policies.policy import PolicyError
-from mechanics.untrusted import check_size, parse_json
+from mechanics.limited_child import call_limited
+from mechanics.untrusted import parse_json, read_bytes
 
 METADATA = "drive_agent"
 MOST_BYTES = 100_000_000  # of a file: far more than any policy that makes its millisecond
+ACTION_TIME, ACTION_MEMORY = 20.0, 2_000_000_000  # s of the processor and bytes for loading it and one action
 CARRIED = {"state": "next_state", "cell": "next_cell"}  # of recurrent agents
 
 
 class OnnxPolicy:
     """A policy of one thread from an ONNX file.
 
+    A file of a few bytes may ask for 10^11 numbers or 10^15 rounds of a loop: another process acts once beforehand.
+
     Args:
         path: The file.
 
     Raises:
-        BundleError: If it is no model, has other inputs, or onnxruntime is missing.
+        BundleError: If it is no model, has other inputs, one action exceeds a limit, or onnxruntime is missing.
     """
 
     def __init__(self, path: str | Path) -> None:
         try:
-            import onnxruntime
+            import onnxruntime  # noqa: F401
         except ImportError:
             raise BundleError(f"{path} needs onnxruntime: pip install 'drive-env[agents]'") from None
         if not Path(path).is_file():
             raise BundleError(f"there is no file {path}")
-        check_size(Path(path), MOST_BYTES)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # threads cost more than such a network
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime raises what its own library defines
-            raise BundleError(f"{path} is not an ONNX model: {str(error).splitlines()[0]}") from None
+        _check_limits(Path(path))
+        self._session = _session(path)
         inputs = {one.name: one.shape for one in self._session.get_inputs()}
         outputs = [one.name for one in self._session.get_outputs()]
         if "observation" not in inputs or "action" not in outputs:
@@ -93,3 +93,40 @@ class OnnxPolicy:
             self._lanes = 0
         else:
             self._carried = {name: np.where(mask[:, None], np.float32(0.0), x) for name, x in self._carried.items()}
+
+
+_harmless: set[bytes] = set()  # hashes of files that have acted once within the limits
+
+
+def _check_limits(path: Path) -> None:
+    """Raise BundleError unless a model can be loaded and act within the limits."""
+    try:
+        content = hashlib.sha256(read_bytes(path, MOST_BYTES)).digest()
+        if content not in _harmless:
+            call_limited(f"the policy {path}", _act_once, path, memory=ACTION_MEMORY, time=ACTION_TIME)
+            _harmless.add(content)
+    except ValueError as error:
+        raise BundleError(str(error)) from None
+
+
+def _act_once(path: Path) -> bytes:
+    session = _session(path)
+    rows = {one.name: np.zeros([n if isinstance(n, int) else 1 for n in one.shape], np.float32)
+            for one in session.get_inputs()}  # fmt: skip
+    try:
+        session.run(None, rows)
+    except Exception as error:  # whatever it does not take it says when it is used
+        if "alloc" in str(error):
+            raise MemoryError from None
+    return b""
+
+
+def _session(path: str | Path) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # threads cost more than such a network
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises what its own library defines
+        raise BundleError(f"{path} is not an ONNX model: {str(error).splitlines()[0]}") from None

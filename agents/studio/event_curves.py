@@ -6,8 +6,11 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from mechanics.untrusted import MOST_RECORDING, check_size
+
 EVENTS = "events.out.tfevents."
 MOST_POINTS = 20_000  # of a curve that are read
+MOST_CURVES = 200  # that are read
 
 Curves = Mapping[str, tuple[list[int], list[float]]]
 
@@ -15,7 +18,7 @@ Curves = Mapping[str, tuple[list[int], list[float]]]
 def read_curves(folder: Path) -> Curves:
     """Return each scalar of a folder's event files by its tag: steps, and values.
 
-    A file whose end is being written is read up to there.
+    A file whose end is being written is read up to there; links, pipes and files beyond the limits are left out.
 
     Raises:
         ImportError: If TensorBoard, of the extra `agents`, is not installed.
@@ -24,9 +27,15 @@ def read_curves(folder: Path) -> Curves:
 
     found: dict[str, tuple[list[int], list[float]]] = {}
     for path in sorted(folder.rglob(f"{EVENTS}*")):
+        try:
+            check_size(path, MOST_RECORDING)
+        except (OSError, ValueError):
+            continue
         if path.is_symlink():
             continue
         for step, tag, value in _scalars(LegacyEventFileLoader(str(path))):
+            if tag not in found and len(found) >= MOST_CURVES:
+                continue
             steps, values = found.setdefault(tag, ([], []))
             if len(steps) < MOST_POINTS and math.isfinite(value):
                 steps.append(step)

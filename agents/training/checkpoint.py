@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.training.algorithms import algorithm_class, need
 from drive_env.whole_file import write_whole
-from mechanics.untrusted import MOST_TEXT, parse_json, read_member
+from mechanics.untrusted import MOST_TEXT, member_names, parse_json, read_member
 
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
 # What the JSON of a run has besides: it is read before anybody is trusted.
@@ -84,9 +84,10 @@ def check_trust(path: Path, trust: bool) -> None:
 
 def is_plain(path: Path) -> bool:
     """Return whether a file is Stable-Baselines3's alone, without what drive-agent adds."""
-    if not zipfile.is_zipfile(path):
+    try:
+        names = member_names(path)
+    except (OSError, ValueError):
         return False
-    names = _names(path)
     return PLAIN in names and RUN not in names
 
 
@@ -137,7 +138,7 @@ def load(path: Path, env: Any = None, *, trust: bool = False) -> tuple[Any, Any]
     """
     run = read_run(path)
     check_trust(path, trust)
-    names = _names(path)
+    names = member_names(path)
     normaliser = pickle.loads(_read(path, NORMALISER)) if NORMALISER in names else None
     if normaliser is not None and env is not None:
         normaliser.set_venv(env)
@@ -170,11 +171,6 @@ def restore_random_states(path: Path, model: Any) -> None:
     np.random.set_state(states["numpy"])
     torch.set_rng_state(torch.from_numpy(states["torch"]))
     model.action_space.np_random.bit_generator.state = states["actions"]
-
-
-def _names(path: Path) -> list[str]:
-    with zipfile.ZipFile(path) as archive:
-        return archive.namelist()
 
 
 def _read(path: Path, name: str) -> bytes:

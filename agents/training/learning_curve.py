@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 from drive_env.whole_file import write_picture
+from mechanics.untrusted import MOST_RECORDING, read_text
 
 TERM = "term "  # what columns of reward terms begin with
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
@@ -25,8 +26,7 @@ def draw_learning_curve(table: Path, picture: Path, title: str) -> None:
 
     if not table.is_file():
         return
-    with table.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(io.StringIO(read_text(table, MOST_RECORDING))))
     if not rows:
         return
     steps = [int(row["timesteps"]) for row in rows]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from drive_env.whole_file import naming
+from mechanics.untrusted import MOST_RECORDING, read_text
 
 
 class TrainingTable:
@@ -22,8 +24,8 @@ class TrainingTable:
         self._path = path
         rows = []
         if keep and path.is_file():
-            with path.open(newline="", encoding="utf-8") as file:
-                rows = [row for row in csv.DictReader(file) if int(row["timesteps"]) <= keep]
+            text = io.StringIO(read_text(path, MOST_RECORDING))
+            rows = [row for row in csv.DictReader(text) if int(row["timesteps"]) <= keep]
         self._columns: list[str] = []
         path.unlink(missing_ok=True)
         for row in rows:

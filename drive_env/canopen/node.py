@@ -25,6 +25,7 @@ from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.canopen.sync import SyncProducer, SyncWindow
 from drive_env.canopen.time_of_day import Clock, TimeProducer
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, VALUE_RANGE, ObjectAccessError
+from drive_env.dictionary.entries import eds_text
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.firmware.common.protection import COMMUNICATION
 from drive_env.node.node_axes import NodeAxes
@@ -704,7 +705,7 @@ class Node:
 
     def _eds_text(self) -> str:
         """Return what 1021h holds, each byte a character: the EDS as it is, which 1022h says is not compressed."""
-        return self._device.eds.read_text(encoding="utf-8").encode().decode("latin-1")
+        return eds_text(self._device.eds).encode().decode("latin-1")
 
     def _leave_for_bootloader(self) -> None:
         self._leaves_for_bootloader = True

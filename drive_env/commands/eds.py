@@ -14,6 +14,7 @@ def print_eds(
 ) -> None:
     """Print the EDS of a device: drive-env eds tmcm1636_fw109 > drive.eds."""
     from drive_env.devices import find_device
+    from drive_env.dictionary.entries import eds_text
 
     with errors_as_exit_codes():
-        print(find_device(device).eds.read_text(encoding="utf-8"), end="")
+        print(eds_text(find_device(device).eds), end="")

@@ -29,7 +29,6 @@ from drive_env.commands.options import (
     print_json,
 )
 from drive_env.drives.arguments import LONGEST
-from mechanics.untrusted import MOST_RECORDING, check_size
 
 MOST_CHANNELS = 0xFFFF
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
@@ -119,8 +118,7 @@ def replay(
     shows the frames.
     """
     with errors_as_exit_codes():
-        import can
-
+        from drive_env.commands.recorded_frames import read_frames
         from drive_env.commands.replayed_motors import ANSWER_TIMEOUT
         from drive_env.master.can.dry_run import show_frame
         from drive_env.master.can.port import Port, open_bus
@@ -131,15 +129,7 @@ def replay(
             raise ValueError(f"there is no file {file}")
         if not 0.0 < speed < math.inf:
             raise ValueError(f"--speed {speed:g} must be above 0")
-        check_size(file, MOST_RECORDING)
-        try:
-            with can.LogReader(str(file)) as reader:
-                frames = [frame for frame in reader if everything or _is_from_a_master(frame)]
-        except OSError:
-            raise
-        except Exception as error:  # each format's reader raises what the broken place leads to
-            raise ValueError(f"{file} cannot be read as {file.suffix}: {error}; is it complete?") from error
-        frames = [f for f in frames if not (f.is_extended_id or f.is_error_frame)]
+        frames = read_frames(file, everything=everything)
         _check_stamps(file, frames, speed)
         if dry_run:
             for frame in frames:
@@ -209,17 +199,6 @@ def _in_time(port: Any, frames: list[Any], speed: float, noted: list[int]) -> It
         if noted:
             return
         yield frame
-
-
-def _is_from_a_master(frame: Any) -> bool:
-    """Return whether the predefined connection set has a master send this identifier."""
-    from drive_env.canopen.frames import ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SYNC
-    from drive_env.master.can.error_control import MASTERS
-
-    can_id = frame.arbitration_id
-    if frame.is_remote_frame or can_id in (NMT, SYNC) or can_id - ERROR_CONTROL in MASTERS:
-        return True
-    return any(base < can_id < base + 0x80 for base in (*RPDO, SDO_REQUEST))
 
 
 def _take_interrupts() -> Any:

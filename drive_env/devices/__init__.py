@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -27,12 +26,13 @@ from drive_env.devices.variants import (
     variant_bindings,
 )
 from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.entries import EdsText, ObjectDictionary
+from drive_env.dictionary.entries import EdsText, ObjectDictionary, eds_text
 from drive_env.dictionary.parts import Part, parts_of
 from drive_env.dictionary.roles import Role
 from drive_env.firmware import checked_firmware, default_motor, find_firmware, motor_kinds
 from drive_env.motors import EXTRA_LOW_VOLTAGE, KINDS, MOTORS, Motor, is_extra_low, motors_of
 from mechanics.near_names import did_you_mean
+from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.firmware.cycle import Firmware
@@ -275,7 +275,7 @@ class Device(NamedTuple):
         written_for = find_device(self.variant_of or self.name)
         preset: dict[str, int]
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
-            preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+            preset = dict(read_toml(path)["objects"])
         elif self.commissioning == STANDARD_COMMISSIONING:
             rule = importlib.import_module("drive_env.devices.standard_commissioning")
             preset = rule.preset(self, motor)
@@ -346,7 +346,7 @@ def find_device(name: str) -> Device:
         base = find_device(own["variant_of"])
         folder = FOLDER / base.name
         data = merged(_read(folder), own)
-        eds: Path | EdsText = compose_eds(f"{name}.eds", base.eds.read_text(encoding="utf-8"), own)
+        eds: Path | EdsText = compose_eds(f"{name}.eds", eds_text(base.eds), own)
         bindings = variant_bindings(base.bindings, own["objects"])
     else:
         rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
@@ -434,11 +434,11 @@ def _device(
 
 
 def _read(folder: Path) -> dict[str, Any]:
-    return tomllib.loads((folder / "device.toml").read_text(encoding="utf-8"))
+    return read_toml(folder / "device.toml")
 
 
 def _roles(folder: Path) -> dict[Role, tuple[int, int]]:
-    rows = tomllib.loads((folder / "roles.toml").read_text(encoding="utf-8"))
+    rows = read_toml(folder / "roles.toml")
     return {Role[name.upper()]: parse_key(text) for name, text in rows.items()}
 
 

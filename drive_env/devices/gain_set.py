@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import BasicDrives
@@ -249,7 +250,7 @@ class GainSet:
 
 def load_gain_set(path: Path) -> GainSet:
     """Return the gain set of a device's `gains.toml`."""
-    data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    data: dict[str, Any] = read_toml(path)
     rows = []
     for row in data["gain"]:
         index, sub = row["object"].split(":")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
+
+from mechanics.untrusted import read_toml
 
 Key = tuple[int, int]
 # Data types of fields: character of `struct` for the bits as they are, and how many.
@@ -34,7 +35,7 @@ def fixed_images(folder: Path) -> dict[int, FixedImage]:
     path = folder / "images.toml"
     if not path.exists():
         return {}
-    data = tomllib.loads(path.read_text(encoding="utf-8"))
+    data = read_toml(path)
     return {
         int(number, 16): FixedImage(row["direction"] == "outputs", tuple(_field(*one) for one in row["fields"]))
         for number, row in data.items()

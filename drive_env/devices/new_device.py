@@ -33,6 +33,7 @@ from drive_env.devices.vendor_units import vendor_units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds
+from drive_env.dictionary.eds_values import number_of
 from drive_env.dictionary.entries import INTEGER_TYPES, eds_file
 from drive_env.dictionary.units import find_unit
 from drive_env.whole_file import files_to_be
@@ -379,12 +380,26 @@ class _Draft:
         if exponent in self._types and self._types[exponent].default is None:
             self._section(exponent)["DefaultValue"] = "-3"
             self._changes.append(Note(f"[{_text(exponent)}]", "has no default: -3, milliseconds"))
-        for key in self._units.scale.values():
-            self._section(key).setdefault("LowLimit", "1")
+        self._correct_scale()
         for key, variable in self._types.items():
             if isinstance(variable.default, int) and variable.default >= 1 << 63:
                 self._section(key)["DefaultValue"] = "0"
                 self._changes.append(Note(f"[{_text(key)}]", "the emulator keeps 63 bits: its default is 0"))
+
+    def _correct_scale(self) -> None:
+        """Let the objects that make the scale of positions never be 0, by which others are divided."""
+        keys = list(self._units.scale.values())
+        lacking = any(self._default(*key) <= 0 for key in keys)
+        for k, key in enumerate(keys):
+            row = self._section(key)
+            row["LowLimit"] = str(max(number_of(row.get("LowLimit", "")) or 0, 1))
+            value = round(self._motor.encoder_counts) if k == 0 else 1
+            if lacking and self._default(*key) != value:
+                row["DefaultValue"] = str(value)
+                why = "with the others makes no scale of positions"
+                self._changes.append(
+                    Note(f"[{_text(key)}]", f"DefaultValue={self._default(*key)} {why}: it is {value}")
+                )
 
     def _section(self, key: Key) -> Section:
         name = object_section(*key)

@@ -16,7 +16,6 @@ import dataclasses
 import io
 import itertools
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_bytes
+from mechanics.untrusted import read_toml
 
 Key = tuple[int, int]
 
@@ -72,7 +71,7 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
         ValueError: If the file cannot be read, or has what a variant cannot have, with the remedy.
     """
     try:
-        own = tomllib.loads(read_bytes(path).decode("utf-8"))
+        own = read_toml(path)
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

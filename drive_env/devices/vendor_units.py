@@ -18,7 +18,8 @@ from drive_env import cia402
 
 Key = tuple[int, int]
 
-COARSEST = 100.0  # units of position in a turn: a scale below is none that a position could be held by
+# Units of position in a turn: by fewer no position could be held, and of more 32 bits hold fewer than 8 turns.
+COARSEST, FINEST = 100.0, float(2**28)
 # Codes of CiA 303-2 in 60A8h to 60AAh: powers of ten above, then numerator, denominator, and a byte that is 0.
 RADIAN, GRADIAN, DEGREE, ARC_MINUTE, ARC_SECOND = 0x10, 0x40, 0x41, 0x42, 0x43
 DIMENSIONLESS, REVOLUTIONS, INCREMENTS, PER_MINUTE = 0x00, 0xB4, 0xB5, 0xC0
@@ -233,14 +234,19 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
     position = _code(types, cia402.POSITION_UNIT)
     angle = 1.0 / (position.prefix * ANGLES[position.numerator]) if position is not None and position.is_angle else 0.0
     if units > 0 and turns > 0:
-        if units / turns * geared >= COARSEST:
+        if _is_scale(units / turns * geared):
             if angle and not math.isclose(angle, units / turns, rel_tol=1e-3):
                 said = f"{_shown(types, cia402.POSITION_UNIT)} says {angle:g}"
                 notes.append(("60A8h", f"6092h counts, {units / turns:g} units a turn; {said}"))
             source = "6092h over 6091h" if has_gear else "6092h"
             return feed | (gear if has_gear else {}), 0, Feed(units / turns, source)
-        notes.append(("6092h", _too_coarse(units * shaft, turns * motor)))
-    if round(angle * geared) >= COARSEST:
+        notes.append(
+            (
+                "6092h over 6091h" if has_gear else "6092h",
+                _no_scale(f"{units * shaft} : {turns * motor}", units / turns * geared),
+            )
+        )
+    if _is_scale(round(angle * geared)):
         if has_gear:
             notes.append(("6091h", f"its factory's ratio is in the scale that 60A8h gives, {angle:g} units a turn of "
                                    "the shaft; another ratio that is written changes nothing"))  # fmt: skip
@@ -248,7 +254,7 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
             notes.append(("60A8h", f"{angle * geared:.9g} units a turn are taken as {round(angle * geared)}"))
         return {}, round(angle * geared), Feed(angle, "60A8h")
     if angle:
-        notes.append(("60A8h", _too_coarse(f"{angle * geared:g}", 1)))
+        notes.append(("60A8h", _no_scale(f"{angle * geared:g} : 1", angle * geared)))
     if position is not None and not angle and position.numerator not in (INCREMENTS, DIMENSIONLESS):
         why = "is no angle: how many of it a turn has only 6092h tells"
         notes.append(("60A8h", f"{_shown(types, cia402.POSITION_UNIT)} {why}"))
@@ -257,14 +263,21 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
         notes.append(("6091h", why))
     if all(key in types for key in encoder.values()):
         counts, per = _factory(types, encoder)
-        if counts <= 0 or per <= 0 or counts / per >= COARSEST:
+        if counts <= 0 or per <= 0 or _is_scale(counts / per):
             return encoder, 0, Feed(0.0, "608Fh")
-        notes.append(("608Fh", _too_coarse(counts, per)))
+        notes.append(("608Fh", _no_scale(f"{counts} : {per}", counts / per)))
     return {}, 0, Feed(0.0, "")
 
 
-def _too_coarse(units: int | str, turns: int) -> str:
-    return f"{units} : {turns} is not taken: a position cannot be held by fewer than {COARSEST:g} units a turn"
+def _is_scale(units: float) -> bool:
+    """Return whether positions can be counted in so many units a turn."""
+    return COARSEST <= units <= FINEST
+
+
+def _no_scale(ratio: str, units: float) -> str:
+    if units > FINEST:
+        return f"{ratio} is not taken: positions of 32 bits hold fewer than 8 turns of more than {FINEST:.0f} units"
+    return f"{ratio} is not taken: a position cannot be held by fewer than {COARSEST:g} units a turn"
 
 
 def _factory(types: Mapping[Key, ODVariable], roles: Mapping[str, Key]) -> tuple[int, int]:

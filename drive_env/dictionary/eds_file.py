@@ -28,6 +28,7 @@ from drive_env.dictionary.eds_values import (
     number_of,
 )
 from drive_env.dictionary.standard_types import STANDARD_TYPES
+from mechanics.untrusted import UntrustedFileError
 
 VARIABLES, GROUPS = (2, 7), (8, 9)  # ObjectType: DOMAIN, VAR; ARRAY, RECORD
 VAR, RECORD = 7, 9
@@ -53,12 +54,15 @@ KEYS = {
 _DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "SimpleBootUpMaster", "SimpleBootUpSlave",
                    "Granularity", "DynamicChannelsSupported", "GroupMessaging", "NrOfRXPDO", "NrOfTXPDO",
                    "LSS_Supported")  # fmt: skip
-_SECTION = re.compile(r"\s*\[\s*(.*?)\s*(\].*)?$")
 _OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?$", re.IGNORECASE)
 _MEMBER = re.compile(
     r"(?:0x)?([0-9A-Fa-f]{4})h?[\s_]*sub[\s_]*(?:index)?[\s_]*(?:0x)?([0-9A-Fa-f]{1,2})h?$", re.IGNORECASE
 )
 _COMPACT = re.compile(r"([0-9A-Fa-f]{4})(Name|Value)$", re.IGNORECASE)
+
+MOST_ENTRIES = 20_000  # sections, those included that CompactSubObj stands for: no drive's file known has a tenth
+MOST_SUB = 254  # highest sub-index (CiA 301)
+LONGEST_NAME = 200  # letters of a section's name
 
 VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
 
@@ -93,6 +97,8 @@ def object_section(index: int, sub: int | None = None) -> str:
 
 def place_of(name: str) -> tuple[int, int] | None:
     """Return index and sub-index of a section, sub-index -1 of an object as a whole; None of another section."""
+    if len(name) > LONGEST_NAME:
+        return None
     if found := _OBJECT.match(name):
         return int(found[1], 16), -1
     if found := _MEMBER.match(name):
@@ -102,8 +108,15 @@ def place_of(name: str) -> tuple[int, int] | None:
 
 def place_of_line(line: str) -> tuple[int, int] | None:
     """Return the same of a line of a file, None of one that begins no section of an object."""
-    found = _SECTION.match(line)
-    return None if found is None else place_of(found[1])
+    found = _section_of(line)
+    return None if found is None else place_of(found[0])
+
+
+def _section_of(line: str) -> tuple[str, bool] | None:
+    """Return the name of the section that a line begins, and whether its bracket is closed."""
+    line = line.strip()
+    name, is_closed, _ = line[1:].partition("]")
+    return (name.strip(), bool(is_closed)) if line.startswith("[") else None
 
 
 @lru_cache(maxsize=16)
@@ -113,6 +126,9 @@ def parse_eds(text: str, node_id: int = 1) -> EdsFile:
     Args:
         text: Of the file.
         node_id: For sums with the node-ID that CiA 306 does not have.
+
+    Raises:
+        UntrustedFileError: If it describes more than MOST_ENTRIES.
     """
     return _Repairer(text, node_id).file()
 
@@ -157,12 +173,13 @@ class _Repairer:
                 continue
             if line.startswith(("#", "//")):
                 self._tell(f"line {number}", "a comment that does not begin with ';' was left out")
-            elif found := _SECTION.match(line):
-                name = self._section_name(found[1], number, is_closed=found[2] is not None)
+            elif found := _section_of(line):
+                name = self._section_name(found[0], number, is_closed=found[1])
                 is_second = name in self._sections
                 if is_second:
                     self._tell(f"[{name}]", "stands twice: the first counts, the second only adds what that lacks")
                 section = self._sections.setdefault(name, {})
+                self._check_number()
             elif section is None or ("=" not in line and ":" not in line):
                 self._tell(f"line {number}", f"{line[:40]!r} is neither a section nor a value, and was left out")
             else:
@@ -194,13 +211,24 @@ class _Repairer:
             again = "" if is_second else "stands twice: "
             self._tell(f"[{name}]", f"{again}{key}={section[key]} counts, not {value}")
 
+    def _check_number(self) -> None:
+        if len(self._sections) > MOST_ENTRIES:
+            raise UntrustedFileError(
+                f"the EDS describes more than {MOST_ENTRIES} entries (CompactSubObj stands for as many as it says); "
+                "leave out those that you do not need"
+            )
+
     # --- objects --------------------------------------------------------------------------------------------------
     def _expand_compact_objects(self) -> None:
         """Write the members of an array that is described once (CompactSubObj) one by one."""
         for name in [name for name, row in self._sections.items() if "CompactSubObj" in row]:
             place, row = place_of(name), self._sections[name]
-            count = number_of(row.pop("CompactSubObj")) or 0
+            text = row.pop("CompactSubObj")
+            count = number_of(text) or 0
             if place is None or count == 0:
+                continue
+            if not 0 < count <= MOST_SUB:
+                self._tell(f"[{name}]", f"CompactSubObj={text} is no number of sub-objects, 1 to {MOST_SUB}")
                 continue
             texts = {kind: self._sections.pop(f"{place[0]:04X}{kind}", {}) for kind in ("Name", "Value")}
             member = {key: row[key] for key in row if key not in ("SubNumber", "ObjectType", "ParameterName")}
@@ -211,6 +239,7 @@ class _Repairer:
                 if value := texts["Value"].get(str(sub)):
                     named["DefaultValue"] = value
                 self._sections.setdefault(object_section(place[0], sub), member | named)
+            self._check_number()
             for key in VALUE_KEYS:
                 row.pop(key, None)
             row["ObjectType"] = row.get("ObjectType", str(GROUPS[0]))
@@ -400,6 +429,7 @@ class _Repairer:
 
     def _count(self, indices: list[int]) -> None:
         """Write the lists of objects anew, and tell where they were wrong."""
+        there = set(indices)
         for title in LISTS:
             listed = self._sections.get(title)
             if listed is None:
@@ -408,7 +438,7 @@ class _Repairer:
             if number_of(listed.get("SupportedObjects", "")) != len(rows):
                 count = listed.get("SupportedObjects", "(missing)")
                 self._tell(f"[{title}]", f"lists {len(rows)} objects, and counts {count}")
-            absent = [f"{row:04X}h" for row in rows if row is not None and row not in indices]
+            absent = [f"{row:04X}h" for row in rows if row is not None and row not in there]
             if absent:
                 self._tell(f"[{title}]", f"lists {', '.join(absent)}, which no section describes: absent")
         groups: dict[str, list[int]] = {title: [] for title in LISTS}

@@ -8,6 +8,7 @@ import re
 from canopen.objectdictionary import datatypes
 
 NODE_ID = "$NODEID"
+LONGEST = 100  # letters of a number or a sum
 BOOLEANS = {"true": 1, "yes": 1, "false": 0, "no": 0}
 OBJECT_TYPES = {"NULL": 0, "DOMAIN": 2, "DEFTYPE": 5, "DEFSTRUCT": 6, "VAR": 7, "VARIABLE": 7, "ARRAY": 8, "RECORD": 9}
 TYPE_NAMES = {
@@ -35,7 +36,7 @@ def number_of(text: str) -> int | None:
     """Return the number that a text is, None for none: 0x20, 20h, &H20, 32, 032 (32), 32.0, 2F (hexadecimal), true."""
     text = text.strip().strip('"').replace(" ", "")
     sign, text = (-1, text[1:]) if text.startswith("-") else (1, text.removeprefix("+"))
-    if not text:
+    if not 0 < len(text) <= LONGEST:
         return None
     found = _HEX.match(text)
     if found is not None and not text.isdigit():
@@ -93,7 +94,7 @@ class NodeIdSum:
 def node_id_sum(text: str) -> NodeIdSum | None:
     """Return what a text with the node-ID is; None for one without, or that cannot be understood."""
     plain = re.sub(r"\s", "", text).upper().strip("()")
-    if "NODEID" not in plain or not re.fullmatch(r"[-+*$&0-9A-Z]+", plain):
+    if "NODEID" not in plain or len(plain) > LONGEST or not re.fullmatch(r"[-+*$&0-9A-Z]+", plain):
         return None
     times = number = 0
     for sign, term in _TERM.findall(plain):

@@ -14,6 +14,7 @@ from typing import Any
 
 from drive_env.faults.bus_faults import BusFaults
 from drive_env.faults.schedule import parse_order
+from mechanics.untrusted import parse_json
 
 LOOPBACK = "127.0.0.1"
 PORT = 29637  # beside the hub's
@@ -98,7 +99,7 @@ def ask(port: int, request: str) -> dict[str, Any]:
     try:
         with socket.create_connection((LOOPBACK, port), ANSWER_TIME) as connection:
             connection.sendall(request.encode() + b"\n")
-            answer = json.loads(_line(connection))
+            answer = parse_json(_line(connection))
     except OSError as error:
         raise ControlError(f"no bus takes faults at port {port} ({error.strerror or error}); {remedy}") from None
     except ValueError:

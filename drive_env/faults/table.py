@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from drive_env.devices import find_device
 from mechanics.near_names import did_you_mean
+from mechanics.untrusted import read_toml
 
 GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
 DRIVE = "tmcm1636"  # whose reactions the table has
@@ -50,7 +50,7 @@ class FaultRow:
 
 
 def _rows() -> dict[str, FaultRow]:
-    tables = tomllib.loads((Path(__file__).parent / "table.toml").read_text(encoding="utf-8"))
+    tables = read_toml(Path(__file__).parent / "table.toml")
     return {
         name: FaultRow(
             name, **{**table, "parameters": {k: FaultParameter(**p) for k, p in table.get("parameters", {}).items()}}

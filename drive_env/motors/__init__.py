@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import itertools
 import math
-import tomllib
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_bytes
+from mechanics.untrusted import read_toml
 
 FOLDER = Path(__file__).parent
 
@@ -233,7 +232,7 @@ def load_motor(path: Path) -> Motor:
         MotorError: If it cannot be read, lacks a number, or has one that no motor can have.
     """
     try:
-        data = tomllib.loads(read_bytes(path).decode("utf-8"))
+        data = read_toml(path)
     except OSError as error:
         raise MotorError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mechanics.untrusted import read_json
+
 Key = tuple[int, int]
 Section = dict[Key, int]
 FORMAT = 1
@@ -94,14 +96,14 @@ def write_whole(path: Path, text: str) -> None:
 
 def _parse(path: Path, device: str) -> dict[str, Section]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         if content["format"] != FORMAT or content["device"] != device:
             raise ValueError(f"it is of format {content['format']} and of a {content['device']}")
         return {
             str(name): {_key(text): _raw(text, raw) for text, raw in section.items()}
             for name, section in content["sections"].items()
         }
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path} has no parameters of a {device} ({error}); give another file, or delete it to start with factory "
             "values"

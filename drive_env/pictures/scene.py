@@ -141,7 +141,7 @@ class Scene:
             floor="" if has_floor else _FLOOR.format(height=float(low[2]) - 0.01 * size),
         )
         scene = mujoco.MjSpec.from_string(text)
-        machine = mujoco.MjSpec.from_file(str(mjcf))
+        machine = mujoco.MjSpec.from_file(str(mjcf))  # load_model has checked it
         scene.option = machine.option  # MuJoCo warns where they differ; nothing moves here by itself
         scene.attach(machine, prefix="machine/", frame=scene.worldbody.add_frame())
         return scene.compile()
@@ -178,9 +178,12 @@ class Scene:
 
 
 def load_model(mjcf: str | Path) -> Any:
-    """Return the compiled model of an MJCF alone, as `mujoco.MjModel`."""
+    """Return the compiled model of an MJCF alone, as `mujoco.MjModel`; ValueError as `check_model`."""
     import mujoco  # not import_mujoco(): a model needs no OpenGL
 
+    from mechanics.model import check_model
+
+    check_model(Path(mjcf))
     return mujoco.MjModel.from_xml_path(str(mjcf))
 
 

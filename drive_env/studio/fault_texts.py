@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
+
+from mechanics.untrusted import read_toml
 
 _PACKAGE = Path(__file__).parents[1]
 # In a wheel it lies in the package; in a working copy it is where the documentation is made.
@@ -25,7 +26,7 @@ class FaultText(NamedTuple):
 def _rows() -> dict[str, dict[str, str]]:
     for place in _PLACES:
         if place.is_file():
-            topics = tomllib.loads(place.read_text(encoding="utf-8"))["topic"]
+            topics = read_toml(place)["topic"]
             return {row["emcy"]: row for topic in topics for row in topic["message"] if "emcy" in row}
     return {}
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 import mimetypes
 import time
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from mechanics.untrusted import read_json, read_start, read_toml
+
 RUNS = Path("runs")
 ROUTE = "/studio/runs/"
 MOST_RUNS = 500  # that are listed; the newest
 MOST_FILES = 400  # of a run
+MOST_ENTRIES = 20_000  # of a run's folder that are looked at
 MOST_TEXT = 200_000  # bytes of a text that are shown
+MOST_READ = 8  # files of one name that are read for a page
 PICTURES, FILMS = (".png", ".jpg", ".jpeg", ".svg", ".webp", ".gif"), (".mp4", ".webm")
 TEXTS = (".toml", ".json", ".csv", ".txt", ".md", ".yaml", ".yml", ".log")
 REPORTS = (".html",)
@@ -125,8 +128,7 @@ def media_type(path: Path) -> str:
 
 def text_of(path: Path) -> str:
     """Return the text of a file, its beginning if it is long."""
-    with path.open("rb") as file:
-        content = file.read(MOST_TEXT + 1)
+    content = read_start(path, MOST_TEXT + 1)
     text = content[:MOST_TEXT].decode("utf-8", "replace")
     return text if len(content) <= MOST_TEXT else text + "\n… (the file goes on)"
 
@@ -134,33 +136,37 @@ def text_of(path: Path) -> str:
 def settings_of(run: Run, root: Path = RUNS) -> dict[str, str]:
     """Return the settings of a run as flat names and texts; empty where it has none."""
     found: dict[str, str] = {}
-    for file in run.files:
-        if Path(file.path).name in ("settings.toml", "config.toml", "args.toml") and file.size < MOST_TEXT:
-            try:
-                found |= _flat(tomllib.loads(confined(f"{run.name}/{file.path}", root).read_text("utf-8")))
-            except (OSError, ValueError):
-                continue
+    for file in _named(run, "settings.toml", "config.toml", "args.toml"):
+        try:
+            found |= _flat(read_toml(confined(f"{run.name}/{file.path}", root)))
+        except (OSError, ValueError):
+            continue
     return found
 
 
 def certificate_of(run: Run, root: Path = RUNS) -> dict[str, Any]:
     """Return the certificate of a run as its JSON has it; empty where it has none that can be read."""
-    for file in run.files:
-        if Path(file.path).name in ("certificate.json", "stepper-certificate.json"):
-            try:
-                data = json.loads(confined(f"{run.name}/{file.path}", root).read_text("utf-8"))
-            except (OSError, ValueError, RecursionError):
-                continue
-            if isinstance(data, dict):
-                return data
+    for file in _named(run, "certificate.json", "stepper-certificate.json"):
+        try:
+            data = read_json(confined(f"{run.name}/{file.path}", root))
+        except (OSError, ValueError):
+            continue
+        if isinstance(data, dict):
+            return data
     return {}
+
+
+def _named(run: Run, *names: str) -> list[RunFile]:
+    """Return the first files of a run that have one of these names and are short enough for a page."""
+    found = [file for file in run.files if Path(file.path).name in names and file.size < MOST_TEXT]
+    return found[:MOST_READ]
 
 
 def _run(path: Path, changed: float) -> Run:
     if path.is_file():
         return Run(path.name, changed, (RunFile("", kind_of(path), path.stat().st_size),))
     files: list[RunFile] = []
-    for one in sorted(path.rglob("*")):
+    for one in sorted(itertools.islice(path.rglob("*"), MOST_ENTRIES)):
         if len(files) >= MOST_FILES:
             break
         if one.is_file() and not one.is_symlink() and not any(p.startswith(".") for p in one.relative_to(path).parts):

@@ -33,6 +33,7 @@ from drive_env.studio.scope_view import (
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
+from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
 DEFAULT = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
@@ -71,7 +72,7 @@ async def _listen(line: WebSocket, view: ScopeView) -> None:
     """Hear how wide the picture is."""
     with contextlib.suppress(WebSocketDisconnect, ValueError, KeyError, TypeError):
         while True:
-            message = json.loads(await line.receive_text())
+            message = parse_json(await line.receive_text())
             view.columns = min(4000, max(50, int(message["columns"])))
 
 

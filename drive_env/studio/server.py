@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import json
 import logging
 import os
 import signal
@@ -33,6 +32,7 @@ from drive_env.studio.page import StudioPage
 from drive_env.studio.pages_thread import PagesThread, Receive, Scope, Send
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
+from mechanics.untrusted import parse_json
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class Studio:
         presence.beat(page)
         try:
             while True:
-                message = json.loads(await line.receive_text())
+                message = parse_json(await line.receive_text())
                 self._hear(page, message, held)
         except (WebSocketDisconnect, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             pass

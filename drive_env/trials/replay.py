@@ -8,7 +8,8 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +21,7 @@ from drive_env import cia402
 from drive_env.drives import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
 from mechanics.near_names import did_you_mean
-from mechanics.untrusted import MOST_RECORDING, check_size
+from mechanics.untrusted import read_rows
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -125,29 +126,14 @@ def read_log(path: str | Path) -> Log:
     file = Path(path)
     if not file.is_file():
         raise ValueError(f"there is no log {file}; record one with drive-env scope")
-    check_size(file, MOST_RECORDING)
     try:
-        with file.open(newline="", encoding="utf-8") as text:
-            rows = list(csv.reader(text))
+        rows = read_rows(file)
+        columns = _columns(file, next(rows, []))
+        t, raw = _samples(file, rows, sum(map(len, columns.values())))
     except UnicodeDecodeError:
         raise ValueError(f"{file} is not a text file; give the CSV that drive-env scope writes") from None
     except csv.Error as error:
         raise ValueError(f"{file} is not CSV: {error}; give the one that drive-env scope writes") from None
-    if not rows or not rows[0] or rows[0][0] != "t [s]" or len(rows[0]) < 2:
-        raise ValueError(f"{file}: the first line must begin with 't [s]', as drive-env scope writes it")
-    columns: dict[Key, list[int]] = {}
-    for k, title in enumerate(rows[0][1:]):
-        found = _COLUMN.match(title)
-        if found is None:
-            raise ValueError(f"{file}: column {title!r} names no object; it must begin as '6064h:00 '")
-        columns.setdefault((int(found[1], 16), int(found[2], 16)), []).append(k)
-    try:
-        t = np.array([float(row[0]) for row in rows[1:]])
-        raw = np.array([[int(value) for value in row[1:]] for row in rows[1:]], np.int64)
-    except (ValueError, OverflowError, IndexError) as error:
-        raise ValueError(f"{file}: every line needs a time and {len(rows[0]) - 1} whole numbers: {error}") from None
-    if len(t) < 10 or raw.shape != (len(t), len(rows[0]) - 1):
-        raise ValueError(f"{file}: needs at least 10 lines of {len(rows[0])} values each")
     if not np.all(np.abs(t) <= LATEST):
         wrong = int(np.argmax(~(np.abs(t) <= LATEST)))
         raise ValueError(
@@ -159,6 +145,35 @@ def read_log(path: str | Path) -> Log:
     if len({len(places) for places in columns.values()}) > 1:
         raise ValueError(f"{file}: every object must be there for the same axes")
     return Log(t, {key: raw[:, places] for key, places in columns.items()})
+
+
+def _columns(file: Path, head: list[str]) -> dict[Key, list[int]]:
+    """Return the columns of each object, one for each axis, by the first line of a log."""
+    if len(head) < 2 or head[0] != "t [s]":
+        raise ValueError(f"{file}: the first line must begin with 't [s]', as drive-env scope writes it")
+    columns: dict[Key, list[int]] = {}
+    for k, title in enumerate(head[1:]):
+        found = _COLUMN.match(title)
+        if found is None:
+            raise ValueError(f"{file}: column {title!r} names no object; it must begin as '6064h:00 '")
+        columns.setdefault((int(found[1], 16), int(found[2], 16)), []).append(k)
+    return columns
+
+
+def _samples(file: Path, rows: Iterator[list[str]], width: int) -> tuple[Floats, Integers]:
+    """Return times [s] and integers, shape (n, width), of a log's rows; little more memory than these is taken."""
+    times, values = array("d"), array("q")
+    for number, row in enumerate(rows, 2):
+        try:
+            if len(row) != width + 1:
+                raise ValueError(f"line {number} has {len(row)} values")
+            times.append(float(row[0]))
+            values.extend(map(int, row[1:]))
+        except (ValueError, OverflowError) as error:
+            raise ValueError(f"{file}: every line needs a time and {width} whole numbers: {error}") from None
+    if len(times) < 10:
+        raise ValueError(f"{file}: needs at least 10 lines of {width + 1} values each")
+    return np.array(times), np.array(values, np.int64).reshape(len(times), width)
 
 
 def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None = None) -> dict[Key, Integers]:

@@ -229,13 +229,14 @@ def _print_best(result: Any, count: int) -> None:
 
 
 def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
+    from mechanics.untrusted import read_text
     from tuning.runs.experiment import load_experiment, shipped_experiment
 
     experiment = load_experiment(config, **overrides)
     if any(value is not None for value in overrides.values()):
         text = experiment.to_toml(experiment.versions)
     else:
-        text = (config or shipped_experiment(None)).read_text(encoding="utf-8")
+        text = read_text(config or shipped_experiment(None))
     sys.stdout.write(text)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,23 @@ PRESETS = ("quick", "full")
 RUN_KEYS = ("n_envs", "n_timesteps", "policy", "normalize", "env_kwargs", "vec_env_wrapper", "imitate")
 
 
+MOST_YAML = 1_000_000  # bytes; PyYAML reads about 100 kB/s
+
+
 class HyperparameterError(ValueError):
     """A file of hyper-parameters is wrong; the message says where."""
+
+
+class _DifferentNames(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
+    """PyYAML's safe reader, which drops the first of a name that stands twice; this one refuses it."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for name, count in Counter(names).items():
+            if count > 1:
+                raise yaml.YAMLError(f"the name {name[:100]!r} stands twice in one table; leave one of them")
+        table: dict[Any, Any] = super().construct_mapping(node, deep)
+        return table
 
 
 def load(
@@ -147,7 +163,7 @@ def _file(environment: str, algorithm: str, path: str | Path | None) -> Path:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        table = yaml.safe_load(read_text(file))
+        table = yaml.load(read_text(file, MOST_YAML), _DifferentNames)
         check_table(table)
     except FileNotFoundError:
         raise HyperparameterError(f"there is no file {file}") from None
