@@ -2,7 +2,8 @@
 
 A task is a function of a module, called with one item; what it returns must depend on the item alone, so that it
 matters to no result where and in which order tasks ran. Every task outside this process carries the hash of our sources
-and is refused by a worker that has others, whenever that worker came.
+and is refused by a worker that has others, whenever that worker came. It carries the content of its user's files as
+well (`inputs.Input`): a worker opens none of its own.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any, Protocol, TypeVar
 from urllib.parse import parse_qsl
 
 from tuning.runs import provenance
+from tuning.runs.inputs import forget_copies
 
 Say = Callable[[str], None]
 Item = TypeVar("Item")
@@ -356,5 +358,6 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
+        forget_copies()
         # At once: whoever waits in a queue that nobody fills any more would wait for ever.
         os._exit(1)

@@ -32,6 +32,7 @@ from mechanics.model import COPIES_PER_MODEL
 from tuning.runs import metrics, provenance
 from tuning.runs.experiment import Experiment, Resolved, label, resolve
 from tuning.runs.experiment import load_experiment as load_experiment
+from tuning.runs.inputs import write_inputs
 from tuning.runs.metrics import MoveRecording
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
@@ -41,6 +42,7 @@ PIECE = 0.02  # s of simulation between two reports of progress
 CLOSING_TIME = 0.6  # s, in which the encoder of a standing rotor is aligned
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
 MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
+ROWS = 65_536  # of results.csv, that are written at a time
 SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
 
 Progress = Callable[[str, float], None]
@@ -102,7 +104,7 @@ class SweepResult:
         return found
 
     def save(self, folder: str | Path) -> Path:
-        """Write results.csv, heatmap.png, best_response.png and settings.toml into a new folder and return it.
+        """Write results.csv, heatmap.png, best_response.png, settings.toml and inputs/ into a new folder and return it.
 
         The files are complete or absent: they are written beside the folder and moved.
 
@@ -117,6 +119,7 @@ class SweepResult:
                 self._write_csv(file)
             plots.heat_map(self).savefig(partial / "heatmap.png")
             plots.best_response(self).savefig(partial / "best_response.png")
+            write_inputs(partial, self.experiment.inputs())
             settings = provenance.HEADER + self.experiment.to_toml(provenance.versions())
             (partial / "settings.toml").write_text(settings, encoding="utf-8")
         return Path(folder)
@@ -126,7 +129,9 @@ class SweepResult:
         writer.writerow(self.columns)
         # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
         columns = [column.astype(int) if column.dtype == bool else column for column in self.columns.values()]
-        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+        for first in range(0, len(self.order), ROWS):  # as Python's numbers, a table of a million rows has 600 MB
+            rows = slice(first, first + ROWS)
+            writer.writerows(zip(*(column[rows].tolist() for column in columns), strict=True))
 
 
 class Shard(NamedTuple):
@@ -190,10 +195,12 @@ def run(
 
     Raises:
         ExperimentError: If the experiment cannot be.
+        InputError: If a file of its user cannot be taken.
         PoolError: If shards could not be run where they were to.
     """
     report = progress or (lambda _what, _share: None)
     resolved = resolve(experiment)
+    experiment = experiment.with_inputs()
     found: dict[int, Arrays] = {} if log is None else dict(log.done)
     done = {first: first + len(arrays["score"]) for first, arrays in found.items()}
     threads, width = (num_threads, 1) if pool is None else (1, pool.width)
@@ -248,7 +255,7 @@ def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -
 def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None) -> Arrays:
     """Return the columns of a shard, and under `best.` the recording of its best point."""
     experiment = shard.experiment
-    points = experiment.points()[shard.first : shard.last]
+    points = experiment.points(shard.first, shard.last)
     axes = find_load(experiment.load).num_axes
     with _machines(experiment, len(points), shard.num_threads) as drives:
         recording, fault = _record(drives, experiment, resolve(experiment), points, report)
