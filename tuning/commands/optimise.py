@@ -109,7 +109,8 @@ def optimise(
 
     An axis that oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best
     gains. Writes trials.csv, trials.png and settings.toml, with which `drive-tune optimise --config settings.toml`
-    repeats the search, and on a bus OUT-before.toml, with which `drive-tune undo` restores the state before.
+    repeats the search (files of your own are copied to inputs/ beside it), and on a bus OUT-before.toml, with which
+    `drive-tune undo` restores the state before.
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
@@ -127,6 +128,8 @@ def optimise(
         from tuning.runs import provenance
         from tuning.search.optimise import Settings
 
+        drive.check()
+        drive = drive.with_inputs()
         folder = provenance.run_folder("optimise") if out is None else out
         if resume:
             _check_unfinished(folder, journal)
@@ -144,6 +147,7 @@ def optimise(
             safe=drive.bus if safe is None else safe,
             seed=drive.seed,
             journal=journal,
+            subject=_subject(drive),
             **({} if width is None else {"width": width}),
         )
         if drive.bus:
@@ -165,6 +169,7 @@ def _on_machine(
 ) -> None:
     """Search on an emulated machine, write and print what was found."""
     from tuning.runs import unfinished
+    from tuning.runs.inputs import as_kept
 
     machine = drive.machine() | {"num_machines": copies}
     try:
@@ -174,7 +179,7 @@ def _on_machine(
         fail(kept, INTERRUPTED)
     options = _named(drive) | {"load": drive.load, "copies": copies, "searches": searches}
     _save(found, settings, folder, options)
-    _report(found, settings, folder, None, f"an emulated {drive.load}", options, json)
+    _report(found, settings, folder, None, f"an emulated {as_kept(drive.load)}", options, json)
     unfinished.discard(folder)
 
 
@@ -194,6 +199,14 @@ def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -
     _report(found, settings, folder, before, "the bus", options, json)
 
 
+def _subject(drive: DriveOptions) -> str:
+    """Return what a journal is of: the drive, and a machine's load, with what files of the user hold."""
+    from tuning.runs.inputs import as_kept, table_of
+
+    named = _named(drive) | ({} if drive.bus else {"load": drive.load})
+    return "\n".join([*(f"{name} = {value}" for name, value in as_kept(named).items()), *table_of(drive.inputs())])
+
+
 def _named(drive: DriveOptions) -> dict[str, Any]:
     """Return what settings.toml tells of any drive."""
     named = {"device": drive.device, "motor": drive.motor_name, "supply": drive.supply, "travel": drive.travel}
@@ -211,14 +224,18 @@ def _search_machine(
 ) -> Any:
     """Search on an emulated machine; return all searches as one."""
     from tuning.runs import provenance, unfinished
+    from tuning.runs.inputs import inputs_in, table_of
     from tuning.runs.pools import open_pool
     from tuning.search import searches
+    from tuning.toml_tables import toml
 
     shards = searches.searches(machine, settings, count)
-    versions = "".join(f"{name} = {version}\n" for name, version in provenance.versions().items())
+    inputs = inputs_in(machine)
+    versions = "".join(f"{name} = {toml(version)}\n" for name, version in provenance.versions().items())
+    described = searches.description(shards) + versions + "\n".join(table_of(inputs)) + "\n"
     what = f"{settings.trials} trials by {settings.sampler}" + (f", {count} times" if count > 1 else "")
     with (
-        unfinished.shard_log(folder, searches.description(shards) + versions, resume=resume) as log,
+        unfinished.shard_log(folder, described, resume=resume, inputs=inputs) as log,
         open_pool(workers, cluster) as pool,
     ):
         if log.done or unfinished.has_parts(log):
@@ -293,11 +310,13 @@ def _report(
     from dataclasses import asdict
 
     if json:
+        from tuning.runs.inputs import as_kept
+
         print_json(
             {
                 "gains": found.gains.tolist(), "rule": found.rule.tolist(), "cost": found.cost.tolist(),
                 "drive_seconds": found.drive_seconds, "aborts": int(found.aborts.sum()), "notes": list(found.notes),
-                "settings": asdict(settings), "machine": options, "folder": str(folder),
+                "settings": asdict(settings), "machine": as_kept(options), "folder": str(folder),
                 "before": str(before) if before else None,
             }
         )  # fmt: skip

@@ -25,7 +25,7 @@ from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
-from tuning.runs.inputs import Input, as_kept, found_again, hashes, inputs_in, taken
+from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, taken
 from tuning.runs.metrics import TRACKING, combined_of, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
@@ -145,8 +145,7 @@ class Experiment:
         if self.metric.weights:
             weights = ", ".join(f"{name} = {toml(weight)}" for name, weight in self.metric.weights.items())
             lines.append(f"weights = {{ {weights} }}")
-        if inputs := self.inputs():
-            lines += ["", "[inputs]", *(f"{json.dumps(k)} = {toml(v)}" for k, v in hashes(inputs).items())]
+        lines += table_of(self.inputs())
         if versions:
             lines += ["", "[versions]", *(f"{json.dumps(k)} = {toml(v)}" for k, v in versions.items())]
         return "\n".join(lines) + "\n"

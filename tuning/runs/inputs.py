@@ -1,7 +1,7 @@
 """What a run takes from its user's files: kept in its folder by content, known by a hash, and sent along with its work.
 
-A motor, load, device, set of distributions or suite of one's own is a path. What lies there may be edited while a run is
-stopped, and a worker may have another file of that name. So a run reads it once: from then on its `Input` is what is
+A motor, load, device, set of distributions or suite of one's own is a path. What lies there may be edited while a run
+is stopped, and a worker may have another file of that name. So a run reads it once: from then on its `Input` is what is
 opened, wherever the work is done. Names of what ships are no inputs: the hash of the sources covers them.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -95,7 +96,7 @@ def taken(what: str, name: Any) -> Any:
         InputError: If a file of it cannot be read, or lies where the run's copy would not have it.
         ValueError: If it is no such thing.
     """
-    if isinstance(name, Input) or not isinstance(name, str | Path) or not _is_path(what, str(name)):
+    if isinstance(name, Input) or not isinstance(name, str | Path) or not is_path(what, str(name)):
         return name
     _check(what, name)  # with the user's path in the message
     return _read(what, Path(name), str(name))
@@ -114,6 +115,12 @@ def inputs_in(value: Any) -> list[Input]:
 def hashes(inputs: Iterable[Input]) -> dict[str, str]:
     """Return what settings say of inputs: where the folder has each -> its hash."""
     return {one.kept: one.hash for one in inputs}
+
+
+def table_of(inputs: Iterable[Input]) -> list[str]:
+    """Return the lines of settings that say the same as a table; none without inputs."""
+    lines = [f'{json.dumps(place)} = "{own}"' for place, own in hashes(inputs).items()]
+    return ["", "[inputs]", *lines] if lines else []
 
 
 def as_kept(value: Any) -> Any:
@@ -178,10 +185,25 @@ def check_unchanged(recorded: Any, inputs: Iterable[Input], place: Path) -> None
     for one in inputs:
         if recorded.get(one.kept, one.hash) != one.hash:
             raise InputError(
-                f"{one.given} ({one.what}) was changed since the run in {place} was begun, and the results of two are "
+                f"{_changed(one, place)} was changed since the run in {place} was begun, and the results of two are "
                 f"not mixed: go on with the {one.what} as it was, of which {place / one.kept} is a copy, or remove "
                 f"{place} to begin anew"
             )
+
+
+def _changed(one: Input, place: Path) -> str:
+    """Return which file of an input differs from the copy in a run's folder, for a message."""
+    folder = place / FOLDER / one.what
+    for name, content in one.files.items():
+        try:
+            same = read_bytes(folder / name) == content
+        except (OSError, ValueError):
+            same = False
+        if not same and name != one.main:
+            return f"{name} of {one.given} ({one.what})"
+        if not same:
+            break
+    return f"{one.given} ({one.what})"
 
 
 def forget_copies() -> None:
@@ -192,13 +214,24 @@ def forget_copies() -> None:
 
 
 # --- which files there are --------------------------------------------------------------------------------------------
-def _is_path(what: str, name: str) -> bool:
+def is_path(what: str, name: str) -> bool:
+    """Return whether a name is the path of a file, or of a device's folder, as `find_motor` and its like read it."""
+    if is_shipped(what, name):
+        return False
     if what == "device":
-        from drive_env.devices import device_names
         from drive_env.devices.own_folder import is_own_folder
 
-        return name not in device_names() and (name.endswith(".toml") or is_own_folder(name))
+        return name.endswith(".toml") or is_own_folder(name)
     return name.endswith((".xml", ".mjcf") if what == "load" else ".toml")
+
+
+def is_shipped(what: str, name: str) -> bool:
+    """Return whether a name is one of what ships, whatever lies in the present folder."""
+    if what == "device":
+        from drive_env.devices import device_names
+
+        return name in device_names()
+    return False  # other names that ship end otherwise than paths do
 
 
 def _check(what: str, name: str | Path) -> None:
@@ -224,8 +257,8 @@ def _check(what: str, name: str | Path) -> None:
 def _read(what: str, path: Path, given: str) -> Input:
     """Return the input at a path, all its files read once."""
     try:
-        paths = [Path(os.path.abspath(one)) for one in _FILES[what](path)]  # not resolved: links keep their names
-        top = Path(os.path.abspath(path))
+        paths = [_whole(one) for one in _FILES[what](path)]
+        top = _whole(path)
         folder = Path(os.path.commonpath([one.parent for one in (*paths, top)]))
         files: dict[str, bytes] = {}
         for one in sorted(set(paths)):
@@ -235,16 +268,21 @@ def _read(what: str, path: Path, given: str) -> Input:
         raise InputError(f"{error.filename or given} cannot be read: {error.strerror}") from None
     except TooLargeError as error:
         raise InputError(
-            f"{given}: {error} A {what} has {MOST_BYTES // 1_000_000} MB with all its files at most, since each task has it"
+            f"{given}: {error} A {what} has {MOST_BYTES // 1_000_000} MB at most, since each task has it"
         ) from None
     found = Input(what, given, top.relative_to(folder).as_posix(), files)
-    outside = [one for one in _FILES[what](Path(found)) if not Path(os.path.abspath(one)).is_relative_to(_top(found))]
+    outside = [one for one in _FILES[what](Path(found)) if not _whole(one).is_relative_to(_top(found))]
     if outside:
         raise InputError(
-            f"{given} names {outside[0]} by its whole path, so that a run's copy would not hold it; name it relative to "
-            f"{given}"
+            f"{given} names {outside[0]} by its whole path, so that a run's copy would not hold it; name it relative "
+            f"to {given}"
         )
     return found
+
+
+def _whole(path: Path) -> Path:
+    """Return a whole path without `..`; links are not followed, since they keep their names in a copy."""
+    return Path(os.path.abspath(path))  # noqa: PTH100
 
 
 def _top(one: Input) -> Path:

@@ -1,8 +1,8 @@
 """A run that is under way: a folder beside the one that its results will have, from which it goes on if it is killed.
 
-The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run with
-its inputs and the results of the shards that are done, and for shards that can go on from where they were, what they have so far; it
-vanishes with the last step of the run.
+The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run,
+its inputs, the results of the shards that are done, and of shards that can go on from where they were what they have so
+far; it vanishes with the last step of the run.
 """
 
 from __future__ import annotations
@@ -34,9 +34,7 @@ def settings_of(folder: str | Path) -> Path | None:
 
 
 @contextmanager
-def shard_log(
-    folder: str | Path, settings: str, *, resume: bool, inputs: Iterable[Input] = ()
-) -> Iterator[ShardLog]:
+def shard_log(folder: str | Path, settings: str, *, resume: bool, inputs: Iterable[Input] = ()) -> Iterator[ShardLog]:
     """Give the shards of a run that are done, and keep those to come; leave nothing behind if there are none.
 
     Args:

@@ -53,6 +53,7 @@ class Settings:
         safe: Start from safe gains and go on from what was proved.
         seed: Of everything random.
         journal: File of Optuna's journal, in which the search is kept and from which it goes on.
+        subject: What is searched, as text: a journal of something else is refused.
     """
 
     sampler: str = "tpe"
@@ -63,6 +64,7 @@ class Settings:
     safe: bool = False
     seed: int = 0
     journal: Path | None = None
+    subject: str = ""
 
     def __post_init__(self) -> None:
         _check("sampler", [self.sampler], SAMPLERS)
@@ -401,6 +403,7 @@ class _Search:
             first=[start],
             generation=len(self._members[k]),
             journal=settings.journal,
+            subject=f"{settings.subject}\n{settings.gains} {settings.objectives}",
             name=f"machine {k}",
         )
 

@@ -60,6 +60,7 @@ def new_proposer(
     first: Sequence[Floats] = (),
     generation: int = 1,
     journal: Path | None = None,
+    subject: str = "",
     name: str = "study",
 ) -> Proposer:
     """Return a sampler of the box low...high.
@@ -74,6 +75,7 @@ def new_proposer(
         first: Points that are proposed before all others.
         generation: How many points are asked for at a time: the population of CMA-ES, if it is 4 or more.
         journal: File in which Optuna's studies are kept, and from which one that was broken off goes on.
+        subject: What the studies are of, as text: one of something else is refused.
         name: The study's name in the journal.
 
     Raises:
@@ -88,7 +90,7 @@ def new_proposer(
         if journal is not None:
             raise ValueError("a grid keeps no journal; leave it out, or use drive-tune sweep, which resumes")
         return _Grid(low, high, trials, first)
-    return _Optuna(sampler, low, high, seed, objectives, first, generation, journal, name)
+    return _Optuna(sampler, low, high, seed, objectives, first, generation, journal, subject, name)
 
 
 def check_installed(sampler: str) -> None:
@@ -145,6 +147,7 @@ class _Optuna:
         first: Sequence[Floats],
         generation: int,
         journal: Path | None,
+        subject: str,
         name: str,
     ) -> None:
         import optuna
@@ -162,7 +165,7 @@ class _Optuna:
             storage=storage, study_name=name, directions=["minimize"] * objectives, load_if_exists=True
         )
         if journal is not None:
-            check_study(self._study, journal, "give another --journal")
+            check_study(self._study, journal, "give another --journal", subject)
         # Points that were asked for when the study was broken off come first.
         running = optuna.trial.TrialState.RUNNING
         self._running = [trial._trial_id for trial in self._study.get_trials(deepcopy=False, states=(running,))]

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.runs.inputs import as_kept
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 from tuning.runs.unfinished import part_log, part_path
@@ -55,8 +56,9 @@ def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list
 def description(shards: list[Search]) -> str:
     """Return what makes these searches what they are, as TOML lines."""
     lines = [f"searches = {len(shards)}"]
-    lines += [f"machine.{name} = {_text(value)}" for name, value in shards[0].machine.items() if value is not None]
-    settings = {f.name: getattr(shards[0].settings, f.name) for f in fields(Settings)}
+    machine = as_kept(dict(shards[0].machine))
+    lines += [f"machine.{name} = {_text(value)}" for name, value in machine.items() if value is not None]
+    settings = {f.name: getattr(shards[0].settings, f.name) for f in fields(Settings) if f.name != "subject"}
     lines += [f"{name} = {_text(value)}" for name, value in settings.items() if value is not None]
     return "\n".join(lines) + "\n"
 
