@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from agents.evaluation.evaluation import Evaluation, environments_for, evaluate, summary
 from agents.evaluation.scores import Episode
-from agents.policies.open_policy import names_a_file, opened
+from agents.policies.open_policy import names_a_file, opened, source_of
 from agents.training.tasks import configuration_of, environment_name, make_environments
+from tuning.runs.inputs import taken_options
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
@@ -22,21 +23,30 @@ class Written(NamedTuple):
     Attributes:
         text: What names it.
         content: Of the file that the text is, None if it is none.
+        source: Hash of the file of the Python function that the text is, "" if it is none: it is not sent, and who
+            opens it must have the same.
         trust: As `open_policy` takes it.
     """
 
     text: str
     content: bytes | None
     trust: bool
+    source: str = ""
 
     @classmethod
     def of(cls, text: str, trust: bool) -> Written:
         """Return what a text names."""
-        return cls(text, Path(text).read_bytes() if names_a_file(text) else None, trust)
+        content = Path(text).read_bytes() if names_a_file(text) else None
+        return cls(text, content, trust, source_of(text) if content is None else "")
 
     def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:
         """Return the policy, or the baseline, in an environment with these options."""
         if self.content is None:
+            if (own := source_of(self.text)) != self.source:
+                raise ValueError(
+                    f"{self.text}: a worker's file with it has hash {own[:16]}, here it has {self.source[:16]}; give "
+                    "the worker the same file, in the folder where it was started, or evaluate in this process"
+                )
             return opened(self.text, environment, configuration, trust=self.trust).policy
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / Path(self.text).name
@@ -72,7 +82,7 @@ def evaluate_elsewhere(
     told: Callable[[float], None] = lambda share: None,
 ) -> Evaluation:
     """Run episodes on emulated machines and return what they say, as `evaluate` does, wherever the pool runs them."""
-    environment, options = environment_name(environment), dict(configuration)
+    environment, options = environment_name(environment), taken_options(configuration)
     at_once = environments_for(episodes)
     rounds = [
         _Round(policy, environment, options, seed + first, min(at_once, episodes - first), at_once)

@@ -19,8 +19,9 @@ import yaml
 
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
-from agents.training.train import DivergedError, train
+from agents.training.train import DivergedError, train, with_inputs
 from agents.training.training_run import TrainingRun
+from tuning.runs.inputs import as_kept, found_in, inputs_in, table_of, write_inputs
 from tuning.runs.provenance import check_study
 
 if TYPE_CHECKING:
@@ -121,11 +122,12 @@ def search(
 
     Raises:
         DivergedError: If no training at all gave an agent.
-        ValueError: For a study that was begun with other sources.
+        ValueError: For a study that was begun with other sources, hyper-parameters or files.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    study = _Study(TrainingRun(environment, algorithm, hyperparameters), folder, seed, episodes, told)
+    base = with_inputs(TrainingRun(environment, algorithm, hyperparameters))
+    study = _Study(base, folder, seed, episodes, told)
     for first in range(0, trials, ROUND):
         _make_round(study, min(ROUND, trials - first), pool)
     return study.best()
@@ -165,7 +167,11 @@ class _Study:
         storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
         name = f"{base.environment} {base.algorithm}"
         self._study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        check_study(self._study, folder / JOURNAL, "give another --out")
+        inputs = inputs_in(base.hyperparameters)
+        subject = [f"{name} = {value}" for name, value in as_kept(base.hyperparameters).items()]
+        subject += [f"episodes = {episodes}", *table_of(inputs)]
+        check_study(self._study, folder / JOURNAL, "give another --out", "\n".join(subject))
+        write_inputs(folder, inputs)
         self._states = optuna.trial.TrialState
 
     def known(self) -> Any:
@@ -205,7 +211,8 @@ class _Study:
         found = self._study.tell(trial, scored.score, state=state)
         best = self._study.best_trial if self._completed() else None
         if best is not None:
-            _write(self._folder / BEST, self._base.environment, self._drawn(best), self._study, best)
+            found_best = found_in(self._drawn(best), self._folder)
+            _write(self._folder / BEST, self._base.environment, found_best, self._study, best)
         if self._told is not None:
             last = SearchTrial(found.number, found.value, found.params)
             self._told(last, None if best is None else SearchTrial(best.number, best.value, best.params))

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from drive_env.whole_file import write_whole
 from mechanics.untrusted import TooLargeError, read_bytes
 
 FOLDER = "inputs"  # of a run
@@ -134,8 +133,19 @@ def as_kept(value: Any) -> Any:
     return value
 
 
+def found_in(value: Any, folder: Path) -> Any:
+    """Return values with whole paths of a run's own copies for inputs, for a file that is read from elsewhere."""
+    if isinstance(value, Input):
+        return str(folder.absolute() / value.kept)
+    if isinstance(value, Mapping):
+        return {key: found_in(one, folder) for key, one in value.items()}
+    return value
+
+
 def write_inputs(folder: Path, inputs: Iterable[Input]) -> None:
     """Write inputs into a run's folder; raises OSError with the file and the reason."""
+    from drive_env.whole_file import write_whole  # not with the module: acting with an agent's file needs NumPy alone
+
     for one in inputs:
         for name, content in one.files.items():
             write_whole(folder / FOLDER / one.what / name, content)
