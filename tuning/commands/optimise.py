@@ -129,7 +129,7 @@ def optimise(
         from tuning.search.optimise import Settings
 
         drive.check()
-        drive = drive.with_inputs()
+        given, drive = drive, drive.with_inputs()
         folder = provenance.run_folder("optimise") if out is None else out
         if resume:
             _check_unfinished(folder, journal)
@@ -151,7 +151,7 @@ def optimise(
             **({} if width is None else {"width": width}),
         )
         if drive.bus:
-            _on_bus(drive, settings, folder, json)
+            _on_bus(given, drive, settings, folder, json)
         else:
             _on_machine(drive, settings, copies, searches, folder, workers, cluster, resume, json)
 
@@ -183,14 +183,17 @@ def _on_machine(
     unfinished.discard(folder)
 
 
-def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
-    """Search on the drives of a bus, write and print what was found."""
+def _on_bus(given: DriveOptions, drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
+    """Search on the drives of a bus, write and print what was found.
+
+    They are opened as they were given: the state before names their device for whoever undoes this another day.
+    """
     from tuning.snapshot import file_before
 
     before = file_before("optimise", folder)
-    with drive.open() as target:
-        given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
-        options = _named(drive) | given | {key: value for key, value in target.bus.items() if key != "axes"}
+    with given.open() as target:
+        bus = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
+        options = _named(drive) | bus | {key: value for key, value in target.bus.items() if key != "axes"}
         try:
             found = _search_bus(target, settings, before, folder, options)
         except KeyboardInterrupt:

@@ -324,14 +324,15 @@ def open_target(drive: DriveOptions) -> Target:
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     drive.check()
+    inputs = tuple(drive.with_inputs().inputs())  # opened as given: the state before names the device for `undo`
     if not drive.bus:
-        return emulated(**drive.machine())
+        return replace(emulated(**drive.machine()), inputs=inputs)
     if drive.travel is None:
         raise ValueError("--travel is missing: give how far the motor may turn, LOW:HIGH in turns, or free")
     options: dict[str, Any] = {} if drive.bitrate is None else {"bitrate": drive.bitrate}
     if drive.lockstep:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
-    return on_bus(
+    target = on_bus(
         drive.device,
         drive.motor_name,
         interface=drive.interface,
@@ -343,6 +344,7 @@ def open_target(drive: DriveOptions) -> Target:
         chosen=drive.axis or None,
         **options,
     )
+    return replace(target, inputs=inputs)
 
 
 def way_back(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:
