@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import pickle
 import re
 import shutil
 import signal
@@ -139,7 +140,7 @@ def test_any_cut_gives_the_digits_of_any_other(experiment, whole, tmp_path):
     class Wide:
         width, shares_disk = 9, True
 
-        def unordered(self, function, items, say):
+        def unordered(self, function, items, say=None, fits=None):
             return iter([(k, function(item)) for k, item in enumerate(items)])
 
     with ShardLog(tmp_path / "shards", "x") as log:
@@ -447,7 +448,7 @@ def test_worker_processes_of_other_sources_are_refused_with_both_hashes(monkeypa
 def test_a_worker_whose_files_were_edited_since_it_began_is_refused(monkeypatch):
     monkeypatch.setattr(provenance, "hash_of_sources", lambda: "fedcba9876543210")
     with pytest.raises(PoolError, match=f"sources fedcba9876543210, the run was begun with {provenance.SOURCES}"):
-        pools._checked(provenance.SOURCES, square, 1)
+        pools._checked(provenance.SOURCES, pickle.dumps((square, 1)))
     assert pools._versions()["sources"] == "fedcba9876543210"
 
 

@@ -70,6 +70,12 @@ def _run(task: _Round) -> list[Episode]:
     ).episodes
 
 
+def _is_of(task: _Round, found: Any) -> bool:
+    """Return whether episodes are those of a round."""
+    seeds = [episode.seed for episode in found if len(episode.observations) == len(episode.actions) + 1]
+    return seeds == list(range(task.seed, task.seed + task.episodes))
+
+
 def evaluate_elsewhere(
     policy: Written,
     environment: str,
@@ -89,7 +95,7 @@ def evaluate_elsewhere(
         for first in range(0, episodes, at_once)
     ]
     found: dict[int, list[Episode]] = {}
-    for k, recorded in pool.unordered(_run, rounds):
+    for k, recorded in pool.unordered(_run, rounds, fits=_is_of):
         found[k] = recorded
         told(len(found) / len(rounds))
     lanes: Any = make_environments(environment, 1, options)

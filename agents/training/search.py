@@ -8,6 +8,7 @@ run changes none of them.
 from __future__ import annotations
 
 import copy
+import math
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -146,7 +147,7 @@ def _make_round(study: _Study, count: int, pool: Pool | None) -> None:
         else:
             begun = [study.begin(known, writes_there=pool.shares_disk) for _ in range(count)]
             waiting = [trial for trial, _ in begun]
-            for scored in _in_turn(pool.unordered(_trained, [task for _, task in begun])):
+            for scored in _in_turn(pool.unordered(_trained, [task for _, task in begun], fits=_is_score)):
                 study.end(waiting[0], scored)
                 del waiting[0]
     except (Exception, KeyboardInterrupt):
@@ -273,6 +274,11 @@ def _trained(task: _TrainingTask) -> _Scored:
             score = mean if found.lower_is_better[found.score] else -mean
         paths = [] if task.folder is not None else [path for path in folder.rglob("*") if path.is_file()]
         return _Scored(score, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
+
+
+def _is_score(_: _TrainingTask, scored: Any) -> bool:
+    """Return whether something is what `_trained` returns."""
+    return isinstance(scored, _Scored) and (scored.score is None or math.isfinite(scored.score))
 
 
 def _in_turn(results: Iterator[tuple[int, _Scored]]) -> Iterator[_Scored]:

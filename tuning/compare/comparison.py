@@ -231,9 +231,15 @@ def _elsewhere(
 ) -> Iterator[tuple[int, list[MachineRow]]]:
     """Give the number and the rows of each task as it comes back."""
     items = [_GroupTask([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
-    for place, text in pool.unordered(_run, items):
+    for place, text in pool.unordered(_run, items, fits=_is_of):
         say(left[place])
         yield left[place], _rows_of(text)
+
+
+def _is_of(task: _GroupTask, text: Any) -> bool:
+    """Return whether a text has the rows of a tuner on a group."""
+    rows = [(row.tuner, row.machine) for row in _rows_of(text)]
+    return rows == [(task.tuner, machine.name) for machine in task.group]
 
 
 def _text_of(rows: Sequence[MachineRow]) -> str:

@@ -237,7 +237,7 @@ def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -
         report("simulating", done())
 
     if pool is not None:
-        for k, arrays in pool.unordered(simulate, left, lambda what: report(what or "simulating", done())):
+        for k, arrays in pool.unordered(simulate, left, lambda what: report(what or "simulating", done()), _is_of):
             say(k, 1.0)
             yield left[k], arrays
         return
@@ -266,6 +266,15 @@ def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None
     columns = {name: values[worst] for name, values in columns.items()}
     best = recording.point(int(worst[np.argmin(_score(columns))]))
     return columns | {f"best.{name}": np.asarray(getattr(best, name)) for name in _recorded(experiment)}
+
+
+def _is_of(shard: Shard, arrays: Any) -> bool:
+    """Return whether arrays are the columns of a shard and a recording."""
+    columns = _column_names(resolve(shard.experiment))
+    recorded = [f"best.{name}" for name in _recorded(shard.experiment)]
+    return set(arrays) == {*columns, *recorded} and all(
+        arrays[name].shape == (shard.last - shard.first,) and arrays[name].dtype.kind in "fb" for name in columns
+    )
 
 
 _RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")

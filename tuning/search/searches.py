@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices import find_device
 from tuning.runs.inputs import as_kept
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
@@ -105,7 +106,7 @@ def _done(
 
             yield k, _run(tasks[k], report)
         return
-    for done, (place, arrays) in enumerate(pool.unordered(_run, [tasks[k] for k in left]), before + 1):
+    for done, (place, arrays) in enumerate(pool.unordered(_run, [tasks[k] for k in left], fits=_is_of), before + 1):
         progress(done / len(tasks))
         yield left[place], arrays
 
@@ -150,6 +151,13 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
         "notes": np.array(found.notes[:1]),
         "t_0": np.array(found.t_0),
     }
+
+
+def _is_of(task: _SearchTask, arrays: Any) -> bool:
+    """Return whether arrays are what `_run` returns of a search."""
+    found = _optimised(arrays, 0)
+    gains = find_device(str(task.search.machine["device"])).gains
+    return found.gains.shape[1] == len(gains.names) and all(row.gains.shape == found.gains.shape for row in found.rows)
 
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
