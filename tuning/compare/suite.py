@@ -78,8 +78,8 @@ def own_names(path: Path) -> list[tuple[str, str]]:
     for row in table.get("generated", []):
         pairs = row.get("groups", []) if isinstance(row, dict) else []
         found += [("motor", pair[1]) for pair in pairs if isinstance(pair, list) and len(pair) == 2]
-    named = [(what, name, _located(what, name, path.parent)) for what, name in found if isinstance(name, str)]
-    return [(what, place) for what, name, place in named if place != name]
+    named = [(what, _located(what, name, path.parent)) for what, name in found if isinstance(name, str)]
+    return [(what, str(place)) for what, place in named if place is not None]
 
 
 def suite_names() -> list[str]:
@@ -202,15 +202,15 @@ def _read(path: Path) -> dict[str, Any]:
         raise ExperimentError(f"{path} is not TOML: {error}") from error
 
 
-def _located(what: str, name: str, folder: Path) -> str:
-    """Return a name as it is, or a path, which is relative to the suite's file, as one from here."""
-    return str(folder / name) if is_path(what, str(folder / name)) and not is_shipped(what, name) else name
+def _located(what: str, name: str, folder: Path) -> Path | None:
+    """Return where a name that is a path, which is relative to the suite's file, lies; None for other names."""
+    return folder / name if is_path(what, str(folder / name)) and not is_shipped(what, name) else None
 
 
 def _named(what: str, name: str, folder: Path) -> str:
     """Return what a name of a suite stands for; of a path its content, which goes wherever the machine goes."""
     try:
-        return str(name) if (place := _located(what, name, folder)) == name else taken(what, place)
+        return name if (place := _located(what, name, folder)) is None else taken(what, place)
     except ValueError as error:
         raise ExperimentError(str(error)) from None
 

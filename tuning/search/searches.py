@@ -16,12 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.devices import find_device
-from tuning.runs.inputs import as_kept
+from tuning.runs.inputs import as_kept, taken_options
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 from tuning.runs.unfinished import part_log, part_path
-from tuning.search.optimise import Optimised, Settings, TrialRow, optimise
+from tuning.search.optimise import SAFE_STARTS, Optimised, Settings, TrialRow, optimise
 from tuning.target import emulated
 from tuning.toml_tables import toml
 
@@ -51,6 +50,7 @@ def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list
         raise ValueError(f"--searches {count} is below 1; give the number of searches")
     if count > 1 and settings.journal is not None:
         raise ValueError("a journal keeps one search; leave --journal out, or take --searches 1")
+    machine = taken_options(machine)
     return [Search(machine, replace(settings, seed=settings.seed + k)) for k in range(count)]
 
 
@@ -156,8 +156,8 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
 def _is_of(task: _SearchTask, arrays: Any) -> bool:
     """Return whether arrays are what `_run` returns of a search."""
     found = _optimised(arrays, 0)
-    gains = find_device(str(task.search.machine["device"])).gains
-    return found.gains.shape[1] == len(gains.names) and all(row.gains.shape == found.gains.shape for row in found.rows)
+    trials = len(found.rows) <= task.search.settings.trials + SAFE_STARTS
+    return trials and all(one.shape == found.gains.shape for one in (found.rule, *(row.gains for row in found.rows)))
 
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
