@@ -423,7 +423,7 @@ def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, 
         )
 
     if not isinstance(answer, _Answer):
-        raise refused("nothing" if answer is None else f"a {type(answer).__name__}")
+        raise refused("nothing" if answer is None else f"a value of type {type(answer).__name__}")
     if answer.versions.get("sources") != provenance.SOURCES:
         raise refused(f"a result of sources {answer.versions.get('sources', 'unknown')}")
     if answer.work != _sha256(work):
