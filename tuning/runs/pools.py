@@ -415,29 +415,31 @@ def _checked(sources: str, work: bytes) -> _Answer:
 
 def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, again: str) -> Any:
     """Return the result in an answer; PoolError, with who gave it, for one that is none of this work."""
-
-    def refused(what: str) -> PoolError:
-        return PoolError(
-            f"{who} gave back {what}, which is no result of its work and is not used: start it again with the same "
+    wrong, result = _wrong_with(answer, work), None
+    if not wrong:
+        result = pickle.loads(answer.content)
+        try:
+            good = fits(result)
+        except Exception:  # whatever there is in its place
+            good = False
+        wrong = "" if good else f"a result of another form ({type(result).__name__})"
+    if wrong:
+        raise PoolError(
+            f"{who} gave back {wrong}, which is no result of its work and is not used: start it again with the same "
             f"files installed as here, and {again}"
         )
-
-    if not isinstance(answer, _Answer):
-        raise refused("nothing" if answer is None else f"a value of type {type(answer).__name__}")
-    if answer.versions.get("sources") != provenance.SOURCES:
-        raise refused(f"a result of sources {answer.versions.get('sources', 'unknown')}")
-    if answer.work != _sha256(work):
-        raise refused("a result of other work")
-    if answer.hash != _sha256(answer.content):
-        raise refused("a result whose content does not match its hash")
-    result = pickle.loads(answer.content)
-    try:
-        good = fits(result)
-    except Exception:  # whatever there is in its place
-        good = False
-    if not good:
-        raise refused(f"a result of another form ({type(result).__name__})")
     return result
+
+
+def _wrong_with(answer: Any, work: bytes) -> str:
+    """Return what an answer is in place of one on this work, "" if it is that."""
+    if not isinstance(answer, _Answer):
+        return "nothing" if answer is None else f"a value of type {type(answer).__name__}"
+    if answer.versions.get("sources") != provenance.SOURCES:
+        return f"a result of sources {answer.versions.get('sources', 'unknown')}"
+    if answer.work != _sha256(work):
+        return "a result of other work"
+    return "" if answer.hash == _sha256(answer.content) else "a result whose content does not match its hash"
 
 
 def _sha256(content: bytes) -> str:
