@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from drive_env.motors import find_motor
 from mechanics.loads import MODELS, find_load
 from tuning.commands.cli import app
 from tuning.compare.comparison import compare
-from tuning.compare.suite import load_suite
+from tuning.compare.suite import load_suite, suite_input
 from tuning.runs import inputs, sweep
 from tuning.runs.experiment import ExperimentError, load_experiment
 from tuning.runs.inputs import Input, InputError, found_again, hashes, taken, write_inputs
@@ -127,18 +128,19 @@ def edit(path):
                                 "mine.toml"]),
 ])  # fmt: skip
 def test_an_input_is_all_that_is_read_of_it_and_its_hash_shows_a_change_of_any(own, what, name, files):
-    found = taken(what, name)
+    take = suite_input if what == "suite" else partial(taken, what)
+    found = take(name)
     assert sorted(found.files) == files
     assert Path(found).exists() and not Path(found).is_relative_to(own)
     assert found.kept == f"inputs/{what}/{Path(name).name}"
     (own / "unrelated.txt").write_text("x")
     (own / "invented" / "notes.txt").write_text("x")
-    assert taken(what, own / name).hash == found.hash  # by its whole path, too
+    assert take(str(own / name)).hash == found.hash  # by its whole path, too
     top = (own / name).parent
     seen = {found.hash}
     for file in files:
         edit(top / file if not file.startswith("arm/") else own / file)
-        seen.add(taken(what, name).hash)
+        seen.add(take(name).hash)
     assert len(seen) == 1 + len(files)
 
 

@@ -78,15 +78,14 @@ def rank(
         folder = provenance.run_folder("rank") if out is None else out
         try:
             from tuning.compare.comparison_files import save
-            from tuning.compare.suite import load_suite
-            from tuning.runs.inputs import taken
+            from tuning.compare.suite import load_suite, suite_input
 
             check_seed(seed)
             if trials is not None and trials < 1:
                 raise ValueError(f"--trials must be 1 or more, not {trials}")
             provenance.check_folder(folder)
             machines = load_suite(suite, seed if drawn else None, count)
-            suite = taken("suite", suite)
+            suite = suite_input(suite)
             compared, left_out = _find_tuners(tuners, trials, slow)
             settings: dict[str, Any] = {
                 "suite": suite,

@@ -28,7 +28,7 @@ from mechanics.loads import find_load
 from mechanics.shaft import one, way
 from mechanics.untrusted import read_toml
 from tuning.identify.linked_axes import are_linked
-from tuning.runs.inputs import is_path, is_shipped, taken
+from tuning.runs.inputs import files_of, is_path, is_shipped, taken
 from tuning.target import Target
 from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
 
@@ -70,7 +70,16 @@ class SuiteMachine:
         return self.device, self.load, self.motor, self.friction
 
 
-def own_names(path: Path) -> list[tuple[str, str]]:
+def suite_input(name: str) -> str:
+    """Return a suite's name as it is, or an `Input` of its file and all that its machines name; raises as `taken`."""
+    if not is_path("suite", name):
+        return name
+    named = [one for what, place in _own_names(Path(name)) for one in files_of(what, place)]
+    found: str = taken("suite", name, named)
+    return found
+
+
+def _own_names(path: Path) -> list[tuple[str, Path]]:
     """Return the paths among a suite's names: device, motor or load, and where it is; raises as `load_suite` does."""
     table = _read(path)
     rows = [row for row in table.get("group", []) if isinstance(row, dict)]
@@ -79,7 +88,7 @@ def own_names(path: Path) -> list[tuple[str, str]]:
         pairs = row.get("groups", []) if isinstance(row, dict) else []
         found += [("motor", pair[1]) for pair in pairs if isinstance(pair, list) and len(pair) == 2]
     named = [(what, _located(what, name, path.parent)) for what, name in found if isinstance(name, str)]
-    return [(what, str(place)) for what, place in named if place is not None]
+    return [(what, place) for what, place in named if place is not None]
 
 
 def suite_names() -> list[str]:

@@ -84,12 +84,13 @@ class Input(str):
         return f"Input({self.kept!r}, {self.hash!r})"
 
 
-def taken(what: str, name: Any) -> Any:
+def taken(what: str, name: Any, also: Iterable[Path] = ()) -> Any:
     """Return a name as it is, or what it stands for as an `Input` if it is the path of a file or folder.
 
     Args:
         what: A key of `_FILES`.
         name: As `find_motor`, `find_load`, `find_device` and `Distributions.load` take it.
+        also: Further files that belong to it, as those that a suite names.
 
     Raises:
         InputError: If a file of it cannot be read, or lies where the run's copy would not have it.
@@ -98,7 +99,12 @@ def taken(what: str, name: Any) -> Any:
     if isinstance(name, Input) or not isinstance(name, str | Path) or not is_path(what, str(name)):
         return name
     _check(what, name)  # with the user's path in the message
-    return _read(what, Path(name), str(name))
+    return _read(what, Path(name), str(name), also)
+
+
+def files_of(what: str, path: Path) -> list[Path]:
+    """Return the files that are read of what lies at a path; raises as `taken`."""
+    return _FILES[what](path)
 
 
 def taken_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -264,10 +270,10 @@ def _check(what: str, name: str | Path) -> None:
         Distributions.load(name)
 
 
-def _read(what: str, path: Path, given: str) -> Input:
+def _read(what: str, path: Path, given: str, also: Iterable[Path] = ()) -> Input:
     """Return the input at a path, all its files read once."""
     try:
-        paths = [_whole(one) for one in _FILES[what](path)]
+        paths = [_whole(one) for one in (*_FILES[what](path), *also)]
         top = _whole(path)
         folder = Path(os.path.commonpath([one.parent for one in (*paths, top)]))
         files: dict[str, bytes] = {}
@@ -324,17 +330,10 @@ def _of_device(path: Path) -> list[Path]:
     return [*(path / name for name in named), *(path / "presets").glob("*.toml")]
 
 
-def _of_suite(path: Path) -> list[Path]:
-    """Return the files of a suite: those of the devices, motors and loads of its machines too."""
-    from tuning.compare.suite import own_names
-
-    return [path, *(one for what, name in own_names(path) for one in _FILES[what](Path(name)))]
-
-
-_FILES = {"motor": _alone, "distributions": _alone, "load": _of_load, "device": _of_device, "suite": _of_suite}
+_FILES = {"motor": _alone, "distributions": _alone, "load": _of_load, "device": _of_device, "suite": _alone}
 
 # --- copies -----------------------------------------------------------------------------------------------------------
-_LOCK = threading.Lock()
+_LOCK = threading.RLock()  # Ctrl-C may come while it is held, and removes the copies
 _COPIES: list[tuple[int, Path]] = []  # the process and its folder
 
 

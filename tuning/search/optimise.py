@@ -22,7 +22,7 @@ from drive_env.trials.method import check_tried
 from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
 from drive_env.trials.positioning import wrapped
 from tuning.runs.shard_log import ShardLog
-from tuning.search.samplers import SAMPLERS, Proposer, load, new_proposer
+from tuning.search.samplers import SAMPLERS, Proposer, Study, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
 from tuning.search.trial_log import LoggedTrials
 from tuning.target import Target, timed
@@ -403,8 +403,7 @@ class _Search:
             first=[start],
             generation=len(self._members[k]),
             journal=settings.journal,
-            subject=f"{settings.subject}\n{settings.gains} {settings.objectives}",
-            name=f"machine {k}",
+            study=Study(f"machine {k}", f"{settings.subject}\n{settings.gains} {settings.objectives}"),
         )
 
     def _points(self, gains: Integers) -> Floats:
