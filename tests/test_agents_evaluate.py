@@ -570,7 +570,7 @@ class Elsewhere:
 
     width, shares_disk = 2, False
 
-    def unordered(self, function, items, say=None):
+    def unordered(self, function, items, say=None, fits=None):
         for k, item in reversed(list(enumerate(items))):
             task = pickle.loads(pickle.dumps((function, item)))
             yield k, pickle.loads(pickle.dumps(task[0](task[1])))

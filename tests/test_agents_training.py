@@ -452,7 +452,7 @@ class Elsewhere:
 
     width, shares_disk = 3, False
 
-    def unordered(self, function, items, say=None):
+    def unordered(self, function, items, say=None, fits=None):
         for k, item in reversed(list(enumerate(items))):
             task = pickle.loads(pickle.dumps((function, item)))
             yield k, pickle.loads(pickle.dumps(task[0](task[1])))
@@ -483,7 +483,7 @@ def test_what_a_round_draws_follows_from_the_rounds_before_wherever_it_runs(tmp_
         return search._Scored(abs(task.run.hyperparameters["learning_rate"] - 1e-3), {})
 
     class AtOnce(Elsewhere):
-        def unordered(self, function, items, say=None):
+        def unordered(self, function, items, say=None, fits=None):
             return [(k, function(item)) for k, item in reversed(list(enumerate(items)))]
 
     monkeypatch.setattr(search, "_trained", scored)
@@ -499,7 +499,7 @@ def test_trials_that_an_error_ends_are_over_for_the_next_search(tmp_path, monkey
     run = tiny(timesteps=32)
 
     class Lost(Elsewhere):
-        def unordered(self, function, items, say=None):
+        def unordered(self, function, items, say=None, fits=None):
             yield 0, function(items[0])
             raise PoolError("the connection was lost")
 

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -36,6 +37,7 @@ from tuning.certificate.certificate import (
 )
 from tuning.certificate.certificate_files import save_certificate
 from tuning.commands.cli import app
+from tuning.runs import inputs
 from tuning.snapshot import take
 from tuning.target import emulated
 
@@ -109,7 +111,8 @@ def test_state_before_a_change(tmp_path):
 def test_sweep(tmp_path):
     text = re.sub(r"count = \d+", "count = 2", (ROOT / "tuning" / "runs" / "sweep.toml").read_text(encoding="utf-8"))
     (tmp_path / "small.toml").write_text(text, encoding="utf-8")
-    run("sweep", "--config", tmp_path / "small.toml", "--out", tmp_path / "out")
+    mine = shutil.copy(ROOT / "drive_env" / "motors" / "qbl4208.toml", tmp_path / "mine.toml")
+    run("sweep", "--config", tmp_path / "small.toml", "--motor", mine, "--out", tmp_path / "out")
     settings = tomllib.loads((tmp_path / "out" / "settings.toml").read_text(encoding="utf-8"))
     assert fields("sweep settings") == list(settings)
     assert fields("sweep") == list(settings["sweep"][0])
@@ -119,10 +122,15 @@ def test_sweep(tmp_path):
 
 
 def test_search(tmp_path):
-    run("optimise", "--trials", 1, "--load", "inertia", "--out", tmp_path / "out")
+    mine = shutil.copy(ROOT / "drive_env" / "motors" / "qbl4208.toml", tmp_path / "mine.toml")
+    run("optimise", "--trials", 1, "--motor", mine, "--load", "inertia", "--out", tmp_path / "out")
     settings = tomllib.loads((tmp_path / "out" / "settings.toml").read_text(encoding="utf-8"))
     assert fields("search settings") == list(settings)
     assert fields("trials") == header(tmp_path / "out" / "trials.csv")
+
+
+def test_inputs():
+    assert set(fields("inputs", "files")) == set(inputs._FILES)
 
 
 def test_comparison(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import pickle
 import re
 import shutil
 import signal
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,7 +21,7 @@ import numpy as np
 import pytest
 
 from tuning.runs import pools, provenance, sweep
-from tuning.runs.experiment import load_experiment
+from tuning.runs.experiment import load_experiment, resolve
 from tuning.runs.pools import PoolError, in_order, open_pool, parse_cluster
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.runs.unfinished import SHARDS, shard_log, unfinished_folder
@@ -139,7 +141,7 @@ def test_any_cut_gives_the_digits_of_any_other(experiment, whole, tmp_path):
     class Wide:
         width, shares_disk = 9, True
 
-        def unordered(self, function, items, say):
+        def unordered(self, function, items, say=None, fits=None):
             return iter([(k, function(item)) for k, item in enumerate(items)])
 
     with ShardLog(tmp_path / "shards", "x") as log:
@@ -365,15 +367,16 @@ main()
 """
 
 
-@pytest.fixture
-def bare_cluster():
+@contextmanager
+def cluster_with(program):
+    """Give a cluster whose one worker is a process with a program of its own."""
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 0, "protocol": "tcp://", "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(host="127.0.0.1", silence_logs="CRITICAL", **options) as cluster:
         address = cluster.scheduler_address
         process = subprocess.Popen(
-            [sys.executable, "-c", BARE_WORKER, address, "--host", "127.0.0.1", "--no-nanny", "--no-dashboard"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            [sys.executable, "-c", program, address, "--host", "127.0.0.1", "--no-nanny", "--no-dashboard"],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment(),
         )  # fmt: skip
         try:
             with distributed.Client(address, set_as_default=False) as client:
@@ -382,6 +385,12 @@ def bare_cluster():
         finally:
             process.kill()
             process.wait()
+
+
+@pytest.fixture
+def bare_cluster():
+    with cluster_with(BARE_WORKER) as cluster:
+        yield cluster
 
 
 def test_a_worker_without_the_package_is_told_before_and_when_it_joins_late(bare_cluster):
@@ -393,6 +402,89 @@ def test_a_worker_without_the_package_is_told_before_and_when_it_joins_late(bare
             pool.differences()
         with pytest.raises(PoolError, match=f"^a worker{told}"):
             in_order(pool, square, [3])
+
+
+# A worker whose packages are ours and whose answers are not.
+LYING_WORKER = """
+from tuning.runs import pools, provenance
+honest, versions = pools._checked, provenance.versions
+{lie}
+from distributed.cli.dask_worker import main
+main()
+"""
+NO_RESULT = r"which is no result of its work and is not used: start it again with the same files installed"
+
+
+@pytest.mark.every(3)
+@pytest.mark.parametrize(("lie", "told"), [
+    ("pools._checked = lambda *_: None", "nothing"),
+    ("pools._checked = lambda *_: {'score': 1.0}", "a value of type dict"),
+    ("pools._checked = lambda sources, work: honest(sources, work)._replace(work='other')", "a result of other work"),
+])  # fmt: skip
+def test_a_worker_of_a_cluster_that_gives_back_what_is_no_result_is_refused_by_its_address(lie, told):
+    with cluster_with(LYING_WORKER.format(lie=lie)) as cluster, open_pool(cluster=cluster.scheduler_address) as pool:
+        assert pool.differences() == []
+        with pytest.raises(PoolError, match=rf"^worker tcp://127\.0\.0\.1:\d+ gave back {told}, {NO_RESULT}"):
+            in_order(pool, abs, [-3])
+
+
+def test_a_worker_of_another_numpy_that_is_not_there_at_first_is_named_once(caplog):
+    lie = "provenance.versions = lambda: versions() | {'numpy': '0.9'}"
+    with cluster_with(LYING_WORKER.format(lie=lie)) as cluster, open_pool(cluster=cluster.scheduler_address) as pool:
+        assert in_order(pool, abs, [-3, 4]) == [3, 4]
+        assert pool.differences() == []  # told already
+    assert len(re.findall(r"worker tcp://\S+ has numpy 0\.9, here it is .*: last digits may differ", caplog.text)) == 1
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda answer: None, "nothing"),
+    (lambda answer: 9, "a value of type int"),
+    (lambda answer: answer._replace(versions={"sources": "fedcba9876543210"}), "a result of sources fedcba9876543210"),
+    (lambda answer: answer._replace(versions={}), "a result of sources unknown"),
+    (lambda answer: answer._replace(work="0" * 64), "a result of other work"),
+    (lambda answer: answer._replace(content=answer.content + b"x"), "a result whose content does not match its hash"),
+])  # fmt: skip
+def test_an_answer_that_is_none_of_the_work_is_refused(change, told):
+    work = pickle.dumps((square, 3))
+    answer = pools._checked(provenance.SOURCES, work)
+    assert pools._result_of(answer, work, lambda result: result == 9, "a worker", "try again") == 9
+    with pytest.raises(PoolError, match=f"^a worker gave back {told}, {NO_RESULT} as here, and try again"):
+        pools._result_of(change(answer), work, lambda result: True, "a worker", "try again")
+
+
+def test_a_result_of_another_form_is_refused_whatever_it_is():
+    work = pickle.dumps((square, 3))
+    for fits in (lambda result: False, lambda result: result["score"] > 0):
+        with pytest.raises(PoolError, match=r"gave back a result of another form \(int\)"):
+            pools._result_of(pools._checked(provenance.SOURCES, work), work, fits, "a worker", "try again")
+
+
+@pytest.mark.parametrize("change", [
+    lambda arrays: arrays | {"score": arrays["score"][:-1]},
+    lambda arrays: arrays | {"score": arrays["score"][:, None]},
+    lambda arrays: arrays | {"score": arrays["score"].astype(str)},
+    lambda arrays: {name: values for name, values in arrays.items() if name != "fault"},
+    lambda arrays: arrays | {"more": arrays["score"]},
+    lambda arrays: {},
+    lambda arrays: None,
+])  # fmt: skip
+def test_what_is_not_of_a_shard_is_not_taken_for_it(experiment, change):
+    names = [*sweep._column_names(resolve(experiment)), *(f"best.{name}" for name in sweep._recorded(experiment))]
+    arrays = {name: np.zeros(64) for name in names}
+    shard = sweep.Shard(experiment, 64, 128, 1)
+    assert sweep._is_of(shard, arrays)
+    work = b"work"
+    answer = pools._Answer(pools._sha256(work), provenance.versions(), (content := pickle.dumps(change(arrays))),
+                           pools._sha256(content))  # fmt: skip
+    with pytest.raises(PoolError, match="a result of another form"):
+        pools._result_of(answer, work, lambda result: sweep._is_of(shard, result), "a worker", "try again")
+
+
+def test_sources_are_compared_before_the_work_is_opened(monkeypatch):
+    """What other sources do not know cannot be unpickled there: they are told, and no traceback."""
+    monkeypatch.setattr(provenance, "SOURCES", "0123456789abcdef")
+    with pytest.raises(PoolError, match="worker has sources 0123456789abcdef, the run was begun with fedcba9876543210"):
+        pools._checked("fedcba9876543210", b"no pickle")
 
 
 def test_workers_of_another_version_are_told():
@@ -447,7 +539,7 @@ def test_worker_processes_of_other_sources_are_refused_with_both_hashes(monkeypa
 def test_a_worker_whose_files_were_edited_since_it_began_is_refused(monkeypatch):
     monkeypatch.setattr(provenance, "hash_of_sources", lambda: "fedcba9876543210")
     with pytest.raises(PoolError, match=f"sources fedcba9876543210, the run was begun with {provenance.SOURCES}"):
-        pools._checked(provenance.SOURCES, square, 1)
+        pools._checked(provenance.SOURCES, pickle.dumps((square, 1)))
     assert pools._versions()["sources"] == "fedcba9876543210"
 
 

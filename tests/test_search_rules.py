@@ -399,7 +399,7 @@ def started(monkeypatch):
     def start(history=(), *, shared=False, **settings):
         def new_proposer(sampler, low, high, **more):
             made.append((sampler, low.tolist(), high.tolist(), more))
-            return SimpleNamespace(told=0, history=lambda: history if more["name"] == "machine 1" else ())
+            return SimpleNamespace(told=0, history=lambda: history if more["study"].name == "machine 1" else ())
 
         monkeypatch.setattr(module, "new_proposer", new_proposer)
         bench = SimpleNamespace(
@@ -421,7 +421,7 @@ def test_every_machine_has_a_sampler_and_a_seed_of_its_own(started):
     assert [more["seed"] for *_, more in made] == [5, 5 + 7919]
     for k, (*_, more) in enumerate(made):
         assert (more["objectives"], more["trials"], more["generation"], more["journal"]) == (2, 7, 1, None)
-        assert more["name"] == f"machine {k}" and [point.tolist() for point in more["first"]] == [[0.0] * 3]
+        assert more["study"].name == f"machine {k}" and [point.tolist() for point in more["first"]] == [[0.0] * 3]
     assert search._gains(0, np.full(3, 9.0))[0, 2:].tolist() == [7, 6, 5], "as high as the bench allows"
     assert search.notes == ["", ""] and search._halted == [False, False]
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
     from drive_env.motors import Motor
     from mechanics.load import Load
+    from tuning.runs.inputs import Input
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -67,6 +68,7 @@ class Target:
         linked: Whether the axes of a machine pull at one thing, as those of a gantry: none goes far without the others.
         machine: What turns: an emulated load's name, or the channel.
         bus: How the drives of a bus are opened again: what `CanDrives` takes; empty for emulated ones.
+        inputs: What device, motor and load hold that are its user's files, for its certificate.
     """
 
     drives: Drives
@@ -81,6 +83,7 @@ class Target:
     linked: bool = False
     machine: str = ""
     bus: Mapping[str, Any] = field(default_factory=dict)
+    inputs: tuple[Input, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("supply", "low", "high"):

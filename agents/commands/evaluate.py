@@ -258,6 +258,7 @@ def _open(
     from agents.training.tasks import environment_name
     from drive_env.envs.randomisation import shipped as shipped_distributions
     from mechanics.untrusted import read_toml
+    from tuning.runs.inputs import taken_options
 
     loaded = LoadedPolicy(text, None) if is_baseline(text) else open_policy(text, trust=trust)
     if environment is not None:
@@ -284,6 +285,7 @@ def _open(
         if configuration.get("distributions") == configuration.get("load"):  # the old load's own
             configuration["distributions"] = load if load in shipped_distributions() else None
         configuration["load"] = load
+    configuration = taken_options(configuration)
     if loaded.policy is None:
         loaded.policy = opened(text, loaded.environment, configuration).policy
     return loaded, configuration
@@ -490,8 +492,10 @@ def _tell(
 def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
     from agents.evaluation import episode_log, evaluation_plots
     from drive_env.whole_file import write_whole
+    from tuning.runs.inputs import inputs_in, write_inputs
 
     folder.mkdir(parents=True, exist_ok=True)
+    write_inputs(folder, inputs_in(found.configuration))
     found.save(folder / "report.json")
     episode_log.save(folder / "episodes.npz", found.environment, found.configuration, found.episodes)
     evaluation_plots.save(found, folder)

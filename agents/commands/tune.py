@@ -222,7 +222,7 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     folder.mkdir(parents=True, exist_ok=True)
     return run(
         target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say,
-        files=lambda certificate: certificate_files(certificate, folder),
+        files=lambda certificate: certificate_files(certificate, folder, target.inputs),
     )  # fmt: skip
 
 

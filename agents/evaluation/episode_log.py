@@ -15,6 +15,7 @@ from agents.policies.agent_file import plain
 from agents.policies.guard import PATIENT, GuardedPolicy
 from drive_env.whole_file import write_arrays
 from mechanics.untrusted import parse_json, read_arrays
+from tuning.runs.inputs import as_kept
 
 
 class EpisodeRecording(NamedTuple):
@@ -37,7 +38,7 @@ class Repeated(NamedTuple):
 
 def save(path: Path, environment: str, configuration: dict[str, Any], episodes: Sequence[Episode]) -> None:
     """Write episodes to an .npz."""
-    about = {"environment": environment, "configuration": plain(configuration)}
+    about = {"environment": environment, "configuration": plain(as_kept(configuration))}
     about |= {"seeds": [episode.seed for episode in episodes]}
     arrays = {
         "about": np.frombuffer(json.dumps(about).encode(), np.uint8),

@@ -26,6 +26,7 @@ from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.master.realtime_section import undisturbed
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_json
+from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in
 
 LANES = 64
 FIRST_SEED = 1_000_000  # far from those of a training
@@ -84,8 +85,10 @@ class Evaluation:
         """Write the report as JSON."""
         path = Path(path)
         table = {key: value for key, value in vars(self).items() if key != "episodes"}
+        if inputs := inputs_in(self.configuration):
+            table["inputs"] = hashes(inputs)
         table["intervals"] = {name: self.interval(name)._asdict() for name in self.values}
-        write_whole(path, json.dumps(plain(table), indent=1))
+        write_whole(path, json.dumps(plain(as_kept(table)), indent=1))
         return path
 
     @classmethod
@@ -98,6 +101,8 @@ class Evaluation:
         try:
             table = read_json(path)
             table.pop("intervals")
+            inputs = table.pop("inputs", None)
+            table["configuration"] = found_again(table["configuration"], inputs, Path(path).parent, alone=True)
             table["values"] = {name: [float(one) for one in values] for name, values in table["values"].items()}
             return cls(**table)
         except OSError as error:

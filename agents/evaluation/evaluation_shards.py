@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from agents.evaluation.evaluation import Evaluation, environments_for, evaluate, summary
 from agents.evaluation.scores import Episode
-from agents.policies.open_policy import names_a_file, opened
+from agents.policies.open_policy import names_a_file, opened, source_of
 from agents.training.tasks import configuration_of, environment_name, make_environments
 from mechanics.untrusted import MOST_ARRAYS, read_bytes
+from tuning.runs.inputs import taken_options
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
@@ -23,21 +24,30 @@ class Written(NamedTuple):
     Attributes:
         text: What names it.
         content: Of the file that the text is, None if it is none.
+        source: Hash of the file of the Python function that the text is, "" if it is none: it is not sent, and who
+            opens it must have the same.
         trust: As `open_policy` takes it.
     """
 
     text: str
     content: bytes | None
     trust: bool
+    source: str = ""
 
     @classmethod
     def of(cls, text: str, trust: bool) -> Written:
         """Return what a text names."""
-        return cls(text, read_bytes(text, MOST_ARRAYS) if names_a_file(text) else None, trust)
+        content = read_bytes(text, MOST_ARRAYS) if names_a_file(text) else None
+        return cls(text, content, trust, source_of(text) if content is None else "")
 
     def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:
         """Return the policy, or the baseline, in an environment with these options."""
         if self.content is None:
+            if (own := source_of(self.text)) != self.source:
+                raise ValueError(
+                    f"{self.text}: a worker's file with it has hash {own[:16]}, here it has {self.source[:16]}; give "
+                    "the worker the same file, in the folder where it was started, or evaluate in this process"
+                )
             return opened(self.text, environment, configuration, trust=self.trust).policy
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / Path(self.text).name
@@ -61,6 +71,12 @@ def _run(task: _Round) -> list[Episode]:
     ).episodes
 
 
+def _is_of(task: _Round, found: Any) -> bool:
+    """Return whether episodes are those of a round."""
+    seeds = [episode.seed for episode in found if len(episode.observations) == len(episode.actions) + 1]
+    return seeds == list(range(task.seed, task.seed + task.episodes))
+
+
 def evaluate_elsewhere(
     policy: Written,
     environment: str,
@@ -73,14 +89,14 @@ def evaluate_elsewhere(
     told: Callable[[float], None] = lambda share: None,
 ) -> Evaluation:
     """Run episodes on emulated machines and return what they say, as `evaluate` does, wherever the pool runs them."""
-    environment, options = environment_name(environment), dict(configuration)
+    environment, options = environment_name(environment), taken_options(configuration)
     at_once = environments_for(episodes)
     rounds = [
         _Round(policy, environment, options, seed + first, min(at_once, episodes - first), at_once)
         for first in range(0, episodes, at_once)
     ]
     found: dict[int, list[Episode]] = {}
-    for k, recorded in pool.unordered(_run, rounds):
+    for k, recorded in pool.unordered(_run, rounds, fits=_is_of):
         found[k] = recorded
         told(len(found) / len(rounds))
     lanes: Any = make_environments(environment, 1, options)

@@ -11,7 +11,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.untrusted import TooLargeError, parse_json, read_arrays
+from tuning.runs.inputs import as_kept, found_again
 
 FORMAT, FORMAT_VERSION = "drive-agent", 1
 MAX_BYTES = 1_000_000  # of a file: what ships in the package and is read by a small computer
@@ -103,6 +104,7 @@ class AgentFile:
 
         Raises:
             BundleError: If there is none, it is of another format, or it was changed after it was written.
+            InputError: If a file of its training beside it was changed.
         """
         path = Path(path)
         try:
@@ -128,7 +130,9 @@ class AgentFile:
         bundle = cls(arrays=arrays, **{name: about[name] for name in KINDS_OF_ABOUT})
         if bundle.hash != about.get("hash"):
             raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it again")
-        return bundle
+        # Of a load of its own the copy beside it, never what bears its name where somebody runs it.
+        kept = found_again(bundle.configuration, bundle.card.get("inputs"), path.parent, alone=True)
+        return replace(bundle, configuration=kept)
 
     def _about(self) -> dict[str, Any]:
         return {
@@ -137,7 +141,7 @@ class AgentFile:
             "kind": self.kind,
             "settings": dict(self.settings),
             "environment": self.environment,
-            "configuration": dict(self.configuration),
+            "configuration": as_kept(self.configuration),
             "card": dict(self.card),
             "versions": dict(self.versions),
         }

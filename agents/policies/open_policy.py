@@ -6,6 +6,7 @@ Stable-Baselines3's `save` writes), agent.onnx, or module:function.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import inspect
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 
 from agents.policies.policy import ACTOR, load_policy
 from agents.shipped import shipped, shipped_names
+from tuning.runs.inputs import found_again
 
 CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles
 
@@ -192,7 +194,8 @@ def described_checkpoint(text: str) -> LoadedPolicy:
         return LoadedPolicy(text, None)
     run = checkpoint.read_run(Path(text))
     card = {"trained": f"{run['algorithm']}, {run['timesteps']} steps", "seeds": {"training": run["run"]["seed"]}}
-    return LoadedPolicy(text, None, run["environment"], run["configuration"], card)
+    configuration = found_again(run["configuration"], run.get("inputs"), Path(text).parent, alone=True)
+    return LoadedPolicy(text, None, run["environment"], configuration, card)
 
 
 def _checkpoint(text: str, trust: bool) -> LoadedPolicy:
@@ -227,6 +230,18 @@ def find_object(text: str) -> Any:
         functions = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]
         raise PolicyNotFoundError(f"{text}: {module} has no {name!r}; it has {', '.join(functions) or 'nothing'}")
     return getattr(found, name)
+
+
+def source_of(text: str) -> str:
+    """Return the hash of the file that holds module:function, "" for what is none or has no file; as `find_object`.
+
+    What the module itself imports is not in it.
+    """
+    if ":" not in text:
+        return ""
+    found = sys.modules[getattr(find_object(text), "__module__", text.partition(":")[0])]
+    path = getattr(found, "__file__", None)
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else ""
 
 
 def _callable(text: str) -> LoadedPolicy:

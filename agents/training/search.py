@@ -8,6 +8,7 @@ run changes none of them.
 from __future__ import annotations
 
 import copy
+import math
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,9 +20,10 @@ import yaml
 
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
-from agents.training.train import DivergedError, train
+from agents.training.train import DivergedError, train, with_inputs
 from agents.training.training_run import TrainingRun
 from drive_env.whole_file import write_whole
+from tuning.runs.inputs import as_kept, found_in, inputs_in, table_of, write_inputs
 from tuning.runs.provenance import check_study
 
 if TYPE_CHECKING:
@@ -122,11 +124,12 @@ def search(
 
     Raises:
         DivergedError: If no training at all gave an agent.
-        ValueError: For a study that was begun with other sources.
+        ValueError: For a study that was begun with other sources, hyper-parameters or files.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    study = _Study(TrainingRun(environment, algorithm, hyperparameters), folder, seed, episodes, told)
+    base = with_inputs(TrainingRun(environment, algorithm, hyperparameters))
+    study = _Study(base, folder, seed, episodes, told)
     for first in range(0, trials, ROUND):
         _make_round(study, min(ROUND, trials - first), pool)
     return study.best()
@@ -145,7 +148,7 @@ def _make_round(study: _Study, count: int, pool: Pool | None) -> None:
         else:
             begun = [study.begin(known, writes_there=pool.shares_disk) for _ in range(count)]
             waiting = [trial for trial, _ in begun]
-            for scored in _in_turn(pool.unordered(_trained, [task for _, task in begun])):
+            for scored in _in_turn(pool.unordered(_trained, [task for _, task in begun], fits=_is_score)):
                 study.end(waiting[0], scored)
                 del waiting[0]
     except (Exception, KeyboardInterrupt):
@@ -166,7 +169,11 @@ class _Study:
         storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
         name = f"{base.environment} {base.algorithm}"
         self._study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        check_study(self._study, folder / JOURNAL, "give another --out")
+        inputs = inputs_in(base.hyperparameters)
+        subject = [f"{name} = {value}" for name, value in as_kept(base.hyperparameters).items()]
+        subject += [f"episodes = {episodes}", *table_of(inputs)]
+        check_study(self._study, folder / JOURNAL, "give another --out", "\n".join(subject))
+        write_inputs(folder, inputs)
         self._states = optuna.trial.TrialState
 
     def known(self) -> Any:
@@ -205,7 +212,8 @@ class _Study:
         found = self._study.tell(trial, scored.score, state=state)
         best = self._study.best_trial if self._completed() else None
         if best is not None:
-            _write(self._folder / BEST, self._base.environment, self._drawn(best), self._study, best)
+            found_best = found_in(self._drawn(best), self._folder)
+            _write(self._folder / BEST, self._base.environment, found_best, self._study, best)
         if self._told is not None:
             last = SearchTrial(found.number, found.value, found.params)
             self._told(last, None if best is None else SearchTrial(best.number, best.value, best.params))
@@ -266,6 +274,11 @@ def _trained(task: _TrainingTask) -> _Scored:
             score = mean if found.lower_is_better[found.score] else -mean
         paths = [] if task.folder is not None else [path for path in folder.rglob("*") if path.is_file()]
         return _Scored(score, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
+
+
+def _is_score(_: _TrainingTask, scored: Any) -> bool:
+    """Return whether something is what `_trained` returns."""
+    return isinstance(scored, _Scored) and (scored.score is None or math.isfinite(scored.score))
 
 
 def _in_turn(results: Iterator[tuple[int, _Scored]]) -> Iterator[_Scored]:

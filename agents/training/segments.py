@@ -26,6 +26,7 @@ from agents.training.training_run import (
     segment_seed,
 )
 from agents.training.training_table import TrainingTable
+from tuning.runs.inputs import as_kept, hashes, inputs_in
 from tuning.runs.provenance import SOURCES
 
 ROWS = 200  # of the table, about
@@ -101,9 +102,10 @@ class Segments(BaseCallback):  # type: ignore[misc]
             {
                 "algorithm": self._run.algorithm,
                 "environment": self._run.environment,
-                "configuration": configuration_of(self._lanes),
+                "configuration": as_kept(configuration_of(self._lanes)),
                 "timesteps": self.num_timesteps,
-                "run": plain(asdict(self._run)),
+                "run": as_kept(plain(asdict(self._run))),
+                "inputs": hashes(inputs_in(self._run.hyperparameters)),
                 "sources": SOURCES,
             },
         )

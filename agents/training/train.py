@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
+import shutil
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -28,6 +29,8 @@ from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, sched
 from agents.training.networks import bundle_of
 from agents.training.tasks import configuration_of, make_environments
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, Progress, Report, TrainingRun, segment_seed
+from tuning.runs.inputs import FOLDER as INPUTS
+from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in, taken_options, write_inputs
 from tuning.runs.provenance import check_begun
 
 logger = logging.getLogger(__name__)
@@ -48,7 +51,8 @@ def train(
 ) -> AgentFile:
     """Train an agent and return it.
 
-    The folder gets agent.npz, checkpoint.zip, training.csv, its picture learning_curve.png, and TensorBoard's files.
+    The folder gets agent.npz, checkpoint.zip, training.csv, its picture learning_curve.png, TensorBoard's files, and
+    in inputs/ the files of its user that it needs.
 
     Args:
         run: What is trained; with `resume` None of it is used but the folder's own.
@@ -75,6 +79,8 @@ def train(
         run = run_to_resume(folder)
         checkpoint.check_trust(path, trust)
         check_begun(path, checkpoint.read_run(path).get("sources"), "begin a new run")
+    else:
+        run = with_inputs(run)
     threads = torch.get_num_threads()
     torch.set_num_threads(run.torch_threads)
     lanes, env = make_env(run)
@@ -87,6 +93,8 @@ def train(
             if run.hyperparameters.get("imitate"):
                 _imitate(run, model, lanes, report)
         folder.mkdir(parents=True, exist_ok=True)
+        if not resume:
+            write_inputs(folder, inputs_in(run.hyperparameters))
         model.set_logger(configure(str(folder), ["tensorboard"]))
         segments = Segments(run, folder, lanes, normaliser, report, resume)
         if resume:
@@ -129,11 +137,19 @@ def _without_tracebacks_of_threads() -> Iterator[None]:
         threading.excepthook = before
 
 
+def with_inputs(run: TrainingRun) -> TrainingRun:
+    """Return a run with the content of its user's files in place of the paths in its environment's options."""
+    given = run.hyperparameters
+    options = taken_options(given.get("env_kwargs") or {})
+    return replace(run, hyperparameters={**given, "env_kwargs": options}) if inputs_in(options) else run
+
+
 def clear(folder: str | Path) -> None:
     """Delete what a run has written that was ended before its first checkpoint: nothing can go on with it."""
     folder = Path(folder)
     for path in (folder / TABLE, *folder.glob("events.out.tfevents.*")):
         path.unlink(missing_ok=True)
+    shutil.rmtree(folder / INPUTS, ignore_errors=True)
     with suppress(OSError):  # not there, or something of the user's in it
         folder.rmdir()
 
@@ -143,25 +159,30 @@ def run_to_resume(folder: str | Path) -> TrainingRun:
 
     Raises:
         CheckpointError: If it holds none.
+        InputError: If a file of its user is missing there, or was changed.
     """
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise checkpoint.CheckpointError(
             f"there is no file {path} to continue from: a run writes its first one after a tenth of its steps"
         )
-    return _run_of(checkpoint.read_run(path), path)
+    table = checkpoint.read_run(path)
+    found_again(table["run"], table.get("inputs"), path.parent)  # all of them are needed
+    return _run_of(table, path)
 
 
 def agent_of(model: Any, normaliser: Any, run: TrainingRun, configuration: Mapping[str, Any]) -> AgentFile:
     """Return a trained model as a bundle with what is known of the run on its card."""
     card = {
         "trained": f"{run.algorithm} of Stable-Baselines3, preset {run.preset}, {model.num_timesteps} steps",
-        "distribution": plain(configuration.get("distributions")) or "the environment's own",
+        "distribution": plain(as_kept(configuration.get("distributions"))) or "the environment's own",
         "seeds": {"training": run.seed},
-        "hyperparameters": plain(run.hyperparameters),
+        "hyperparameters": plain(as_kept(run.hyperparameters)),
         "figures": {},
-        "limits": [f"trained on the load {configuration.get('load')!r} alone"],
+        "limits": [f"trained on the load {as_kept(configuration.get('load'))!r} alone"],
     }
+    if inputs := inputs_in(configuration):
+        card["inputs"] = hashes(inputs)
     return bundle_of(model, normaliser, environment=run.environment, configuration=configuration, card=card)
 
 
@@ -173,13 +194,14 @@ def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> AgentFile:
     """
     table = checkpoint.read_run(Path(path))
     model, normaliser = checkpoint.load(Path(path), trust=trust)
-    return agent_of(model, normaliser, _run_of(table, Path(path)), table["configuration"])
+    configuration = found_again(table["configuration"], table.get("inputs"), Path(path).parent, alone=True)
+    return agent_of(model, normaliser, _run_of(table, Path(path)), configuration)
 
 
 def _run_of(table: Mapping[str, Any], path: Path) -> TrainingRun:
-    """Return the run that a checkpoint tells of."""
+    """Return the run that a checkpoint tells of, with the files of its user that its folder has."""
     try:
-        return TrainingRun(**table["run"])
+        return TrainingRun(**found_again(table["run"], table.get("inputs"), path.parent, alone=True))
     except TypeError as error:
         raise checkpoint.CheckpointError(f"{path} is not a checkpoint of this drive-agent: {error}") from None
 

@@ -20,6 +20,7 @@ from tuning.certificate.certificate import (
 )
 from tuning.response.linear_model import OPEN_LOOPS
 from tuning.response.margins import Margins, margins
+from tuning.runs.inputs import hashes
 from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
         seed=seed,
         envelope=envelope(target),
         axes=axes,
-        versions=versions(),
+        versions=versions() | hashes(target.inputs),
     )
 
 

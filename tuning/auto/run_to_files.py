@@ -35,7 +35,7 @@ def auto_to_files(target: Target, folder: Path, progress: Progress, *, seed: int
 
     return auto(
         target, folder / BEFORE, seed=seed, keep=keep, progress=progress,
-        files=lambda result: certificate_files(certificate(target, result, seed), folder),
+        files=lambda result: certificate_files(certificate(target, result, seed), folder, target.inputs),
     )  # fmt: skip
 
 

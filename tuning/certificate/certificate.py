@@ -159,7 +159,7 @@ class Certificate:
         seed: Of everything random.
         envelope: Limits during the tuning: name with unit -> value, e.g. "speed [rad/s]", "travel low [rad]".
         axes: One entry per axis.
-        versions: Of the packages that computed it.
+        versions: Of the packages that computed it, and the hash of each of its user's files that it is of.
         created: When [ISO 8601, UTC].
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from drive_env.whole_file import content_hash, files_to_be
 from mechanics.untrusted import parse_json, read_text
 from tuning.certificate.certificate import FORMAT, HASH, STEPPER_FORMAT, Certificate, CertificateError, Floats
 from tuning.certificate.report import html_is_unchanged, to_html
+from tuning.runs.inputs import Input, write_inputs
 
 
 def save_certificate(certificate: Certificate, folder: str | Path) -> tuple[Path, Path]:
@@ -24,12 +25,15 @@ def save_certificate(certificate: Certificate, folder: str | Path) -> tuple[Path
 
 
 @contextmanager
-def certificate_files(certificate: Certificate, folder: str | Path) -> Iterator[tuple[Path, Path]]:
-    """Write certificate.json and report.html before a block runs; they are removed again if it fails.
+def certificate_files(
+    certificate: Certificate, folder: str | Path, inputs: Iterable[Input] = ()
+) -> Iterator[tuple[Path, Path]]:
+    """Write certificate.json, report.html and inputs/ before a block runs; the first two are removed if it fails.
 
     Raises:
         OSError: If they cannot be written, with the file and the reason.
     """
+    write_inputs(Path(folder), inputs)
     told, report = Path(folder) / "certificate.json", Path(folder) / "report.html"
     with files_to_be({told: certificate.to_json(), report: to_html(certificate)}):
         yield told, report

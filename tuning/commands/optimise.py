@@ -109,7 +109,8 @@ def optimise(
 
     An axis that oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best
     gains. Writes trials.csv, trials.png and settings.toml, with which `drive-tune optimise --config settings.toml`
-    repeats the search, and on a bus OUT-before.toml, with which `drive-tune undo` restores the state before.
+    repeats the search (files of your own are copied to inputs/ beside it), and on a bus OUT-before.toml, with which
+    `drive-tune undo` restores the state before.
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
@@ -127,6 +128,8 @@ def optimise(
         from tuning.runs import provenance
         from tuning.search.optimise import Settings
 
+        drive.check()
+        given, drive = drive, drive.with_inputs()
         folder = provenance.run_folder("optimise") if out is None else out
         if resume:
             _check_unfinished(folder, journal)
@@ -144,10 +147,11 @@ def optimise(
             safe=drive.bus if safe is None else safe,
             seed=drive.seed,
             journal=journal,
+            subject=_subject(drive),
             **({} if width is None else {"width": width}),
         )
         if drive.bus:
-            _on_bus(drive, settings, folder, json)
+            _on_bus(given, drive, settings, folder, json)
         else:
             _on_machine(drive, settings, copies, searches, folder, workers, cluster, resume, json)
 
@@ -165,6 +169,7 @@ def _on_machine(
 ) -> None:
     """Search on an emulated machine, write and print what was found."""
     from tuning.runs import unfinished
+    from tuning.runs.inputs import as_kept
 
     machine = drive.machine() | {"num_machines": copies}
     options = _named(drive) | {"load": drive.load, "copies": copies, "searches": searches}
@@ -175,25 +180,36 @@ def _on_machine(
             kept = what_an_interrupt_leaves(folder) if settings.journal is None else _kept_in(settings.journal)
             fail(kept, INTERRUPTED)
         _save(found, settings, folder, options)
-    _report(found, settings, folder, None, f"an emulated {drive.load}", options, json)
+    _report(found, settings, folder, None, f"an emulated {as_kept(drive.load)}", options, json)
     unfinished.discard(folder)
 
 
-def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
-    """Search on the drives of a bus, write and print what was found."""
+def _on_bus(given: DriveOptions, drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
+    """Search on the drives of a bus, write and print what was found.
+
+    They are opened as they were given: the state before names their device for whoever undoes this another day.
+    """
     from tuning.snapshot import file_before
     from tuning.way_back import way_back
 
     before = file_before("optimise", folder)
     try:
-        with way_back(before, "drive-tune"), drive.open() as target:
-            given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
-            options = _named(drive) | given | {key: value for key, value in target.bus.items() if key != "axes"}
+        with way_back(before, "drive-tune"), given.open() as target:
+            bus = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
+            options = _named(drive) | bus | {key: value for key, value in target.bus.items() if key != "axes"}
             found = _search_bus(target, settings, before, folder, options)
     except KeyboardInterrupt:
         lost = "interrupted; the trials made so far are lost: on a bus they are kept only with --journal FILE"
         fail(lost if settings.journal is None else _kept_in(settings.journal), INTERRUPTED)
     _report(found, settings, folder, before, "the bus", options, json)
+
+
+def _subject(drive: DriveOptions) -> str:
+    """Return what a journal is of: the drive, and a machine's load, with what files of the user hold."""
+    from tuning.runs.inputs import as_kept, table_of
+
+    named = _named(drive) | ({} if drive.bus else {"load": drive.load})
+    return "\n".join([*(f"{name} = {value}" for name, value in as_kept(named).items()), *table_of(drive.inputs())])
 
 
 def _named(drive: DriveOptions) -> dict[str, Any]:
@@ -213,14 +229,18 @@ def _search_machine(
 ) -> Any:
     """Search on an emulated machine; return all searches as one."""
     from tuning.runs import provenance, unfinished
+    from tuning.runs.inputs import inputs_in, table_of
     from tuning.runs.pools import open_pool
     from tuning.search import searches
+    from tuning.toml_tables import toml
 
     shards = searches.searches(machine, settings, count)
-    versions = "".join(f"{name} = {version}\n" for name, version in provenance.versions().items())
+    inputs = inputs_in(machine)
+    versions = "".join(f"{name} = {toml(version)}\n" for name, version in provenance.versions().items())
+    described = searches.description(shards) + versions + "\n".join(table_of(inputs)) + "\n"
     what = f"{settings.trials} trials by {settings.sampler}" + (f", {count} times" if count > 1 else "")
     with (
-        unfinished.shard_log(folder, searches.description(shards) + versions, resume=resume) as log,
+        unfinished.shard_log(folder, described, resume=resume, inputs=inputs) as log,
         open_pool(workers, cluster) as pool,
     ):
         if log.done or unfinished.has_parts(log):
@@ -295,11 +315,13 @@ def _report(
     from dataclasses import asdict
 
     if json:
+        from tuning.runs.inputs import as_kept
+
         print_json(
             {
                 "gains": found.gains.tolist(), "rule": found.rule.tolist(), "cost": found.cost.tolist(),
                 "drive_seconds": found.drive_seconds, "aborts": int(found.aborts.sum()), "notes": list(found.notes),
-                "settings": asdict(settings), "machine": options, "folder": str(folder),
+                "settings": asdict(settings), "machine": as_kept(options), "folder": str(folder),
                 "before": str(before) if before else None,
             }
         )  # fmt: skip

@@ -7,10 +7,10 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self, get_type_hints
 
 import typer
 
@@ -30,6 +30,7 @@ from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
 
 if TYPE_CHECKING:
+    from tuning.runs.inputs import Input
     from tuning.snapshot import Transaction
     from tuning.target import Target
 
@@ -138,6 +139,23 @@ class DriveOptions:
         from drive_env.devices import find_device
 
         return find_device(self.device).default_motor if self.motor is None else self.motor
+
+    def with_inputs(self) -> Self:
+        """Return the options with the content of the user's files in place of their paths.
+
+        Raises:
+            ValueError: If one cannot be read, as `inputs.taken` says it.
+        """
+        from tuning.runs.inputs import taken_options
+
+        names = {"device": self.device, "motor": self.motor}
+        return replace(self, **taken_options(names if self.bus else names | {"load": self.load}))
+
+    def inputs(self) -> list[Input]:
+        """Return the user's files that the options have taken."""
+        from tuning.runs.inputs import inputs_in
+
+        return inputs_in([self.device, self.motor, self.load])
 
     def check(self) -> None:
         """Raise ValueError for a number that cannot be, or a drive of which too little is known."""
@@ -308,8 +326,9 @@ def open_target(drive: DriveOptions) -> Target:
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     drive.check()
+    inputs = tuple(drive.with_inputs().inputs())  # opened as given: the state before names the device for `undo`
     if not drive.bus:
-        return emulated(**drive.machine())
+        return replace(emulated(**drive.machine()), inputs=inputs)
     if drive.travel is None:
         raise ValueError("--travel is missing: give how far the motor may turn, LOW:HIGH in turns, or free")
     options: dict[str, Any] = {} if drive.bitrate is None else {"bitrate": drive.bitrate}
@@ -317,7 +336,7 @@ def open_target(drive: DriveOptions) -> Target:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
     # Two tuners take each other's answers, and the second would keep the first one's trial as the state before.
     refuse_other_masters(drive.interface, drive.channel, drive.nodes, drive.bitrate)
-    return on_bus(
+    target = on_bus(
         drive.device,
         drive.motor_name,
         interface=drive.interface,
@@ -329,6 +348,7 @@ def open_target(drive: DriveOptions) -> Target:
         chosen=drive.axis or None,
         **options,
     )
+    return replace(target, inputs=inputs)
 
 
 def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:

@@ -63,7 +63,8 @@ def rank(
 
     The robust cost counts speed, stiffness, noise, overshoot and robustness: the lower the better. It is given relative
         to that of the baseline rule with the true inertia, and machine by machine relative to the best other tuner.
-        Writes tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml. A stopped run continues with
+        Writes tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml, and copies files of your own
+        (suite, motors, loads) to inputs/. A stopped run continues with
         --out and --resume, with identical results; also with --workers and --cluster.
     """
     with errors_as_exit_codes():
@@ -77,13 +78,14 @@ def rank(
         folder = provenance.run_folder("rank") if out is None else out
         try:
             from tuning.compare.comparison_files import save
-            from tuning.compare.suite import load_suite
+            from tuning.compare.suite import load_suite, suite_input
 
             check_seed(seed)
             if trials is not None and trials < 1:
                 raise ValueError(f"--trials must be 1 or more, not {trials}")
             provenance.check_folder(folder)
             machines = load_suite(suite, seed if drawn else None, count)
+            suite = suite_input(suite)
             compared, left_out = _find_tuners(tuners, trials, slow)
             settings: dict[str, Any] = {
                 "suite": suite,
@@ -134,11 +136,12 @@ def _compare(
     from tuning.compare.comparison_files import settings_text
     from tuning.compare.suite import groups
     from tuning.runs import unfinished
+    from tuning.runs.inputs import inputs_in
     from tuning.runs.pools import open_pool
 
-    # The machines themselves, not the suite's name alone: its file may have been edited since.
+    # The machines themselves, too: they are what is tuned.
     run_text = settings_text({**settings, "machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
-    with unfinished.shard_log(folder, run_text, resume=resume) as log:
+    with unfinished.shard_log(folder, run_text, resume=resume, inputs=inputs_in(settings)) as log:
         if log.done:
             steps = len(tuners) * len(groups(machines))
             print(f"note: continues a stopped run; {len(log.done)} of {steps} steps are done", file=sys.stderr)

@@ -55,8 +55,9 @@ def sweep(
     """Try a grid of gains, each on the same emulated machine with the same velocity and load torque step.
 
     Prints the best and writes results.csv, heatmap.png, best_response.png and settings.toml, with which `drive-tune
-    sweep --config settings.toml` repeats the run to the last digit. A stopped run continues with --out and --resume,
-    with identical results.
+    sweep --config settings.toml` repeats the run to the last digit: files of your own (motor, load, device) are copied
+    to inputs/ beside it. A stopped run continues with --out and --resume, with identical results, and only with the
+    files as they were.
     """
     overrides: dict[str, Any] = {"device": device, "motor": motor, "load": load, "seed": seed}
     with errors_as_exit_codes():
@@ -108,11 +109,11 @@ def _sweep(
     provenance.check_folder(folder)
     if config is None and resume and not any(value is not None for value in overrides.values()):
         config = unfinished.settings_of(folder)
-    experiment = load_experiment(config, **overrides)
+    experiment = load_experiment(config, **overrides).with_inputs()
     for line in provenance.differences(experiment.versions):
         _note(console, line)
     settings = provenance.HEADER + experiment.to_toml(provenance.versions())
-    with unfinished.shard_log(folder, settings, resume=resume) as log:
+    with unfinished.shard_log(folder, settings, resume=resume, inputs=experiment.inputs()) as log:
         if log.done:
             _note(console, f"continues a stopped run; {len(log.done)} shards are done")
         with open_pool(workers, cluster) as pool:
@@ -131,6 +132,7 @@ def _note(console: Any, text: str) -> None:
 
 def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folder: Path) -> Any:
     from tuning.runs import unfinished
+    from tuning.runs.inputs import forget_copies
     from tuning.runs.sweep import run
 
     texts = {
@@ -149,6 +151,7 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
     def stop(*_: object) -> None:
         # Not by an exception: raised while the compiler calls back into Python it would be printed and lost.
         console.show_cursor(True)
+        forget_copies()
         if not log.holds_results:
             unfinished.discard(folder)
         print(f"\ndrive-tune: {what_an_interrupt_leaves(folder)}", file=sys.stderr, flush=True)

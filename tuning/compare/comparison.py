@@ -32,6 +32,7 @@ from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.outcome import Outcome, Tuner
+from tuning.runs.inputs import taken_options
 from tuning.runs.shard_log import ShardLog
 from tuning.search.trial_bench import read_gains
 from tuning.target import Target
@@ -230,10 +231,19 @@ def _elsewhere(
     say: Callable[[int], None],
 ) -> Iterator[tuple[int, list[MachineRow]]]:
     """Give the number and the rows of each task as it comes back."""
+    machines = [
+        replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor})) for one in machines
+    ]
     items = [_GroupTask([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
-    for place, text in pool.unordered(_run, items):
+    for place, text in pool.unordered(_run, items, fits=_is_of):
         say(left[place])
         yield left[place], _rows_of(text)
+
+
+def _is_of(task: _GroupTask, text: Any) -> bool:
+    """Return whether a text has the rows of a tuner on a group."""
+    rows = [(row.tuner, row.machine) for row in _rows_of(text)]
+    return rows == [(task.tuner, machine.name) for machine in task.group]
 
 
 def _text_of(rows: Sequence[MachineRow]) -> str:

@@ -11,21 +11,24 @@ from drive_env.whole_file import write_table, write_whole
 from tuning.compare.against_best import RivalRow, all_rivals
 from tuning.compare.comparison import Comparison, MachineRow, TunerRow
 from tuning.compare.comparison_picture import draw
+from tuning.runs.inputs import as_kept, inputs_in, table_of, write_inputs
 from tuning.toml_tables import toml
 
 
 def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml into a folder that exists."""
+    """Write tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml and inputs/ into a folder there is."""
     _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
     _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
     _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
+    write_inputs(folder, inputs_in(settings))
     write_whole(folder / "settings.toml", settings_text(settings))
     draw(comparison, folder / "comparison.png")
 
 
 def settings_text(settings: Mapping[str, Any]) -> str:
-    """Return settings as TOML; what is None is left out."""
-    return "".join(f"{name} = {_toml(value)}\n" for name, value in settings.items() if value is not None)
+    """Return settings as TOML, with the hashes of the inputs among them; what is None is left out."""
+    lines = [f"{name} = {_toml(as_kept(value))}" for name, value in settings.items() if value is not None]
+    return "\n".join([*lines, *table_of(inputs_in(settings))]) + "\n"
 
 
 def _toml(value: Any) -> str:

@@ -1,7 +1,8 @@
 """The machines that tuners are compared on: a public part in a TOML file, and one that is drawn for a seed.
 
 A suite is a file of `suites/`, or your own: tables of machines, one per load and motor, and which loads and motors the
-drawn part turns. A machine is known by its name: it is the same whatever else is opened beside it.
+drawn part turns. Paths in it are relative to it. A machine is known by its name: it is the same whatever else is opened
+beside it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from mechanics.loads import find_load
 from mechanics.shaft import one, way
 from mechanics.untrusted import read_toml
 from tuning.identify.linked_axes import are_linked
+from tuning.runs.inputs import files_of, is_path, is_shipped, taken
 from tuning.target import Target
 from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
 
@@ -68,6 +70,27 @@ class SuiteMachine:
         return self.device, self.load, self.motor, self.friction
 
 
+def suite_input(name: str) -> str:
+    """Return a suite's name as it is, or an `Input` of its file and all that its machines name; raises as `taken`."""
+    if not is_path("suite", name):
+        return name
+    named = [one for what, place in _own_names(Path(name)) for one in files_of(what, place)]
+    found: str = taken("suite", name, named)
+    return found
+
+
+def _own_names(path: Path) -> list[tuple[str, Path]]:
+    """Return the paths among a suite's names: device, motor or load, and where it is; raises as `load_suite` does."""
+    table = _read(path)
+    rows = [row for row in table.get("group", []) if isinstance(row, dict)]
+    found = [("device", table.get("device")), *((what, row.get(what)) for row in rows for what in ("motor", "load"))]
+    for row in table.get("generated", []):
+        pairs = row.get("groups", []) if isinstance(row, dict) else []
+        found += [("motor", pair[1]) for pair in pairs if isinstance(pair, list) and len(pair) == 2]
+    named = [(what, _located(what, name, path.parent)) for what, name in found if isinstance(name, str)]
+    return [(what, place) for what, place in named if place is not None]
+
+
 def suite_names() -> list[str]:
     """Return the names of the suites that ship."""
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
@@ -87,20 +110,15 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
         ExperimentError: For a suite, key, name or number that is none, naming those that are.
     """
     path = _path(name_or_path)
-    try:
-        table = read_toml(path)
-    except OSError as error:
-        raise ExperimentError(f"cannot read the suite {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ExperimentError(f"{path} is not TOML: {error}") from error
+    table = _read(path)
     where = path.name
     check_keys(where, table, ["device", "group", "generated"], optional=("generated", "group"))
-    device = as_value(f"{where}: device", table["device"], "str")
+    device = _named("device", as_value(f"{where}: device", table["device"], "str"), path.parent)
     machines: list[SuiteMachine] = []
     for row in table.get("group", []):
-        machines += _group(where, device, as_table(f"{where}: group", row))
+        machines += _group(where, device, as_table(f"{where}: group", row), path.parent)
     if seed is not None:
-        machines += _generated(f"{where}: generated", device, table.get("generated", []), seed)
+        machines += _generated(f"{where}: generated", device, table.get("generated", []), seed, path.parent)
     if not machines:
         raise ExperimentError(f"{where}: it has no machine; add a [[group]], or [[generated]] and a seed")
     _check_names(where, machines)
@@ -184,11 +202,39 @@ def _names() -> str:
     return ", ".join(suite_names())
 
 
-def _group(where: str, device: str, row: dict[str, Any]) -> list[SuiteMachine]:
-    """Return the machines of a table whose columns they are."""
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return read_toml(path)
+    except OSError as error:
+        raise ExperimentError(f"cannot read the suite {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ExperimentError(f"{path} is not TOML: {error}") from error
+
+
+def _located(what: str, name: str, folder: Path) -> Path | None:
+    """Return where a name that is a path, which is relative to the suite's file, lies; None for other names."""
+    return folder / name if is_path(what, str(folder / name)) and not is_shipped(what, name) else None
+
+
+def _named(what: str, name: str, folder: Path) -> str:
+    """Return what a name of a suite stands for; of a path its content, which goes wherever the machine goes."""
+    try:
+        return name if (place := _located(what, name, folder)) is None else taken(what, place)
+    except ValueError as error:
+        raise ExperimentError(str(error)) from None
+
+
+def _stem(load: str, motor: str) -> str:
+    """Return load and motor for a machine's name, from which it draws: of paths the files' names, wherever they lie."""
+    return "-".join(Path(name).stem if name.endswith((".toml", ".xml", ".mjcf")) else name for name in (load, motor))
+
+
+def _group(where: str, device: str, row: dict[str, Any], folder: Path) -> list[SuiteMachine]:
+    """Return the machines of a table whose columns they are; its paths are relative to the folder."""
     check_keys(f"{where}: group", row, list(_GROUP), optional=("friction", "travel"))
-    load, motor = (as_value(f"{where}: {key}", row[key], "str") for key in ("load", "motor"))
-    stem = f"{load}-{motor}"
+    names = {key: as_value(f"{where}: {key}", row[key], "str") for key in ("load", "motor")}
+    stem = _stem(*names.values())
+    load, motor = (_named(key, name, folder) for key, name in names.items())
     where = f"{where}: {stem}"
     friction = as_value(f"{where}: friction", row.get("friction", FRICTION), "str")
     known = _checked_defaults(where, device, load, motor)
@@ -266,7 +312,7 @@ def _spread(machines: Sequence[SuiteMachine], count: int) -> tuple[SuiteMachine,
 
 
 # --- drawing ----------------------------------------------------------------------------------------------------------
-def _generated(where: str, device: str, tables: Any, seed: int) -> list[SuiteMachine]:
+def _generated(where: str, device: str, tables: Any, seed: int, folder: Path) -> list[SuiteMachine]:
     """Return the machines that are drawn for a seed; one that its motor cannot move is drawn again."""
     if seed < 0:
         raise ExperimentError(f"seed must be 0 or more, not {seed}")
@@ -283,7 +329,7 @@ def _generated(where: str, device: str, tables: Any, seed: int) -> list[SuiteMac
         first = len(machines)
         for k in range(count):
             load, motor = pairs[k % len(pairs)]
-            machines.append(_draw(where, device, load, motor, seed, first + k))
+            machines.append(_draw(where, device, load, _named("motor", motor, folder), seed, first + k))
     return machines
 
 
@@ -299,7 +345,7 @@ def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int
         drawn = laws.draw(rng, known)
         supply = drawn.pop(_SUPPLY, known[_SUPPLY])
         if _sound(device, load, motor, drawn):
-            return SuiteMachine(f"seed{seed}-{number:02d}-{load}-{motor}", device, load, motor, drawn, supply)
+            return SuiteMachine(f"seed{seed}-{number:02d}-{_stem(load, motor)}", device, load, motor, drawn, supply)
     raise ExperimentError(
         f"{where}: {_TRIES} draws of {load!r} gave no machine that {motor!r} can move; choose a stronger motor"
     )

@@ -25,6 +25,7 @@ from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
+from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, taken
 from tuning.runs.metrics import TRACKING, combined_of, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
@@ -35,12 +36,13 @@ CLOSED_LOOPS = {  # of those that may close one, by its kind
     LOAD_ANGLE: Path(__file__).parent / "closed_loop_sweep.toml",
     PID_ON_RAMP: Path(__file__).parent / "pid_sweep.toml",
 }
-MAX_POINTS = 262_144
+MAX_POINTS = 4_194_304  # whose table takes 1 GB of memory
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
 TARGET_VELOCITY, ACCELERATION = (cia402.TARGET_VELOCITY, 0), (cia402.PROFILE_ACCELERATION, 0)
 _INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})h?:(?:0x)?([0-9a-f]{1,2})h?", re.IGNORECASE)
 _SPACINGS = ("lin", "log")
+_NAMES = ("device", "motor", "load")  # which may be paths
 _PAIRS = (("velocity_rpm", "velocity_pps"), ("acceleration_rpm_per_s", "acceleration_pps2"))
 
 
@@ -105,10 +107,13 @@ class Experiment:
     metric: MetricChoice
     versions: Mapping[str, str] = field(default_factory=dict)
 
-    def points(self) -> NDArray[np.int64]:
-        """Return the grid, shape (points, objects), the last object changing fastest."""
-        axes = np.meshgrid(*(swept.values() for swept in self.sweep), indexing="ij")
-        return np.stack([axis.ravel() for axis in axes], axis=1)
+    def points(self, first: int = 0, last: int | None = None) -> NDArray[np.int64]:
+        """Return the grid, or its points from the first to before the last, shape (points, objects).
+
+        The last object changes fastest.
+        """
+        numbers = np.unravel_index(np.arange(first, self.size() if last is None else last), self.shape())
+        return np.stack([swept.values()[own] for swept, own in zip(self.sweep, numbers, strict=True)], axis=1)
 
     def shape(self) -> tuple[int, ...]:
         """Return the number of values of each object."""
@@ -118,9 +123,21 @@ class Experiment:
         """Return the number of points."""
         return math.prod(self.shape())
 
+    def with_inputs(self) -> Experiment:
+        """Return the experiment with the content of its user's files in place of their paths.
+
+        Raises:
+            ValueError: If one cannot be read, as `inputs.taken` says it.
+        """
+        return replace(self, **{name: taken(name, getattr(self, name)) for name in _NAMES})
+
+    def inputs(self) -> list[Input]:
+        """Return the files of its user that it has taken."""
+        return inputs_in([getattr(self, name) for name in _NAMES])
+
     def to_toml(self, versions: Mapping[str, str]) -> str:
-        """Return the experiment as TOML, with the versions of what ran it."""
-        lines = [f"{name} = {toml(getattr(self, name))}" for name in ("device", "motor", "load", "seed")]
+        """Return the experiment as TOML: where a run's folder has its inputs, and the versions of what ran it."""
+        lines = [f"{name} = {toml(as_kept(getattr(self, name)))}" for name in (*_NAMES, "seed")]
         for swept in self.sweep:
             lines += ["", "[[sweep]]", *toml_lines(swept)]
         lines += ["", "[excitation]", *toml_lines(self.excitation)]
@@ -128,6 +145,7 @@ class Experiment:
         if self.metric.weights:
             weights = ", ".join(f"{name} = {toml(weight)}" for name, weight in self.metric.weights.items())
             lines.append(f"weights = {{ {weights} }}")
+        lines += table_of(self.inputs())
         if versions:
             lines += ["", "[versions]", *(f"{json.dumps(k)} = {toml(v)}" for k, v in versions.items())]
         return "\n".join(lines) + "\n"
@@ -170,7 +188,14 @@ def load_experiment(
         raise ExperimentError(
             f"{path} is not valid TOML: {error}; compare it with drive-tune sweep --show-config"
         ) from None
+    inputs = data.pop("inputs", {})
     written = _parse(data)
+    try:
+        written = replace(
+            written, **{name: found_again(getattr(written, name), inputs, path.parent) for name in _NAMES}
+        )
+    except ValueError as error:
+        raise ExperimentError(str(error)) from None
     experiment = replace(written, **{key: value for key, value in overrides.items() if value is not None})
     if path == DEFAULT and config is None and experiment.device != written.device:
         experiment = replace(experiment, sweep=_same_gains(written, experiment.device))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mechanics.loads import find_load
 from tuning.runs import metrics
 from tuning.runs.experiment import SweptObject
+from tuning.runs.inputs import as_kept
 from tuning.runs.metrics import MoveRecording
 
 if TYPE_CHECKING:
@@ -103,7 +104,8 @@ def _title(result: SweepResult) -> str:
     )
     first = "best" if np.isfinite(row[result.score_column]) else "no usable point; first"
     return (
-        f"{experiment.device}, {experiment.motor}, {experiment.load}, seed {experiment.seed}: "
+        f"{as_kept(experiment.device)}, {as_kept(experiment.motor)}, {as_kept(experiment.load)}, "
+        f"seed {experiment.seed}: "
         f"{len(result.order)} points\n{first}: {point}\n{figures}"
     )
 

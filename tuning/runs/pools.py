@@ -2,11 +2,13 @@
 
 A task is a function of a module, called with one item; what it returns must depend on the item alone, so that it
 matters to no result where and in which order tasks ran. Every task outside this process carries the hash of our sources
-and is refused by a worker that has others, whenever that worker came.
+and is refused by a worker that has others, whenever that worker came. It carries the content of its user's files as
+well (`inputs.Input`): a worker opens none of its own.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import multiprocessing
 import os
@@ -21,10 +23,11 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 from urllib.parse import parse_qsl
 
 from tuning.runs import provenance
+from tuning.runs.inputs import forget_copies
 
 Say = Callable[[str], None]
 Item = TypeVar("Item")
@@ -48,6 +51,10 @@ def _silent(_what: str) -> None:
     pass
 
 
+def _anything(_item: Any, _result: Any) -> bool:
+    return True
+
+
 class Pool(Protocol):
     """Somewhere for work to run."""
 
@@ -55,7 +62,11 @@ class Pool(Protocol):
     shares_disk: bool  # whether tasks can go on from files of this machine
 
     def unordered(
-        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        say: Say = _silent,
+        fits: Callable[[Item, Result], bool] = _anything,
     ) -> Iterator[tuple[int, Result]]:
         """Give the number of an item and its result as each is done.
 
@@ -63,6 +74,11 @@ class Pool(Protocol):
             function: Of a module.
             items: What it is called with.
             say: Called with what is waited for, "" when the work goes on; from any thread.
+            fits: Whether a result has the form of what is computed of an item; one from elsewhere that has not is
+                refused.
+
+        Raises:
+            PoolError: If a worker is lost, or gives back what is no result of its work; the message names it.
         """
 
     def differences(self) -> list[str]:
@@ -112,7 +128,11 @@ class _Here:
     shares_disk = True
 
     def unordered(
-        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        say: Say = _silent,
+        fits: Callable[[Item, Result], bool] = _anything,
     ) -> Iterator[tuple[int, Result]]:
         for k, item in enumerate(items):
             yield k, function(item)
@@ -130,15 +150,23 @@ class _Processes:
         self._again = again
 
     def unordered(
-        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        say: Say = _silent,
+        fits: Callable[[Item, Result], bool] = _anything,
     ) -> Iterator[tuple[int, Result]]:
-        checked = partial(_checked, provenance.SOURCES, function)
-        futures = {self._executor.submit(checked, item): k for k, item in enumerate(items)}
+        packed = [pickle.dumps((function, item)) for item in items]
+        futures = {self._executor.submit(_checked, provenance.SOURCES, work): k for k, work in enumerate(packed)}
         say(FIRST_RESULT)
         try:
             for future in as_completed(futures):
+                k = futures[future]
+                result = _result_of(
+                    future.result(), packed[k], partial(fits, items[k]), "a worker process", self._again
+                )
                 say("")
-                yield futures[future], future.result()
+                yield k, result
         except BrokenProcessPool:
             raise PoolError(
                 "a worker process ended unexpectedly, perhaps for lack of memory; take fewer --workers and "
@@ -157,29 +185,43 @@ class _Dask:
         self.width = width
         self._address = address
         self._again = again
+        self._told: set[str] = set()
 
     def unordered(
-        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        say: Say = _silent,
+        fits: Callable[[Item, Result], bool] = _anything,
     ) -> Iterator[tuple[int, Result]]:
         from concurrent.futures import CancelledError
 
         from distributed import as_completed as as_completed_there
         from distributed.scheduler import KilledWorker
 
+        packed = [pickle.dumps((function, item)) for item in items]
         # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
         futures = {
-            self._client.submit(pickle.loads, _call(_checked, provenance.SOURCES, function, item), pure=False): k
-            for k, item in enumerate(items)
+            self._client.submit(pickle.loads, _call(_checked, provenance.SOURCES, work), pure=False): k
+            for k, work in enumerate(packed)
         }
         say(FIRST_RESULT)
         try:
             with self._told_of_no_workers(say):
                 for future in as_completed_there(list(futures), loop=self._client.loop):
-                    result = future.result()
+                    k, answer = futures[future], future.result()
+                    who = self._holder(future)
+                    result = _result_of(answer, packed[k], partial(fits, items[k]), who, self._again)
+                    for line in self._unlike(who, answer.versions):
+                        logger.warning(line)
                     say("")
-                    yield futures[future], result
+                    yield k, result
                     future.release()
         except ImportError as error:
+            raise self._without_package(error) from None
+        except AttributeError as error:
+            if "Can't get attribute" not in str(error):  # pickle's, of what its version of our packages does not have
+                raise
             raise self._without_package(error) from None
         except KilledWorker as error:
             raise PoolError(f"workers of the cluster ended repeatedly: {error}; {self._again}") from None
@@ -194,6 +236,23 @@ class _Dask:
             f"{worker} of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs, "
             f"and {self._again}"
         )
+
+    def _holder(self, future: Any) -> str:
+        """Return which worker has a result, as the scheduler knows it."""
+        addresses = self._client.who_has([future]).get(future.key, ())
+        return f"worker {', '.join(addresses)}" if addresses else "a worker"
+
+    def _unlike(self, who: str, found: Mapping[str, Any]) -> list[str]:
+        """Return a line for each version that a worker has otherwise than this process, once."""
+        here = provenance.versions()
+        lines = [
+            f"{who} has {name} {version}, here it is {here.get(name)}: last digits may differ"
+            for name, version in found.items()
+            if here.get(name) != version
+        ]
+        new = [line for line in lines if line not in self._told]
+        self._told.update(new)
+        return new
 
     @contextmanager
     def _told_of_no_workers(self, say: Say) -> Iterator[None]:
@@ -226,20 +285,18 @@ class _Dask:
             ended.set()
 
     def differences(self) -> list[str]:
-        here, lines = provenance.versions(), set()
+        here, lines = provenance.versions(), []
         there: Mapping[str, Any] = self._client.run(pickle.loads, _call(_versions), on_error="return")
         for address, found in there.items():
             if isinstance(found, Exception):
                 raise self._without_package(found, f"worker {address}")
-            if found.get("sources") != here["sources"]:
+            if not isinstance(found, Mapping) or found.get("sources") != here["sources"]:
+                found = found if isinstance(found, Mapping) else {}
                 raise PoolError(
                     f"worker {address} has sources {found.get('sources', 'unknown')}, here they are {here['sources']}, "
                     "and results are not mixed: install the same files there and start it again"
                 )
-            for name, version in found.items():
-                if here.get(name) != version:
-                    lines.add(f"worker {address} has {name} {version}, here it is {here.get(name)}: last digits may "
-                              "differ")  # fmt: skip
+            lines += self._unlike(f"worker {address}", found)
         return sorted(lines)
 
 
@@ -330,13 +387,63 @@ def _call(function: Callable[..., Any], *arguments: Any) -> bytes:
     return pickle.dumps(_Call(function, *arguments))
 
 
-def _checked(sources: str, function: Callable[[Item], Result], item: Item) -> Result:
-    """Do a task on a worker, if its sources are those of the process that gives the work."""
+class _Answer(NamedTuple):
+    """What a worker gives back of a task: on which work, with which versions, and the result with its hash."""
+
+    work: str
+    versions: Mapping[str, str]
+    content: bytes
+    hash: str
+
+
+def _checked(sources: str, work: bytes) -> _Answer:
+    """Do a task on a worker, if its sources are those of the process that gives the work.
+
+    The work is unpickled after that: what other sources do not know cannot be.
+    """
     try:
         provenance.check_sources(sources)
     except ValueError as error:
         raise PoolError(str(error)) from None
-    return function(item)
+    try:
+        function, item = pickle.loads(work)
+    except OSError as error:  # a file of the user cannot be written there
+        raise PoolError(f"a worker cannot keep the files of a task: {error}; make room there") from None
+    content = pickle.dumps(function(item))
+    return _Answer(_sha256(work), provenance.versions(), content, _sha256(content))
+
+
+def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, again: str) -> Any:
+    """Return the result in an answer; PoolError, with who gave it, for one that is none of this work."""
+    wrong, result = _wrong_with(answer, work), None
+    if not wrong:
+        result = pickle.loads(answer.content)
+        try:
+            good = fits(result)
+        except Exception:  # whatever there is in its place
+            good = False
+        wrong = "" if good else f"a result of another form ({type(result).__name__})"
+    if wrong:
+        raise PoolError(
+            f"{who} gave back {wrong}, which is no result of its work and is not used: start it again with the same "
+            f"files installed as here, and {again}"
+        )
+    return result
+
+
+def _wrong_with(answer: Any, work: bytes) -> str:
+    """Return what an answer is in place of one on this work, "" if it is that."""
+    if not isinstance(answer, _Answer):
+        return "nothing" if answer is None else f"a value of type {type(answer).__name__}"
+    if answer.versions.get("sources") != provenance.SOURCES:
+        return f"a result of sources {answer.versions.get('sources', 'unknown')}"
+    if answer.work != _sha256(work):
+        return "a result of other work"
+    return "" if answer.hash == _sha256(answer.content) else "a result whose content does not match its hash"
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _versions() -> dict[str, str]:
@@ -356,5 +463,6 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
+        forget_copies()
         # At once: whoever waits in a queue that nobody fills any more would wait for ever.
         os._exit(1)

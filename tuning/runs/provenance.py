@@ -10,6 +10,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +56,29 @@ def check_begun(what: object, recorded: object, remedy: str) -> None:
         )
 
 
-def check_study(study: Any, file: Path, remedy: str) -> None:
-    """Have an Optuna study carry the hash of the sources; `check_begun` of one that has trials already."""
+def check_study(study: Any, file: Path, remedy: str, subject: str = "") -> None:
+    """Have an Optuna study carry the hash of the sources and its subject; check those of one that has trials already.
+
+    Args:
+        study: The study.
+        file: Its journal.
+        remedy: What else its user can do.
+        subject: What its trials are of, as lines of text: trials of something else are not comparable.
+
+    Raises:
+        ValueError: If it was begun with other sources or on another subject, with the first line that differs.
+    """
     if not study.trials:
         study.set_user_attr("sources", SOURCES)
+        study.set_user_attr("subject", subject)
     check_begun(file, study.user_attrs.get("sources"), remedy)
+    begun, now = (str(text).splitlines() for text in (study.user_attrs.get("subject", ""), subject))
+    for was, own in zip_longest(begun, now, fillvalue="nothing"):
+        if was != own:
+            raise ValueError(
+                f"{file} holds trials of something else, and they are not mixed: {was} there, {own} here; go on with "
+                f"what it was begun with, or {remedy}"
+            )
 
 
 def check_sources(expected: str) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -32,6 +32,7 @@ from mechanics.model import COPIES_PER_MODEL
 from tuning.runs import metrics, provenance
 from tuning.runs.experiment import Experiment, Resolved, label, resolve
 from tuning.runs.experiment import load_experiment as load_experiment
+from tuning.runs.inputs import write_inputs
 from tuning.runs.metrics import MoveRecording
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
@@ -41,6 +42,7 @@ PIECE = 0.02  # s of simulation between two reports of progress
 CLOSING_TIME = 0.6  # s, in which the encoder of a standing rotor is aligned
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
 MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
+ROWS = 65_536  # of results.csv, that are written at a time
 SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
 
 Progress = Callable[[str, float], None]
@@ -102,7 +104,7 @@ class SweepResult:
         return found
 
     def save(self, folder: str | Path) -> Path:
-        """Write results.csv, heatmap.png, best_response.png and settings.toml into a new folder and return it.
+        """Write results.csv, heatmap.png, best_response.png, settings.toml and inputs/ into a new folder and return it.
 
         The files are complete or absent: they are written beside the folder and moved.
 
@@ -116,14 +118,19 @@ class SweepResult:
             self._write_csv(partial / "results.csv")
             for name, figure in (("heatmap", plots.heat_map(self)), ("best_response", plots.best_response(self))):
                 write_picture(partial / f"{name}.png", figure, figure.dpi)
+            write_inputs(partial, self.experiment.inputs())
             write_whole(partial / "settings.toml", provenance.HEADER + self.experiment.to_toml(provenance.versions()))
         return Path(folder)
 
     def _write_csv(self, path: Path) -> None:
         # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
         columns = [column.astype(int) if column.dtype == bool else column for column in self.columns.values()]
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        write_table(path, [list(self.columns), *rows], lineterminator="\n")
+        rows = (
+            row
+            for first in range(0, len(self.order), ROWS)  # as Python's numbers, a table of a million rows has 600 MB
+            for row in zip(*(column[first : first + ROWS].tolist() for column in columns), strict=True)
+        )
+        write_table(path, chain([list(self.columns)], rows), lineterminator="\n")
 
 
 class Shard(NamedTuple):
@@ -187,10 +194,12 @@ def run(
 
     Raises:
         ExperimentError: If the experiment cannot be.
+        InputError: If a file of its user cannot be taken.
         PoolError: If shards could not be run where they were to.
     """
     report = progress or (lambda _what, _share: None)
     resolved = resolve(experiment)
+    experiment = experiment.with_inputs()
     found: dict[int, Arrays] = {} if log is None else dict(log.done)
     done = {first: first + len(arrays["score"]) for first, arrays in found.items()}
     threads, width = (num_threads, 1) if pool is None else (1, pool.width)
@@ -227,7 +236,7 @@ def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -
         report("simulating", done())
 
     if pool is not None:
-        for k, arrays in pool.unordered(simulate, left, lambda what: report(what or "simulating", done())):
+        for k, arrays in pool.unordered(simulate, left, lambda what: report(what or "simulating", done()), _is_of):
             say(k, 1.0)
             yield left[k], arrays
         return
@@ -245,7 +254,7 @@ def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -
 def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None) -> Arrays:
     """Return the columns of a shard, and under `best.` the recording of its best point."""
     experiment = shard.experiment
-    points = experiment.points()[shard.first : shard.last]
+    points = experiment.points(shard.first, shard.last)
     axes = find_load(experiment.load).num_axes
     with _machines(experiment, len(points), shard.num_threads) as drives:
         recording, fault = _record(drives, experiment, resolve(experiment), points, report)
@@ -256,6 +265,15 @@ def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None
     columns = {name: values[worst] for name, values in columns.items()}
     best = recording.point(int(worst[np.argmin(_score(columns))]))
     return columns | {f"best.{name}": np.asarray(getattr(best, name)) for name in _recorded(experiment)}
+
+
+def _is_of(shard: Shard, arrays: Any) -> bool:
+    """Return whether arrays are the columns of a shard and a recording."""
+    columns = _column_names(resolve(shard.experiment))
+    recorded = [f"best.{name}" for name in _recorded(shard.experiment)]
+    return set(arrays) == {*columns, *recorded} and all(
+        arrays[name].shape == (shard.last - shard.first,) and arrays[name].dtype.kind in "fb" for name in columns
+    )
 
 
 _RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")

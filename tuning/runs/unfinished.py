@@ -1,18 +1,21 @@
 """A run that is under way: a folder beside the one that its results will have, from which it goes on if it is killed.
 
-The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run and
-the results of the shards that are done, and for shards that can go on from where they were, what they have so far; it
-vanishes with the last step of the run.
+The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run,
+its inputs, the results of the shards that are done, and of shards that can go on from where they were what they have so
+far; it vanishes with the last step of the run.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from drive_env.whole_file import write_whole
+from mechanics.untrusted import read_toml
+from tuning.runs.inputs import Input, check_unchanged, write_inputs
 from tuning.runs.shard_log import ShardLog, ShardLogError
 
 SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part-"
@@ -31,21 +34,25 @@ def settings_of(folder: str | Path) -> Path | None:
 
 
 @contextmanager
-def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[ShardLog]:
+def shard_log(folder: str | Path, settings: str, *, resume: bool, inputs: Iterable[Input] = ()) -> Iterator[ShardLog]:
     """Give the shards of a run that are done, and keep those to come; leave nothing behind if there are none.
 
     Args:
         folder: Where the results will be.
         settings: What the run repeats from: with other settings it is another run.
         resume: Go on with an unfinished run if there is one.
+        inputs: What the run has taken from its user's files; the settings have their hashes in a table `inputs`.
 
     Raises:
         ShardLogError: If an unfinished run is there and is not to be resumed, or is another one.
+        InputError: If one of its inputs was changed since.
         OSError: If it cannot be written.
     """
     place = unfinished_folder(folder)
     if place.exists() and not resume:
         raise ShardLogError(f"{place} holds an unfinished run; continue it with --resume, or remove it")
+    inputs = list(inputs)
+    check_unchanged(_recorded(place / SETTINGS), inputs, place)
     is_new = not place.exists()
     place.mkdir(parents=True, exist_ok=True)
     try:
@@ -57,6 +64,7 @@ def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[Sh
     with begun as log:
         try:
             if not (place / SETTINGS).exists():
+                write_inputs(place, inputs)
                 write_whole(place / SETTINGS, settings)
             yield log
         finally:
@@ -74,6 +82,14 @@ def telling_what_is_kept(folder: str | Path) -> Iterator[None]:
             raise
         why = f"{error.strerror}; the completed part is kept: make room, then continue with --out {folder} --resume"
         raise OSError(error.errno, why, error.filename) from None
+
+
+def _recorded(settings: Path) -> object:
+    """Return what the settings of an unfinished run say of its inputs; of settings that are none, nothing."""
+    try:
+        return read_toml(settings).get("inputs")
+    except (OSError, ValueError, tomllib.TOMLDecodeError):
+        return None
 
 
 def has_parts(log: ShardLog) -> bool:

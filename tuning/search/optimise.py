@@ -22,7 +22,7 @@ from drive_env.trials.method import check_tried
 from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
 from drive_env.trials.positioning import wrapped
 from tuning.runs.shard_log import ShardLog
-from tuning.search.samplers import SAMPLERS, Proposer, load, new_proposer
+from tuning.search.samplers import SAMPLERS, Proposer, Study, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
 from tuning.search.trial_log import LoggedTrials
 from tuning.target import Target, timed
@@ -53,6 +53,7 @@ class Settings:
         safe: Start from safe gains and go on from what was proved.
         seed: Of everything random.
         journal: File of Optuna's journal, in which the search is kept and from which it goes on.
+        subject: What is searched, as text: a journal of something else is refused.
     """
 
     sampler: str = "tpe"
@@ -63,6 +64,7 @@ class Settings:
     safe: bool = False
     seed: int = 0
     journal: Path | None = None
+    subject: str = ""
 
     def __post_init__(self) -> None:
         _check("sampler", [self.sampler], SAMPLERS)
@@ -401,7 +403,7 @@ class _Search:
             first=[start],
             generation=len(self._members[k]),
             journal=settings.journal,
-            name=f"machine {k}",
+            study=Study(f"machine {k}", f"{settings.subject}\n{settings.gains} {settings.objectives}"),
         )
 
     def _points(self, gains: Integers) -> Floats:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,16 @@ class Proposer(Protocol):
         """How many points have been told."""
 
 
+class Study(NamedTuple):
+    """A study of a journal: its name in there, and as lines of text what its points are of."""
+
+    name: str = "study"
+    subject: str = ""
+
+
+THE_STUDY = Study()
+
+
 def new_proposer(
     sampler: str,
     low: Floats,
@@ -60,7 +70,7 @@ def new_proposer(
     first: Sequence[Floats] = (),
     generation: int = 1,
     journal: Path | None = None,
-    name: str = "study",
+    study: Study = THE_STUDY,
 ) -> Proposer:
     """Return a sampler of the box low...high.
 
@@ -74,7 +84,7 @@ def new_proposer(
         first: Points that are proposed before all others.
         generation: How many points are asked for at a time: the population of CMA-ES, if it is 4 or more.
         journal: File in which Optuna's studies are kept, and from which one that was broken off goes on.
-        name: The study's name in the journal.
+        study: What the journal calls the study, and what it is of: one of something else is refused.
 
     Raises:
         ValueError: For a sampler that is none, that has one objective only, or that lacks a package.
@@ -88,7 +98,7 @@ def new_proposer(
         if journal is not None:
             raise ValueError("a grid keeps no journal; leave it out, or use drive-tune sweep, which resumes")
         return _Grid(low, high, trials, first)
-    return _Optuna(sampler, low, high, seed, objectives, first, generation, journal, name)
+    return _Optuna(sampler, low, high, seed, objectives, first, generation, journal, study)
 
 
 def check_installed(sampler: str) -> None:
@@ -145,7 +155,7 @@ class _Optuna:
         first: Sequence[Floats],
         generation: int,
         journal: Path | None,
-        name: str,
+        study: Study,
     ) -> None:
         import optuna
 
@@ -159,10 +169,10 @@ class _Optuna:
 
             storage = JournalStorage(JournalFileBackend(str(journal)))
         self._study = optuna.create_study(
-            storage=storage, study_name=name, directions=["minimize"] * objectives, load_if_exists=True
+            storage=storage, study_name=study.name, directions=["minimize"] * objectives, load_if_exists=True
         )
         if journal is not None:
-            check_study(self._study, journal, "give another --journal")
+            check_study(self._study, journal, "give another --journal", study.subject)
         # Points that were asked for when the study was broken off come first.
         running = optuna.trial.TrialState.RUNNING
         self._running = [trial._trial_id for trial in self._study.get_trials(deepcopy=False, states=(running,))]

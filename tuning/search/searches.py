@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.runs.inputs import as_kept, taken_options
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 from tuning.runs.unfinished import part_log, part_path
-from tuning.search.optimise import Optimised, Settings, TrialRow, optimise
+from tuning.search.optimise import SAFE_STARTS, Optimised, Settings, TrialRow, optimise
 from tuning.target import emulated
 from tuning.toml_tables import toml
 
@@ -49,14 +50,16 @@ def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list
         raise ValueError(f"--searches {count} is below 1; give the number of searches")
     if count > 1 and settings.journal is not None:
         raise ValueError("a journal keeps one search; leave --journal out, or take --searches 1")
+    machine = taken_options(machine)
     return [Search(machine, replace(settings, seed=settings.seed + k)) for k in range(count)]
 
 
 def description(shards: list[Search]) -> str:
     """Return what makes these searches what they are, as TOML lines."""
     lines = [f"searches = {len(shards)}"]
-    lines += [f"machine.{name} = {_text(value)}" for name, value in shards[0].machine.items() if value is not None]
-    settings = {f.name: getattr(shards[0].settings, f.name) for f in fields(Settings)}
+    machine = as_kept(dict(shards[0].machine))
+    lines += [f"machine.{name} = {_text(value)}" for name, value in machine.items() if value is not None]
+    settings = {f.name: getattr(shards[0].settings, f.name) for f in fields(Settings) if f.name != "subject"}
     lines += [f"{name} = {_text(value)}" for name, value in settings.items() if value is not None]
     return "\n".join(lines) + "\n"
 
@@ -103,7 +106,7 @@ def _done(
 
             yield k, _run(tasks[k], report)
         return
-    for done, (place, arrays) in enumerate(pool.unordered(_run, [tasks[k] for k in left]), before + 1):
+    for done, (place, arrays) in enumerate(pool.unordered(_run, [tasks[k] for k in left], fits=_is_of), before + 1):
         progress(done / len(tasks))
         yield left[place], arrays
 
@@ -148,6 +151,13 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
         "notes": np.array(found.notes[:1]),
         "t_0": np.array(found.t_0),
     }
+
+
+def _is_of(task: _SearchTask, arrays: Any) -> bool:
+    """Return whether arrays are what `_run` returns of a search."""
+    found = _optimised(arrays, 0)
+    trials = len(found.rows) <= task.search.settings.trials + SAFE_STARTS
+    return trials and all(one.shape == found.gains.shape for one in (found.rule, *(row.gains for row in found.rows)))
 
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:

@@ -15,6 +15,7 @@ import numpy as np
 from drive_env.devices import find_device
 from drive_env.whole_file import write_picture, write_whole
 from mechanics.untrusted import read_toml
+from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, write_inputs
 from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
 from tuning.search.trial_bench import OBJECTIVES
 from tuning.toml_tables import check_keys, toml
@@ -55,7 +56,7 @@ _MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "copies", "se
 def save(
     found: Optimised, settings: Settings, folder: Path, machine: Mapping[str, Any], versions: Mapping[str, str]
 ) -> None:
-    """Write trials.csv, trials.png and settings.toml into a folder that exists.
+    """Write trials.csv, trials.png, settings.toml and inputs/ into a folder that exists.
 
     Args:
         found: What was found.
@@ -91,7 +92,9 @@ def save(
     lines = _lines({name: getattr(settings, name) for name in _SEARCH})
     if settings.journal is not None:
         lines.append(f"# journal: {settings.journal}")
-    lines += ["", "[machine]", *_lines(machine)]
+    lines += ["", "[machine]", *_lines(as_kept(machine))]
+    lines += table_of(inputs := inputs_in(machine))
+    write_inputs(folder, inputs)
     lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
     write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
     write_picture(folder / "trials.png", trials_figure(found, settings, machine["device"]), 120)
@@ -139,12 +142,14 @@ def load_options(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not TOML: {error}; give settings.toml of drive-tune optimise") from None
     if "machine" not in table:
         raise ValueError(f"{path} is not from a search; give settings.toml of drive-tune optimise")
-    check_keys(str(path), table, [*_SEARCH, "machine", "versions"], optional=["versions", *_SEARCH])
+    check_keys(str(path), table, [*_SEARCH, "machine", "inputs", "versions"], optional=["inputs", "versions", *_SEARCH])
     machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
     if "lanes" in machine:  # as versions before 0.2 named them
         machine["copies"] = machine.pop("lanes")
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
     machine.pop("pace", None)  # what lockstep says
+    kept = found_again(machine, table.get("inputs"), Path(path).parent)
+    machine = {name: value.given if isinstance(value, Input) else value for name, value in kept.items()}
     return {name: table[name] for name in _SEARCH if name in table} | machine
 
 

@@ -109,7 +109,7 @@ def commission(
                 _axis(k, target, bench, before, detection, proof_figures, settings[k]) for k in range(target.num_axes)
             ),
             target.device.name, target.motor.name, target.machine, float(found.speed.max()), clock.seconds,
-            transaction.path, kept, can_load(target), target.axis_numbers,
+            transaction.path, kept, can_load(target), target.axis_numbers, target.inputs,
         )  # fmt: skip
         with files(result):
             if kept:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drive_env.devices import find_device
 from drive_env.trials.open_loop import unmeasured
 from tuning.certificate.certificate import HASH, STEPPER_FORMAT, verdict
+from tuning.runs.inputs import Input, hashes, write_inputs
 from tuning.runs.provenance import versions
 
 CERTIFICATE = "stepper-certificate.json"
@@ -63,6 +64,7 @@ class StepperResult:
         file: The state before.
         kept: Whether drives on a bus stored the settings.
         numbers: What each axis is called; its place by default.
+        inputs: Its user's files, as `Target` has them.
         proved_with_load: Whether load and obstacle were put on the axis: emulated machines of independent axes only.
     """
 
@@ -76,6 +78,7 @@ class StepperResult:
     kept: bool
     proved_with_load: bool
     numbers: tuple[int, ...] = ()
+    inputs: tuple[Input, ...] = ()
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
@@ -107,7 +110,7 @@ class StepperResult:
                 }
                 for k, axis in zip(self.numbers or range(len(self.axes)), self.axes, strict=True)
             ],
-            "versions": versions(),
+            "versions": versions() | hashes(self.inputs),
         }
 
 
@@ -122,6 +125,7 @@ def certificate_file(result: StepperResult, folder: Path) -> Iterator[Path]:
     from drive_env.whole_file import content_hash, write_whole
 
     path = folder / CERTIFICATE
+    write_inputs(folder, result.inputs)
     content = {"format": STEPPER_FORMAT} | result.as_dict()
     write_whole(path, json.dumps(content | {HASH: content_hash(content)}, indent=1) + "\n")
     try:
