@@ -136,7 +136,7 @@ def _lines(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushi
 def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushing, period: float, end: float) -> None:
     from rich.live import Live
 
-    from drive_env.drives.limit_at_rest import REMEDY
+    from drive_env.drives.limit_at_rest import SAYS
 
     scales = scales_of(drives)
     emergencies: list[str] = []
@@ -146,9 +146,7 @@ def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushi
                 when = time.strftime("%H:%M:%S")
                 emergencies.append(f"{when}  {axis_name(drives, message.axis)}: {message.code:04X}h {message.name}")
             pushing = [
-                f"{axis_name(drives, axis)}: its current is at its limit, and it stands: {REMEDY}"
-                for axis, pushes in zip(axes, watch.look(), strict=True)
-                if pushes
+                f"{axis_name(drives, axis)}: {SAYS}" for axis, pushes in zip(axes, watch.look(), strict=True) if pushes
             ]
             told = emergencies[-5:] + pushing
             live.update(

@@ -12,7 +12,6 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import BasicDrives, Drives
 
 MILLIAMPERE = 1e-3
-LIMIT_SHARE = 0.95  # of the limit, from which a current counts as limited: it ripples
 _OF_PEAK = "1/32767 M-Ipeak"
 _WHOLE = 32767.0
 
@@ -46,20 +45,3 @@ def peak_current(drives: BasicDrives) -> NDArray[np.float64]:
 def to_counts(drives: Drives, current: Any) -> NDArray[np.int64]:
     """Return currents [A], axes last, as counts of 6071h and of the current limit."""
     return np.asarray(np.rint(counts_per_ampere(drives) * np.asarray(current, float)), np.int64)
-
-
-def at_current_limit_at_rest(current: Any, limit: Any, moved: Any, near: int) -> NDArray[np.bool_]:
-    """Return which axes take the current of their limit though they do not turn.
-
-    Something holds such an axis, a weight is too heavy for it, or its encoder stands still while its motor may turn;
-    the drive itself sees no fault in that.
-
-    Args:
-        current: 6077h.
-        limit: Of the current, in the same unit; 0 for none.
-        moved: How far 6064h went meanwhile [inc].
-        near: What counts as no movement [inc].
-    """
-    ceiling = np.asarray(limit, float)
-    limited = (ceiling > 0.0) & (np.abs(np.asarray(current, float)) >= LIMIT_SHARE * ceiling)
-    return np.asarray(limited & (np.abs(np.asarray(moved, float)) <= near))

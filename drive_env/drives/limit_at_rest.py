@@ -18,9 +18,9 @@ Mask = NDArray[np.bool_]
 
 SHARE = 0.95  # of the current limit, from which on a current is at it: samples are noisy
 HELD = 0.5  # s, for which it stands so: to set off takes all the current, too, and less time
-REMEDY = (
-    "the axis is blocked or stands against a stop, or its encoder is stuck; disable it, and check both before it is "
-    "enabled again"
+SAYS = (
+    "its current is at its limit, and it stands: the axis is blocked or stands against a stop, or its encoder is "
+    "stuck; disable it, and check both before it is enabled again"
 )
 
 

@@ -9,8 +9,9 @@ from nicegui.events import GenericEventArguments
 
 from drive_env import cia402
 from drive_env.cia402 import State
+from drive_env.drives.limit_at_rest import SAYS
 from drive_env.studio import motion_jobs
-from drive_env.studio.axis_states import AT_LIMIT, MODE_NAMES, AxisState, ShownQuantity
+from drive_env.studio.axis_states import MODE_NAMES, AxisState, ShownQuantity
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.state_diagram import ARROWS, diagram
@@ -119,7 +120,7 @@ def _motion_card(visitor: Visitor) -> None:
         with ui.row().classes("studio-bits"):
             bits = [(ui.label(f"○ {name}").classes("studio-bit"), name, bit) for name, bit in BITS]
         with ui.element("div").classes("studio-fault").props('data-test=at-limit role="status"') as limit:
-            ui.label(f"▲ {AT_LIMIT[0].upper()}{AT_LIMIT[1:]}.").classes("studio-strong")
+            ui.label(f"▲ {SAYS[0].upper()}{SAYS[1:]}.").classes("studio-strong")
         limit.set_visibility(False)
 
     def show() -> None:

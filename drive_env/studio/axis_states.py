@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -13,10 +12,9 @@ from drive_env.cia402 import State
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
-from drive_env.drives import motion
-from drive_env.drives.currents import at_current_limit_at_rest
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
+from drive_env.drives.limit_at_rest import SAYS, LimitAtRest
 from drive_env.master.quantities import SHOWN, UNITS, Scale, find_unit
 from drive_env.studio.fault_texts import FaultText, fault_text
 from drive_env.studio.recorder import Key, ScopeRecorder
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
 
 SLOW = 0.5  # s between two readings of what changes slowly
 QUICK = 0.08  # s between two pictures of what is sampled
-HELD = 0.5  # s for which the current is at its limit, and the axis at rest, until that is told
 SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
 INPUTS = ("negative limit switch", "positive limit switch", "home switch")  # bits 0 to 2 of 60FDh
 MODE_NAMES = {
@@ -36,10 +33,6 @@ MODE_NAMES = {
     "cst": "cyclic synchronous torque",
 }  # fmt: skip
 NO_FAULT = ("fault_reset", "error_reset")
-AT_LIMIT = (
-    "the current is at its limit, and the axis does not turn: something holds it, its load is too heavy, or its "
-    "encoder stands still while the motor may turn; disable it and look"
-)
 
 
 @dataclass(frozen=True)
@@ -138,8 +131,7 @@ class AxisStates:
         self._unreadable: set[Key] = set()
         self._limit_key = description.role(Role.CURRENT_LIMIT)
         self._limit: Any = None  # of the current, shape (num_axes,); None where the drive tells none
-        self._stood: Any = None  # positions at the look before
-        self._held_since = [math.inf] * drives.num_axes  # since when each is at its limit [s]
+        self._pushing = LimitAtRest(drives)
         modes = self._modes(drives)
         self.axes: tuple[AxisState, ...] = tuple(
             AxisState(axis, axis_label(drives, description, axis), modes=modes) for axis in range(drives.num_axes)
@@ -198,18 +190,16 @@ class AxisStates:
 
     def _note_limits(self, newest: Mapping[Key, Any]) -> list[str]:
         """Take note of axes whose current is at its limit though they do not turn; return what is new of that."""
-        position, current = newest.get((cia402.POSITION_ACTUAL, 0)), newest.get((cia402.TORQUE_ACTUAL, 0))
-        if self._limit is None or position is None or current is None:
+        current, speed = newest.get((cia402.TORQUE_ACTUAL, 0)), newest.get((cia402.VELOCITY_ACTUAL, 0))
+        if self._limit is None or current is None or speed is None:
             return []
-        before, self._stood = position if self._stood is None else self._stood, position
-        limited = at_current_limit_at_rest(current, self._limit, position - before, motion.NEAR)
-        told, now = [], time.monotonic()
+        status = newest[cia402.STATUSWORD, 0]
+        pushing = self._pushing.look(time.monotonic(), status, current, speed, self._limit)
+        told = []
         for axis in self.axes:
-            held = bool(limited[axis.axis]) and axis.is_live
-            self._held_since[axis.axis] = min(self._held_since[axis.axis], now) if held else math.inf
-            is_at_limit = now - self._held_since[axis.axis] >= HELD
+            is_at_limit = bool(pushing[axis.axis])
             if is_at_limit and not axis.is_at_limit:
-                told.append(f"{axis.name}: {AT_LIMIT}")
+                told.append(f"{axis.name}: {SAYS}")
             self._replace(axis.axis, is_at_limit=is_at_limit)
         return told
 
