@@ -29,8 +29,8 @@ def hash_of_model(mjcf: Path) -> str:
     """Return a hash of all files that a model takes in, itself among them.
 
     Raises:
-        ValueError: If one is not in the model's folder, is no file, or is too large; if there are too many, or one that
-            asks for a plug-in.
+        ValueError: If one is not in the model's folder, is not a regular file, or is too large; if there are too many,
+            or one that asks for a plug-in.
         OSError: If the model itself cannot be read.
     """
     root = mjcf.parent.resolve()

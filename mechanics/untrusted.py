@@ -66,7 +66,9 @@ class TooLargeError(UntrustedFileError):
 
 
 def check_size(path: Path, most: int) -> None:
-    """Raise UntrustedFileError for what is no file or has more than `most` bytes; OSError if it cannot be looked at.
+    """Raise UntrustedFileError for a file that is not a regular one or has more than `most` bytes.
+
+    OSError if it cannot be looked at.
 
     To open a pipe waits for whoever writes into it, and a device may have no end.
     """
@@ -165,7 +167,7 @@ def read_rows(path: str | Path) -> Iterator[list[str]]:
 
     Raises:
         UntrustedFileError: As `check_size`, and for a line of more than MOST_LINE letters.
-        csv.Error: If it is no CSV; UnicodeDecodeError, OSError as reading a file does.
+        csv.Error: If it is not a CSV file; UnicodeDecodeError, OSError as reading a file does.
     """
     check_size(Path(path), MOST_RECORDING)
     with Path(path).open(newline="", encoding="utf-8") as file:

@@ -182,7 +182,7 @@ def test_no_sdo_starts_a_motor_outside_op(rig, state):
     assert rig.download(0x6040, 0, struct.pack("<H", 7)) == 0
 
 
-def test_outputs_that_an_object_does_not_take_change_nothing(pre_op):
+def test_an_output_that_its_object_does_not_take_changes_nothing_and_the_others_act(pre_op):
     """6320h of the device's table, once until a good image comes."""
     assert pre_op.download(0x1C12, 0, b"\0\0", complete=True) == 0
     entries = struct.pack("<H2I", 2, 0x60600008, 0x60FF0020)
@@ -193,7 +193,7 @@ def test_outputs_that_an_object_does_not_take_change_nothing(pre_op):
     assert pre_op.drives.read(0x60FF)[0] == 1234
     for _ in range(3):
         pre_op.exchange_image(struct.pack("<bi", 5, 4321))  # no mode 5
-    assert pre_op.drives.read(0x60FF)[0] == 1234
+    assert (pre_op.drives.read(0x6060)[0], pre_op.drives.read(0x60FF)[0]) == (3, 4321)
     pre_op.answers()
     assert [one[:2] for one in pre_op.emergencies] == [b"\x20\x63"]
 

@@ -123,6 +123,7 @@ MAY_READ = {
     "agents.policies.onnx_policy": "a file that has been read, and acted within limits in mechanics/limited_child.py",
     "drive_env.commands.recorded_frames": "in mechanics/limited_child.py",
     "tuning.runs.shard_log": "frame by frame, each with its length",
+    "tuning.runs.pools": "pickles of the user's own workers, as SECURITY.md says",
 }
 
 

@@ -51,7 +51,7 @@ def made(monkeypatch):
 # --- CAN --------------------------------------------------------------------------------------------------------------
 def test_can_drives_by_default_are_guarded_and_paced_by_the_clock(made):
     drives = CanDrives(channel="c", token="t")
-    kind, port, nodes, description, bus_time = made.link
+    kind, port, nodes, description, bus_time, _ = made.link
     assert (kind, nodes, description) == ("CanLink", (1,), made.description)
     assert port == drives.port == ("Port", ("open_bus", None, "c", ("token", "t")))
     assert bus_time == ("BusTime", float(BIT_RATE), 0.001)

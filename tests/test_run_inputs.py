@@ -286,7 +286,7 @@ def test_settings_of_a_sweep_repeat_it_from_its_folder_alone(own, decoys, monkey
     sweep.run(load_experiment("moved/settings.toml")).save("again")
     assert contents(decoys / "again") == shipped
     (decoys / "again" / "inputs" / "load" / "meshes" / "disc.obj").unlink()
-    with pytest.raises(ExperimentError, match=r"cannot|no file|Error opening|not open"):
+    with pytest.raises(ExperimentError, match="there is no such file in"):
         load_experiment("again/settings.toml")
     shutil.rmtree(decoys / "again" / "inputs")
     with pytest.raises(ExperimentError, match=r"inputs/(motor|load)/.* is missing.*copy the run's folder as a whole"):

@@ -500,7 +500,7 @@ class PlayedBench:
 
 @pytest.fixture
 def played(monkeypatch):
-    drives = SimpleNamespace(advance=lambda seconds: None, num_axes=2)
+    drives = SimpleNamespace(advance=lambda seconds: None, num_axes=2, time_waits=True)
     target = Target(
         drives, find_device("tmcm1636"), find_motor("qbl4208"), np.full(2, 24.0), np.full(2, -np.inf),
         np.full(2, np.inf), 10.0, 1.0,

@@ -100,7 +100,7 @@ def test_a_fault_for_a_while_ends_by_itself(session):
 
 
 def test_a_fault_with_a_number_out_of_its_range_is_refused(session):
-    with pytest.raises(ValueError, match="must lie in"):
+    with pytest.raises(ValueError, match="must be 0 to 1"):
         do(session, machine_jobs.begin_fault("encoder_lost_counts", None, "", {"share": 2.0}))
 
 

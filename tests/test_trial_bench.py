@@ -30,6 +30,8 @@ MOST_STOPS = 3  # trials in a row that the envelope may end
 class Drives:
     """Drives whose positions are what a test says; what is done to them is noted."""
 
+    observers, bus = (), None
+
     def __init__(self):
         self.num_axes, self.position, self.log, self.told = 4, np.full(4, 100), [], []
 

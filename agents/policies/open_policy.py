@@ -19,6 +19,7 @@ import numpy as np
 
 from agents.policies.policy import ACTOR, load_policy
 from agents.shipped import shipped, shipped_names
+from mechanics.untrusted import read_bytes
 from tuning.runs.inputs import found_again
 
 CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles
@@ -241,7 +242,7 @@ def source_of(text: str) -> str:
         return ""
     found = sys.modules[getattr(find_object(text), "__module__", text.partition(":")[0])]
     path = getattr(found, "__file__", None)
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else ""
+    return hashlib.sha256(read_bytes(path)).hexdigest() if path else ""
 
 
 def _callable(text: str) -> LoadedPolicy:

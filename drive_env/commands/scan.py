@@ -42,7 +42,7 @@ def scan(
 ) -> None:
     """Find nodes and read their identification: 1000h, 1008h to 100Ah, 1018h. Nothing is written.
 
-    Two nodes with one node-ID, which both answer, are told.
+    Two nodes that answer as one node-ID are named.
 
     On EtherCAT: the slaves in their order, what their EEPROMs say, and their states; no state changes.
     """

@@ -228,7 +228,7 @@ class _Repairer:
             if place is None or count == 0:
                 continue
             if not 0 < count <= MOST_SUB:
-                self._tell(f"[{name}]", f"CompactSubObj={text} is no number of sub-objects, 1 to {MOST_SUB}")
+                self._tell(f"[{name}]", f"CompactSubObj={text} must be 1 to {MOST_SUB}")
                 continue
             texts = {kind: self._sections.pop(f"{place[0]:04X}{kind}", {}) for kind in ("Name", "Value")}
             member = {key: row[key] for key in row if key not in ("SubNumber", "ObjectType", "ParameterName")}

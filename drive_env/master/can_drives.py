@@ -15,6 +15,7 @@ from drive_env.master.can.can_link import CanLink
 from drive_env.master.can.dry_run import DryPort
 from drive_env.master.can.network import check_nodes
 from drive_env.master.can.port import Port, open_bus
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.description import check_timeout, describe
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, cycles_per_sync
 from drive_env.safety.limits import Limits
@@ -103,3 +104,23 @@ class CanDrives(BusDrives):
     def port(self) -> Port:
         """The bus."""
         return self._port
+
+
+def check_nodes_answer(
+    device: str,
+    interface: str | None,
+    nodes: Iterable[int],
+    *,
+    channel: Any = None,
+    eds: str | Path | None = None,
+    timeout: float | None = None,
+    bitrate: int | None = None,
+) -> None:
+    """Raise NoAnswerError for a silent node, without an NMT command; the arguments are those of `CanDrives`."""
+    patience = describe(device, eds).answer_timeout if timeout is None else timeout
+    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    try:
+        for node in nodes:
+            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
+    finally:
+        port.close()

@@ -54,16 +54,7 @@ def check_answers(device: str = "tmcm1636", **options: Any) -> None:
     interface = options.get("interface")
     if is_ethercat(interface):
         return  # who opens a segment takes its slaves to another state in any case
-    from drive_env.master.can.port import Port, open_bus
-    from drive_env.master.can.sdo import SdoClient
-    from drive_env.master.description import describe
+    from drive_env.master.can_drives import check_nodes_answer
 
-    eds, timeout, bitrate = options.get("eds"), options.get("timeout"), options.get("bitrate")
-    patience = describe(device, eds).answer_timeout if timeout is None else timeout
-    bus = open_bus(interface, options.get("channel"), **({} if bitrate is None else {"bitrate": bitrate}))
-    port = Port(bus)
-    try:
-        for node in options.get("nodes") or default_nodes(interface):
-            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
-    finally:
-        port.close()
+    asked = {key: options.get(key) for key in ("channel", "eds", "timeout", "bitrate")}
+    check_nodes_answer(device, interface, options.get("nodes") or default_nodes(interface), **asked)

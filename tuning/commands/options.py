@@ -410,7 +410,9 @@ def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
 
 def fail(error: object, code: int = USER_ERROR) -> NoReturn:
     """End the command with a line on stderr."""
-    print(f"drive-tune: {error}", file=sys.stderr)
+    from tuning.runs.inputs import as_given
+
+    print(f"drive-tune: {as_given(str(error))}", file=sys.stderr)
     raise typer.Exit(code)
 
 

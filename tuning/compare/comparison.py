@@ -32,7 +32,7 @@ from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.outcome import Outcome, Tuner
-from tuning.runs.inputs import taken_options
+from tuning.runs.inputs import as_given, taken_options
 from tuning.runs.shard_log import ShardLog
 from tuning.search.trial_bench import read_gains
 from tuning.target import Target
@@ -333,7 +333,7 @@ class _Bench:
                         outcome = tuner(watched, rng)
                     return _Tuned(outcome, _checked_gains(outcome, target), "", audit)
                 except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
-                    return _Tuned(None, read_gains(target), f"{type(error).__name__}: {error}", audit)
+                    return _Tuned(None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit)
 
     def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
         """Return what a rule proposes, and the audit of the identification, which is the same for all rules."""

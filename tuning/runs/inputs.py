@@ -55,6 +55,7 @@ class Input(str):
         path = Path(given) if not files else _copy(f"{own[:16]}/{what}", files) / main
         made = super().__new__(cls, path)
         made.given, made.kept, made.hash, made.files = given, f"{FOLDER}/{what}/{main}", own, files
+        _GIVEN[str(path)] = given
         return made
 
     @property
@@ -335,6 +336,14 @@ _FILES = {"motor": _alone, "distributions": _alone, "load": _of_load, "device": 
 # --- copies -----------------------------------------------------------------------------------------------------------
 _LOCK = threading.RLock()  # Ctrl-C may come while it is held, and removes the copies
 _COPIES: list[tuple[int, Path]] = []  # the process and its folder
+_GIVEN: dict[str, str] = {}  # path of a copy -> as the user gave it
+
+
+def as_given(text: str) -> str:
+    """Return a message with the paths that the user gave in place of those of this process's copies."""
+    for copy, given in _GIVEN.items():
+        text = text.replace(copy, given)
+    return text
 
 
 def _copy(place: str, files: Mapping[str, bytes]) -> Path:
