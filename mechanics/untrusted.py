@@ -66,9 +66,7 @@ class TooLargeError(UntrustedFileError):
 
 
 def check_size(path: Path, most: int) -> None:
-    """Raise UntrustedFileError for a file that is not a regular one or has more than `most` bytes.
-
-    OSError if it cannot be looked at.
+    """Raise UntrustedFileError for a file that is not a regular one or has more than `most` bytes; OSError for one that is absent.
 
     To open a pipe waits for whoever writes into it, and a device may have no end.
     """
