@@ -66,7 +66,7 @@ class TooLargeError(UntrustedFileError):
 
 
 def check_size(path: Path, most: int) -> None:
-    """Raise UntrustedFileError for a file that is not a regular one or has more than `most` bytes; OSError for one that is absent.
+    """Raise UntrustedFileError for a file that is not regular or has more than `most` bytes, OSError for an absent one.
 
     To open a pipe waits for whoever writes into it, and a device may have no end.
     """
