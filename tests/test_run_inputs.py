@@ -218,6 +218,7 @@ def begin(out, config):
     return (out.with_name(f"{out.name}.unfinished") / "shards").read_bytes()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("names", "changed", "told"), [
     ({"motor": "mine.toml"}, "mine.toml", r"mine\.toml \(motor\)"),
     ({"load": "arm/arm.xml"}, "arm/arm.xml", r"arm/arm\.xml \(load\)"),
@@ -361,6 +362,7 @@ def test_settings_of_a_search_repeat_it_from_its_folder_alone(own, decoys, monke
     assert "inputs/motor/mine.toml was changed since the run was made with it" in result.output
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("other", ["changed", "another load", "another motor"])
 def test_a_journal_is_not_gone_on_with_for_something_else(own, other):
     """Before: trials of both in one study, whatever they were of."""
