@@ -249,7 +249,10 @@ def test_a_search_of_currents_finds_the_same_in_process_and_over_the_bus():
 
 @pytest.mark.slow
 def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
-    """What is a number in both; only the machine in this process can be loaded, which the node's verdict says."""
+    """What is a number in both; only the machine in this process can be loaded, which the node's verdict says.
+
+    A bus is asked first whether its axes have motors: their rotors begin within a thousandth of another place.
+    """
 
     def act(drives):
         result = commission(six_axes(drives), tmp_path / f"{id(drives)}.toml", keep=False)
@@ -262,7 +265,9 @@ def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
     for (after, figures, verdict, own), (far, seen, told, reservations) in zip(inside, outside, strict=True):
         assert after == far and verdict != "rejected" and told == "accepted with reservations"
         assert all("teeth before the stall" in text for text in own)
-        assert figures | {obstacle: None} == seen | {obstacle: None}
+        assert figures.keys() == seen.keys()
+        numbers = [name for name, value in figures.items() if value is not None and name != obstacle]
+        assert [seen[name] for name in numbers] == pytest.approx([figures[name] for name in numbers], rel=1e-3)
         assert seen[obstacle] is None and len(reservations) == 1 and "not proved with a load" in reservations[0]
         assert after["stall_threshold"] != 0 or after["coolstep_lower"] > 0
 

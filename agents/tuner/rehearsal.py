@@ -376,6 +376,9 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     yield (cia402.TARGET_POSITION, 0), way, "moves", False
     yield (cia402.TARGET_VELOCITY, 0), f"{-speed}...{speed}", "speed during the frequency response, in csv", False
     yield (cia402.TARGET_TORQUE, 0), f"{-amperes}...{amperes}", "current pulses and excitation, in cst", False
+    for index in (cia402.VELOCITY_OFFSET, cia402.TORQUE_OFFSET):
+        if bus_of(target.drives).description.has((index, 0)):
+            yield (index, 0), "0", "no speed or current of before, once the gains are put back", False
     yield (cia402.PROFILE_VELOCITY, 0), f"1...{speed}", "speed of the moves", False
     for index in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
