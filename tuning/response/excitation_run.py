@@ -41,6 +41,7 @@ CYCLE = 0.001  # s
 RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until what it left has died away
 FADE = 20  # cycles
 IN_RAMPS = 0.3  # share of the shaking while the speed changes
+LOOK = 20  # cycles at rest, in which is seen what holds an axis
 REST, RETURN = 30, 50  # cycles in which an axis comes to rest, and goes back, or more where that would be too fast
 BACK = 0.8  # of the way back: an axis that overshoots must not leave its travel
 SETTLED = 200  # cycles until what was let go stands where the others have left it
@@ -164,7 +165,7 @@ class Shaker:
 
     def hold(self) -> Floats:
         """Return what holds the axes at rest [A], shape (axes,)."""
-        trace = self._drives.record([cia402.TORQUE_ACTUAL], 2 * REST * CYCLE)
+        trace = self._drives.record([cia402.TORQUE_ACTUAL], (REST + LOOK) * CYCLE)
         return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
 
     def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, NDArray[np.bool_]]:

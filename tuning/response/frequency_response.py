@@ -211,9 +211,10 @@ class _Measurement:
                 limit = self._current_limit()
                 # At once: friction that has come to rest would make the trial another one.
                 self._holding = counted.drives.read(cia402.TORQUE_ACTUAL) * ampere_per_count(counted.drives)
+                self._friction = np.zeros(target.num_axes)
                 speed = self._trial_speed(shaker, np.abs(room))
                 trial = self._trial(shaker, limit, speed, sign)
-                self._holding = shaker.hold()
+                self._know_friction(trial, shaker.hold(), sign)
                 progress(0.2)
                 rough = transfer(trial.set_point, trial.answer, self._lines)[0]
                 room = np.abs(room) - speed * _duration(1, self._lines)
@@ -272,7 +273,17 @@ class _Measurement:
     def _falling(self, shaker: Shaker, speed: Floats, passes: int, periods: int) -> Floats:
         """Return what weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
         steady, _ = shaker.steady(speed, passes, periods)
-        return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding)
+        return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding, self._friction)
+
+    def _know_friction(self, trial: Pass, at_rest: Floats, sign: Floats) -> None:
+        """Tell a weight from dry friction, which feeds nothing back, by currents in motion and at rest after it [A].
+
+        In motion along `sign` it is weight + friction; against it -weight + friction, which is not less than what held
+        the axis at rest, friction having taken what it likes up to its own.
+        """
+        moving = trial.current.mean(axis=0)
+        self._friction = np.maximum(0.5 * sign * (moving - at_rest), 0.0)
+        self._holding = np.maximum(np.abs(moving), np.abs(at_rest)) - self._friction
 
     def _trial_amplitude(self, speed: Floats, limit: Floats) -> Floats:
         n = len(self._lines.f)

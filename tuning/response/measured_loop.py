@@ -177,8 +177,13 @@ class MeasuredLoop:
         """Return inertia, velocity_filter, loop_delay, anti_resonance, resonance and damping of an axis.
 
         Each has its interval, or the reason why it is refused.
+
+        Raises:
+            ValueError: For the response of a position loop, or of an axis without one; its notes say why.
         """
         fit = self.fits[axis]
+        if fit is None and self.loop == "velocity":
+            raise ValueError(f"there is no response of axis {axis}: {'; '.join(self.notes[axis]) or 'not measured'}")
         if fit is None:
             raise ValueError(f"the {self.loop} loop does not give the axis model; measure the velocity loop")
         return fit.estimates
