@@ -240,7 +240,7 @@ def test_an_array_has_at_most_254_members(count):
     sections, repairs = parse_eds(compact(1, count))
     assert not any("sub" in name for name in sections)
     assert [one.what for one in repairs if "CompactSubObj" in one.what] == [
-        f"CompactSubObj={count} is no number of sub-objects, 1 to 254"
+        f"CompactSubObj={count} must be 1 to 254"
     ]
 
 
