@@ -239,9 +239,7 @@ def test_an_array_has_at_most_254_members(count):
     """A count of ten digits was counted to its end."""
     sections, repairs = parse_eds(compact(1, count))
     assert not any("sub" in name for name in sections)
-    assert [one.what for one in repairs if "CompactSubObj" in one.what] == [
-        f"CompactSubObj={count} must be 1 to 254"
-    ]
+    assert [one.what for one in repairs if "CompactSubObj" in one.what] == [f"CompactSubObj={count} must be 1 to 254"]
 
 
 @pytest.mark.parametrize(
