@@ -213,7 +213,8 @@ def void(bus, key, entry, axis):
         bus.enable()
         bus.send({(CONTROLWORD + AXIS * axis, 0): 0, key: value})
         if not bus.plant.is_off(axis):
-            found.append(value)
+            truth = {name: bus.plant.truth(name).tolist() for name in ("fsa", "stage_on", "omega_m")}
+            found.append((axis, value, truth, list(bus.told)))
         bus.port(key).write(before)
     return found
 
@@ -292,9 +293,8 @@ def test_no_value_in_an_rpdo_voids_a_stop_before_or_behind_it(name, entry):
 @pytest.mark.parametrize("entry", [pytest.param(one, id=f"{one.index:04X}-{one.sub}") for one in received("tmcm3313")])
 def test_no_value_in_a_mapped_image_voids_a_stop_before_or_behind_it(entry):
     bus, key = Coe(plant_of("tmcm3313")), (entry.index, entry.sub)
-    words = [bus.node.dictionary.entries.find((CONTROLWORD + AXIS * axis, 0)) for axis in bus.plant.axes]
-    if entry in words:
-        words.remove(entry)
+    indices = [CONTROLWORD + AXIS * axis for axis in bus.plant.axes]
+    words = [bus.node.dictionary.entries.find((one, 0)) for one in indices if one != entry.index]
     for order in ([*words, entry], [entry, *words]):
         bus.carry(order)
         bus.turn()

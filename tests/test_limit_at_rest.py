@@ -77,10 +77,18 @@ def test_steppers_have_no_such_limit():
 
 
 class Served:
-    """Drives in a world in real time, which lets their time pass."""
+    """Drives in a world in real time, which lets their time pass; its server has them between two calls."""
 
-    def __init__(self, drives):
-        self.num_axes, self.read, self.write = drives.num_axes, drives.read, drives.write
+    def __init__(self, drives, guard):
+        self.num_axes, self._drives, self._guard = drives.num_axes, drives, guard
+
+    def read(self, *args, **options):
+        with self._guard:
+            return self._drives.read(*args, **options)
+
+    def write(self, *args, **options):
+        with self._guard:
+            self._drives.write(*args, **options)
 
     def advance(self, duration):
         time.sleep(duration)
@@ -93,9 +101,14 @@ def test_monitor_tells_it(monkeypatch):
     channel = str(uuid.uuid4())
     for name, value in {"INTERFACE": "virtual", "CHANNEL": channel, "TIMEOUT": "20"}.items():
         monkeypatch.setenv(f"DRIVE_ENV_{name}", value)
-    with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))):
-        drives.machine.fault("encoder_stuck")
-        set_off(Served(drives))
+    with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))) as server:
+        with server.guard:
+            drives.machine.fault("encoder_stuck")
+        served = Served(drives, server.guard)
+        set_off(served)
+        patience = time.monotonic() + 60.0
+        while served.read(cia402.TORQUE_ACTUAL)[0] < 6800 and time.monotonic() < patience:
+            time.sleep(LOOK)
         for options in (["--json"], []):
             result = CliRunner().invoke(app, ["monitor", "6077", "--period", "0.1", "--duration", "3", *options])
             assert result.exit_code == 0, result.output
