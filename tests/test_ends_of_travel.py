@@ -149,6 +149,23 @@ def test_a_jump_that_a_stepper_cannot_follow_is_not_sent(device):
         assert theta == pytest.approx(1.0, abs=0.02)
 
 
+def test_a_stop_in_homing_begins_ahead_of_the_axis_by_the_lag_of_its_position_loop():
+    """A search at 35 turns/s ended 0.79 turns outside: the stop was taken for one of a velocity loop."""
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated:
+
+        def session(drives):
+            motion.enable(drives, mode="hm")
+            drives.write(0x6098, 18)
+            for speed in (1, 2):
+                drives.write((0x6099, speed), 35 * TURN)
+            drives.write(0x6040, 0x1F)
+            drives.advance(1.0)
+
+        theta, ended = turns_of(emulated, session)
+        assert "its stop would end" in str(ended)
+        assert 2.5 < theta.max() < 3.0 + travel_sequences.SLACK["hm"]
+
+
 # --- the property ---------------------------------------------------------------------------------------------------
 def check(found):
     """Assert of sequences that the envelope made none worse, and that it was needed."""

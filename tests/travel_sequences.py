@@ -33,7 +33,7 @@ from drive_env.devices import find_device
 
 DEVICES = ("tmcm1636", "tgz_d", "tmcm3313", "tmcm6212")
 LOADS = ("inertia", "two_mass", "belt", "ball_screw")
-POSITION, VELOCITY, TORQUE = 0x607A, 0x60FF, 0x6071
+POSITION, VELOCITY, TORQUE, METHOD, HOMING_SPEED = 0x607A, 0x60FF, 0x6071, 0x6098, 0x6099
 TARGETS = {"pp": POSITION, "csp": POSITION, "pv": VELOCITY, "csv": VELOCITY, "cst": TORQUE}
 TURN = 2.0 * np.pi  # rad
 AFTERWARDS = 600  # cycles after the last command
@@ -42,7 +42,7 @@ SAME = 0.05  # rev: a stop begins some milliseconds before a turn of the set-poi
 FASTEST, FASTEST_STEPPER = 70.0, 8.0  # rev/s that are asked for
 # How far outside an axis may be [rev], by the modes that it was in: it speeds up until its ramp begins, and its loops
 # overshoot (docs/safety.md).
-SLACK = {"pp": 0.15, "csp": 0.5, "pv": 0.3, "csv": 0.5, "cst": 1.0}
+SLACK = {"pp": 0.15, "csp": 0.5, "pv": 0.3, "csv": 0.5, "cst": 1.0, "hm": 0.5}
 SHARE = 0.07  # by which each further axis of a device is asked for less
 
 
@@ -64,7 +64,8 @@ class Machine:
     """The axes of an emulated device, and what a count of their set-points is.
 
     turn: Increments of a revolution; speed: counts of 60FFh of a revolution a second; current: counts of 6071h of all
-    the current there is; modes: its modes of operation; fastest: speed that is asked for at most [rev/s].
+    the current there is; modes: its modes of operation; homing: its methods; fastest: speed that is asked for at most
+    [rev/s].
     """
 
     drives: EmulatedDrives
@@ -72,6 +73,7 @@ class Machine:
     speed: float
     current: int
     modes: tuple[str, ...]
+    homing: tuple[int, ...]
     fastest: float
 
 
@@ -96,7 +98,8 @@ def machine(device: str, load: str) -> Machine:
         TURN / si_per_count(POSITION, "target_position", 100_000),
         TURN / si_per_count(VELOCITY, "target_velocity", 1000),
         current,
-        tuple(TARGETS) if is_servo else ("pp", "csp", "pv", "csv"),
+        (*TARGETS, "hm") if is_servo else ("pp", "csp", "pv", "csv", "hm"),
+        tuple(find_device(device).allowed_values[(METHOD, 0)]),
         FASTEST if is_servo else FASTEST_STEPPER,
     )
 
@@ -104,7 +107,7 @@ def machine(device: str, load: str) -> Machine:
 # --- sequences ----------------------------------------------------------------------------------------------------
 @dataclass
 class Step:
-    """What is done: "mode", "play" of rows cycle by cycle, "write" by SDO, "move" in pp; then so many cycles pass."""
+    """What is done: "mode", "play" of rows, "write" by SDO, "move" in pp, "home"; then so many cycles pass."""
 
     kind: str
     mode: str
@@ -150,6 +153,9 @@ def draw(number: int, seed: int = 0) -> Sequence:
 
 def _draw_step(rng, axes, mode, travel):
     wait = rng.choice((1, 5, 20, 60, 150))
+    if mode == "hm":
+        speed = round(axes.speed * axes.fastest * rng.choice((0.02, 0.1, 0.5)))
+        return Step("home", mode, [rng.choice(axes.homing)], speed, rng.choice((20, 150, 600)))
     goal = _draw_value(rng, axes, mode, travel)
     if mode == "pp":
         return Step("move", mode, [goal], round(axes.speed * axes.fastest * rng.choice((0.1, 0.5, 1.0))), wait)
@@ -226,6 +232,12 @@ def _take(drives, step):
         drives.write(POSITION, rows[0])
         drives.write(0x6040, 0x0F)
         drives.write(0x6040, 0x3F)
+    elif step.kind == "home":
+        drives.write(METHOD, step.rows[0])
+        for sub in (1, 2):
+            drives.write((HOMING_SPEED, sub), step.speed)
+        for word in (0x0F, 0x1F):
+            drives.write(0x6040, word)
     elif step.kind == "write":
         drives.write(TARGETS[step.mode], rows[0])
     else:

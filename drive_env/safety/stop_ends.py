@@ -2,7 +2,7 @@
 
 A quick stop ends where its demand does. With v the speed, a the deceleration of 6085h and i the current:
 
-    pp, csp           v^2 / 2a + v / k_v                   the demand is ahead by the lag of the position loop
+    pp, csp, hm       v^2 / 2a + v / k_v                   the demand is ahead by the lag of the position loop
     csv               v^2 / 2a + sum of (asked - v) dt     the ramp begins with the speed that was asked for
     pv, torque modes  v^2 / 2a + i / (P I f)               of an axis that speeds up
 
@@ -26,7 +26,7 @@ from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN
-from drive_env.safety.objects import CSP, CSV, CURRENT, PP, TORQUE_MODES
+from drive_env.safety.objects import CSP, CSV, CURRENT, HM, PP, TORQUE_MODES
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -44,6 +44,11 @@ SHORT = 0.75  # of the current that is asked for: less flows at the end of the v
 def by_position(axes: Axes) -> Mask:
     """Return which axes are in a mode that ends by itself, at a set-point which was checked."""
     return np.asarray((axes.mode == PP) | (axes.mode == CSP))
+
+
+def lags(axes: Axes) -> Mask:
+    """Return which axes follow a demand of their position, and are behind it while they move."""
+    return np.asarray(by_position(axes) | (axes.mode == HM))
 
 
 def sees_demand(axes: Axes) -> Mask:
@@ -82,7 +87,7 @@ def ramp_way(bounds: Bounds, speed: Floats) -> Floats:
 
 def stop_way(axes: Axes, bounds: Bounds, speed: Floats) -> Floats:
     """Return how far the axes go on from a speed [inc/s], if they are quick-stopped now, by that alone [inc]."""
-    before = np.where(by_position(axes), np.maximum(bounds.lag, LATENCY), LATENCY)
+    before = np.where(lags(axes), np.maximum(bounds.lag, LATENCY), LATENCY)
     return np.asarray(ramp_way(bounds, speed) + speed * before)
 
 
@@ -140,5 +145,5 @@ class StopEnds:
         speeds_up = self._gain > SPEEDS_UP * bounds.braking
         is_short = np.abs(self._current) < SHORT * np.abs(asked)
         current = np.where(torque, asked, self._current) * way
-        holds = (speeds_up | is_short) & ~by_position(axes) & (axes.mode != CSV) & (np.abs(self.speed) > bounds.rest)
+        holds = (speeds_up | is_short) & ~lags(axes) & (axes.mode != CSV) & (np.abs(self.speed) > bounds.rest)
         return np.asarray(way * bounds.windup * np.where(holds, np.maximum(current, 0.0), 0.0))
