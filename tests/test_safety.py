@@ -212,6 +212,17 @@ def test_an_axis_that_is_enabled_outside_may_not_go_on(bus, drive):
             drives.advance(0.1)
 
 
+def test_an_axis_that_stands_outside_is_told_how_to_come_back(bus, drive):
+    drive.set(0x6064, 3000)
+    with (
+        CanDrives(bus=bus, pace="lockstep", safety=Limits(position=(-1000, 1000))) as drives,
+        pytest.raises(
+            SafetyError, match=r"607Ah.* would lead to 3000.* nothing was sent. Bring the axis back in pp or pv"
+        ),
+    ):
+        motion.enable(drives, mode="csp")
+
+
 def test_homing_is_exempt_from_position_limits(bus, drive):
     with enabled(bus, Limits(position=(-1000, 1000)), "hm") as drives:
         drive.motion = ramp(0x6064, 100)
