@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -223,9 +224,13 @@ def test_an_axis_that_stands_outside_is_told_how_to_come_back(bus, drive):
         motion.enable(drives, mode="csp")
 
 
-def test_homing_is_exempt_from_position_limits(bus, drive):
-    with enabled(bus, Limits(position=(-1000, 1000)), "hm") as drives:
-        drive.motion = ramp(0x6064, 100)
+@pytest.mark.parametrize(("mode", "stops"), [("hm", False), ("pv", True)])
+def test_homing_is_exempt_from_the_drive_s_own_position_limits(bus, drive, mode, stops):
+    drive.set(0x607D, -1000, 1)
+    drive.set(0x607D, 1000, 2)
+    drive.set(0x606C, TURN)
+    with enabled(bus, mode=mode) as drives, pytest.raises(SafetyError) if stops else nullcontext():
+        drive.motion = ramp(0x6064, TURN // 1000)
         drives.advance(0.1)
 
 
