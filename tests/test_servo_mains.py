@@ -528,6 +528,24 @@ def test_a_hot_brake_resistor_rests():
     assert cause_of(drives, 0.1) == 0x7113
 
 
+def test_an_error_that_is_back_in_the_moment_of_its_reset_is_an_error_again(drives):
+    """Of a contact that bounces: with STO open again before the drive had looked, the motor turned at 31 rad/s."""
+    motion.enable(drives, mode="pv")
+    for closed in (False, True):
+        drives.machine.enable_input = closed
+        drives.advance(0.002)
+    drives.write(cia402.CONTROLWORD, 0)
+    drives.machine.enable_input = False
+    drives.write(cia402.CONTROLWORD, 0x80)
+    step_up(drives)
+    drives.write(cia402.TARGET_VELOCITY, rpm(drives, 300))
+    drives.advance(0.3)
+    assert shows(drives, FAULT)
+    assert field(drives, "stage_on")[0] == 0.0
+    assert abs(drives.machine.rotor_speed[0]) < 0.1
+    assert [one.code for one in drives.emergencies()] == [0x5430, 0, 0x5430]
+
+
 # --- both axes of a module --------------------------------------------------------------------------------------------
 def test_axes_of_a_machine_share_their_link_and_their_inputs_and_machines_share_nothing():
     drives = EmulatedDrives("tgz_d", load="gantry", num_machines=2, seed=0)

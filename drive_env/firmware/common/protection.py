@@ -196,11 +196,14 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool, 
             # A drive whose supply or enable is missing is in no fault before anybody switches it on, unless its maker
             # has every error act at once.
             present &= ~faults
-        appeared = present & ~drive.active[lane]
+        reacting = drive.fsa[lane] == fsa.REACTING
+        # Outside of a fault none is known already: what is back in the moment of its reset is a new one.
+        known = drive.active[lane] if faulted or reacting else drive.active[lane] & ~faults
+        appeared = present & ~known
         # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again; where
         # every error is told, none is until the reset.
-        told = drive.active[lane] & stops if drive.fsa[lane] == fsa.REACTING else 0
-        if tells_all and (faulted or drive.fsa[lane] == fsa.REACTING):
+        told = drive.active[lane] & stops if reacting else 0
+        if tells_all and (faulted or reacting):
             told = drive.active[lane] & faults
         drive.active[lane] = present | told
         drive.warning[lane] = 1 if present & warns else 0
