@@ -383,7 +383,7 @@ def test_a_ramp_too_slow_for_a_mode_without_a_limit_of_speed_is_refused_while_it
     bench = Bench(None, mode)
     bench.axes.assumed[0] = True
     if refused:
-        bench.refuses("axis 0: nothing limits the speed in csp, tq or cst", BRAKING, value)
+        bench.refuses("axis 0: nothing limits the speed in ip, csp, tq or cst", BRAKING, value)
     else:
         bench.write(BRAKING, value)
     bench.axes.assumed[0] = False

@@ -15,6 +15,7 @@ from drive_env.master.errors import BusError
 from drive_env.safety import envelope as module
 from drive_env.safety.axes import Axes
 from drive_env.safety.envelope import Envelope, swinging_allowed
+from drive_env.safety.objects import SET_POINTS
 
 WORD, STATUS, MODE, STORE, GATE = (0x6040, 0), (0x6041, 0), (0x6060, 0), (0x1010, 1), (0x2303, 0)
 TARGET, SPEED, PROFILE, OFFSET, RESOLUTION = (0x607A, 0), (0x60FF, 0), (0x6081, 0), (0x607C, 0), (0x608F, 1)
@@ -69,7 +70,7 @@ class Bench:
         made._stops, made._watch, made._commands = self.stops, self.watch, self.commands
         made._lending, made._watchdogs, made._limits = self.lending, self.watchdogs, self.limits
         made._checked_stop, made._is_closing, made._disabling = None, False, np.zeros(2, bool)
-        made._of_further_axes, made._played = {}, {}
+        made._of_further_axes, made._played, made._set_points = {}, {}, frozenset(SET_POINTS)
 
     def entry(self, key):
         return self.drives.entries[key]

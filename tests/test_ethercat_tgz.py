@@ -17,8 +17,11 @@ from drive_env.devices import find_device
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.esi import esi_text
 from drive_env.ethercat.sii_content import sii_content
+from drive_env.firmware.record import set_lanes
 from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.node.node_axes import NodeAxes
+from drive_env.safety.errors import SafetyError
+from drive_env.safety.limits import Limits
 
 FACTORY = (0x1701, 0x1B01)
 SAMPLED = [0x6041, 0x6064, 0x606C, 0x6077]
@@ -210,6 +213,70 @@ def test_a_master_takes_the_image_that_has_what_is_played_and_puts_the_factorys_
             assert trace[0x33C0][-1] - before == pytest.approx(targets[-1] - before, rel=0.2)
             motion.disable(drives)
         assert (slave.output_size, slave.input_size) == (40, 40)
+
+
+TURN, TURN_INSIDE = 65_536, 2**28
+NATIVE = {0x23C7: np.zeros((2, 2), int)}  # what is played before enabling selects the native image
+
+
+@pytest.fixture
+def within_two_turns():
+    with (
+        EmulatedSegment("tgz_d", load="gantry") as segment,
+        EtherCatDrives(
+            "tgz_d", master=segment.master(), pace="lockstep", safety=Limits(position=(-2 * TURN, 2 * TURN))
+        ) as drives,
+    ):
+        yield drives, segment.drives
+
+
+def test_a_target_beyond_the_limits_is_refused_by_whatever_object_and_in_whatever_mode(within_two_turns):
+    """607Ah in ip, 60C1h:01, and the native image's 64 bits in both modes went out unchecked, and ended at 2.05."""
+    drives, inside = within_two_turns
+    drives.record([0x33C0, 0x6077], 0.002, NATIVE)
+    ramp = np.linspace(0.0, 4.0, 100)
+    for mode in ("csp", "ip"):
+        motion.enable(drives, mode=mode)
+        for name, turn in ((0x607A, TURN), ((0x60C1, 1), TURN), (0x23C7, TURN_INSIDE)):
+            with pytest.raises(SafetyError, match="beyond the limits -131072 to 131072; nothing was sent"):
+                drives.write(name, 3 * turn)
+        with pytest.raises(SafetyError, match=r"would lead to 13\d+, .*; nothing was sent"):
+            drives.record([0x33C0, 0x6077], 0.1, {0x23C7: np.stack([ramp * TURN_INSIDE] * 2, axis=1).astype(int)})
+        motion.disable(drives)
+    assert np.abs(inside.machine.rotor_angle).max() < 0.1
+
+
+def test_a_target_of_64_bits_is_held_against_the_limits_by_all_of_them(within_two_turns):
+    """65,536 turns from zero 6064h shows 0, too: the target beside the axis is allowed, the one at zero is far away."""
+    drives, inside = within_two_turns
+    set_lanes(inside.inside.records, "home_shift", np.full(2, -2.0 * np.pi * 65_536))
+    drives.advance(0.01)
+    assert drives.read(0x6064) == pytest.approx(0, abs=50)
+    assert drives.read(0x33C0) == pytest.approx(2**44, abs=50 * 4096)
+    motion.enable(drives, mode="csp")
+    drives.write(0x23C7, 2**44 + TURN_INSIDE // 100)
+    with pytest.raises(SafetyError, match="would lead to -4294966641, beyond the limits"):
+        drives.write(0x23C7, TURN_INSIDE // 100)
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_what_the_native_image_had_moves_no_axis_that_is_enabled_nor_keeps_one_from_its_move(lockstep):
+    """Its position set-point is 607Ah: an axis enabled in csp went 0.1 turns to it, and moves in pp ended there."""
+    pace = {"pace": "lockstep"} if lockstep else {}
+    with (
+        EmulatedSegment("tgz_d", load="gantry", lockstep=lockstep) as segment,
+        EtherCatDrives("tgz_d", master=segment.master(), **pace) as drives,
+    ):
+        drives.record([0x6064, 0x6077], 0.002, NATIVE)
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, TURN // 10)
+        motion.disable(drives)
+        drives.advance(0.1)
+        there = segment.drives.machine.rotor_angle
+        assert there / (2.0 * np.pi) == pytest.approx([0.1, 0.1], abs=0.01)
+        motion.enable(drives, mode="csp")
+        drives.advance(0.2)
+        assert segment.drives.machine.rotor_angle == pytest.approx(there, abs=0.01)
 
 
 def test_in_real_time_what_no_image_has_for_every_axis_is_refused():

@@ -20,11 +20,12 @@ from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
 from drive_env.safety.objects import (
     CONTROLWORD,
-    CSP,
     CSV,
     DEMAND,
     HOMING_SPEED_TO_SWITCH,
     HOMING_SPEED_TO_ZERO,
+    INTERPOLATED_POSITION,
+    LED_MODES,
     MODE,
     MOVING_SPEEDS,
     POSITION,
@@ -88,6 +89,7 @@ class Commands:
         self._axes = axes
         self._limits = limits
         self._modes = modes
+        self._target_inside = drives.description.role(Role.TARGET_INSIDE)
         self._set_points: dict[Key, Integers] = {}  # as they were written or read last
 
     def check_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
@@ -103,7 +105,9 @@ class Commands:
             if rows.shape[0] == 0:
                 continue
             self._check_meaning(entry, self._axes.everywhere, is_played=True)
-            if key in (TARGET_POSITION, POSITION_OFFSET):
+            if self._is_other_target(key):
+                self._check_position(entry, self._target(key, rows), self._axes.everywhere, (PP, *LED_MODES))
+            elif key in (TARGET_POSITION, POSITION_OFFSET):
                 if not relative:
                     self._check_sum(entry, rows, played)
             elif key == MODE:
@@ -114,11 +118,31 @@ class Commands:
             assert words is not None
             self._check_played_moves(words, played)
 
+    def _is_other_target(self, key: Key) -> bool:
+        """Return whether an object is the target position by another name than 607Ah."""
+        return key in (INTERPOLATED_POSITION, self._target_inside)
+
+    def _target(self, key: Key, raw: Integers) -> Integers:
+        """Return targets by another object than 607Ah in increments of 6064h, as it counts now."""
+        if key == INTERPOLATED_POSITION:
+            return raw
+        role = self._drives.description.role
+        turn, actual = role(Role.TURN_INSIDE), role(Role.POSITION_INSIDE)
+        assert turn is not None and actual is not None, "a drive with a target inside has both"
+        scale = self._axes.rotor.scale / read_own(self._drives, turn, 1)
+        # 6064h is the lower end of the position inside, whose turns of 32 bits it does not tell.
+        above = read_own(self._drives, actual, 0) * scale - read_own(self._drives, POSITION, 0)
+        return np.rint(raw * scale - 2.0**32 * np.rint(above / 2.0**32)).astype(np.int64)
+
     def note(self, key: Key, raw: Integers, where: Mask) -> None:
         """Take note of a set-point that was written."""
+        if self._is_other_target(key):
+            self.forget(TARGET_POSITION)
+            self._axes.led = np.where(where, math.nan, self._axes.led)
+            return
         self._set_points[key] = np.where(where, raw, self._set_points.get(key, 0))
         if key in (TARGET_POSITION, POSITION_OFFSET):
-            led = where & self._axes.live & (self._axes.mode == CSP)
+            led = where & self._axes.live & np.isin(self._axes.mode, LED_MODES)
             other = self._set_points.get(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION, 0)
             self._axes.led = np.where(led, self._set_points[key] + other, self._axes.led)
         if key in _PARTNERS:
@@ -219,7 +243,7 @@ class Commands:
         aim = target + offset
         if aim.shape != rows.shape:
             aim = np.broadcast_to(aim, rows.shape)
-        self._check_position(entry, aim, self._axes.everywhere, (CSP,))
+        self._check_position(entry, aim, self._axes.everywhere, LED_MODES)
         self._check_jumps(entry, aim, self._axes.everywhere)
         if (entry.index, entry.sub) == TARGET_POSITION:
             self._check_position(entry, rows, self._axes.everywhere, (PP,))
@@ -228,10 +252,12 @@ class Commands:
         self, entry: Entry, raw: Integers, where: Mask, played: Mapping[Entry, Integers] | None = None
     ) -> None:
         key = (entry.index, entry.sub)
-        if key in (TARGET_POSITION, POSITION_OFFSET):
+        if self._is_other_target(key):
+            self._check_position(entry, self._target(key, raw), where, LED_MODES)
+        elif key in (TARGET_POSITION, POSITION_OFFSET):
             other = self._last(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION)
-            if key == TARGET_POSITION or np.any(self._modes() == CSP):
-                self._check_position(entry, raw + other, where, (CSP,))
+            if key == TARGET_POSITION or np.isin(self._modes(), LED_MODES).any():
+                self._check_position(entry, raw + other, where, LED_MODES)
                 self._check_jumps(entry, raw + other, where)
         elif key == QUICK_STOP_DECELERATION:
             self._check_braking(entry, raw, where)
@@ -295,7 +321,7 @@ class Commands:
         if np.all(jump <= limit * cycle):
             return
         period = np.maximum(self._interpolation_period(), cycle)
-        wrong = axes & self._axes.live & (jump > limit * period) & (self._modes() == CSP)
+        wrong = axes & self._axes.live & (jump > limit * period) & np.isin(self._modes(), LED_MODES)
         for axis in np.flatnonzero(wrong).tolist():
             raise SafetyError(
                 f"axis {axis}: {entry.label} would jump by {jump[axis]:.0f} increments within "
@@ -319,7 +345,7 @@ class Commands:
             return
         ramp = np.where(modes == PP, profile_way(bounds, speed), ramp_way(bounds, speed) + speed * bounds.lag)
         beyond = outside(bounds, self._axes.position + ramp)
-        wrong = axes & np.isin(modes, (PP, CSP)) & (np.abs(speed) > bounds.rest)
+        wrong = axes & np.isin(modes, (PP, *LED_MODES)) & (np.abs(speed) > bounds.rest)
         wrong &= beyond > np.maximum(outside(bounds, self._axes.position), bounds.slack)
         for axis in np.flatnonzero(wrong & (self._modes() != modes)).tolist():
             raise SafetyError(
@@ -496,7 +522,7 @@ class Commands:
         for axis in np.flatnonzero(wrong).tolist():
             count = self._ramp_count()[axis]
             raise SafetyError(
-                f"axis {axis}: nothing limits the speed in csp, tq or cst, and a quick stop's ramp of 6085h = "
+                f"axis {axis}: nothing limits the speed in ip, csp, tq or cst, and a quick stop's ramp of 6085h = "
                 f"{ramp[axis] / count:.0f} is too slow for it; nothing was sent. Have 6085h at "
                 f"{math.ceil(self._unramped_ramp()[axis] / count)} or more, or choose another mode"
             )

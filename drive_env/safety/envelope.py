@@ -106,6 +106,7 @@ class Envelope:
         self._disabling = np.zeros(drives.num_axes, bool)  # the last controlword was "disable operation"
         self._played: dict[Key, Integers] = {}  # modes and set-points of the rows that are under way
         self._of_further_axes = drives.description.of_further_axes()
+        self._set_points = frozenset((*SET_POINTS, drives.description.role(Role.TARGET_INSIDE)))
 
     @property
     def limits(self) -> Limits:
@@ -157,7 +158,7 @@ class Envelope:
         if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
             self._arm()
         self._commands.check_write(entry, raw, where)
-        if key in SET_POINTS:
+        if key in self._set_points:
             self._arm()
         if self._axes.is_armed:
             self._stops.keep_ramps(key, raw, where)
@@ -191,7 +192,7 @@ class Envelope:
             self._after_controlword(raw, where)
         elif key == MODE:
             self._axes.mode = np.where(where, raw, self._axes.mode)
-        elif key in SET_POINTS:
+        elif key in self._set_points:
             self._commands.note(key, raw, where)
         elif key in scale_objects(self._drives.description):
             self._limits.place()
@@ -245,7 +246,7 @@ class Envelope:
         enables = self._axes.everywhere if words is None else cia402.may_enable(words).any(axis=0)
         if words is not None:
             self._check_ends(words, [(entry.index, entry.sub) for entry in played])
-        if words is not None or any((entry.index, entry.sub) in SET_POINTS for entry in played):
+        if words is not None or any((entry.index, entry.sub) in self._set_points for entry in played):
             self._arm()
         if words is not None and enables.any():
             self._commands.check_modes(enables, played=played)
@@ -255,9 +256,9 @@ class Envelope:
             self._axes.assume(enables)
         self._checked_stop = self._stops.current
         self._played = {
-            (entry.index, entry.sub): rows
+            key: rows
             for entry, rows in played.items()
-            if (entry.index, entry.sub) in (MODE, *SET_POINTS) and len(rows)
+            if len(rows) and ((key := (entry.index, entry.sub)) == MODE or key in self._set_points)
         }
 
     def _check_place(self, entry: Entry) -> None:

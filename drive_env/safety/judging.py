@@ -15,10 +15,10 @@ from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce, bound_text
-from drive_env.safety.objects import CSP, CURRENT, DEMAND, HM, POSITION, PP, STATUSWORD, VELOCITY
+from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, PP, STATUSWORD, VELOCITY
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
 from drive_env.safety.rotor import wrapped
-from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, sees_demand
+from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, is_led, sees_demand
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -151,8 +151,9 @@ class Judging:
         known = bounds.profile > 0.0
         profile = np.sign(speed) * speed**2 / (2.0 * np.where(known, bounds.profile, 1.0)) * known
         ends = ends_by_itself(axes, bounds)
-        own = np.where(ends | ((axes.mode == CSP) & ~sees_demand(axes)), profile, own)
-        own = np.where((axes.mode == CSP) & ends, 0.0, own)
+        led = is_led(axes)
+        own = np.where(ends | (led & ~sees_demand(axes)), profile, own)
+        own = np.where(led & ends, 0.0, own)
         return own, np.where(by_position(axes), own, asked)
 
     def _judge_following(self, judged: Mask, error: Integers, bounds: Bounds) -> None:
@@ -160,7 +161,7 @@ class Judging:
         # The mode is an SDO transfer away: asked for only where it matters.
         if not np.any(judged & (largest > bounds.following)):
             return
-        follows = np.isin(self._modes(), (PP, CSP))
+        follows = np.isin(self._modes(), (PP, *LED_MODES))
         self._trip(
             judged,
             np.where(follows, largest, 0),

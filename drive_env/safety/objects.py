@@ -18,6 +18,7 @@ POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET = (
     (cia402.VELOCITY_OFFSET, 0),
     (cia402.TORQUE_OFFSET, 0),
 )
+INTERPOLATED_POSITION = (cia402.INTERPOLATION_DATA, 1)
 PROFILE_VELOCITY, POSITIONING_OPTIONS = (cia402.PROFILE_VELOCITY, 0), (cia402.POSITIONING_OPTIONS, 0)
 HOMING_RAMP = (cia402.HOMING_ACCELERATION, 0)
 HOMING_SPEED_TO_SWITCH, HOMING_SPEED_TO_ZERO = (cia402.HOMING_SPEEDS, 1), (cia402.HOMING_SPEEDS, 2)
@@ -36,11 +37,13 @@ DISABLE_OPERATION_OPTION, HALT_OPTION, FAULT_REACTION_OPTION = (
 # What makes an axis move, or changes how far; whoever writes it arms.
 SET_POINTS = (
     TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
+    INTERPOLATED_POSITION,
 )  # fmt: skip
 
-PP, PV, HM, CSP, CSV = 1, 3, 6, 8, 9  # modes of operation
+PP, PV, HM, IP, CSP, CSV = 1, 3, 6, 7, 8, 9  # modes of operation
+LED_MODES = (IP, CSP)  # by a position in each cycle
 TORQUE_MODES = (4, 10)
-UNRAMPED_MODES = (4, CSP, 10)  # tq, csp, cst: no object says how fast what they command may become
+UNRAMPED_MODES = (4, *LED_MODES, 10)  # tq, ip, csp, cst: no object says how fast what they command may become
 # What sets the speed of a mode, sums in brackets: from when the mode is on, and from when a move is started.
 RUNNING_SPEEDS = {PV: ((TARGET_VELOCITY,),), CSV: ((TARGET_VELOCITY, VELOCITY_OFFSET),)}
 MOVING_SPEEDS = {PP: ((PROFILE_VELOCITY,),), HM: ((HOMING_SPEED_TO_SWITCH,), (HOMING_SPEED_TO_ZERO,))}

@@ -26,7 +26,7 @@ from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN
-from drive_env.safety.objects import CSP, CSV, CURRENT, HM, PP, TORQUE_MODES
+from drive_env.safety.objects import CSP, CSV, CURRENT, HM, IP, PP, TORQUE_MODES
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -41,9 +41,14 @@ PROFILE_SHARE = 0.8  # of its way: its axis is a little faster or slower than it
 SHORT = 0.75  # of the current that is asked for: less flows at the end of the voltage, and the integral has it all
 
 
+def is_led(axes: Axes) -> Mask:
+    """Return which axes are led by a position in each cycle."""
+    return np.asarray((axes.mode == CSP) | (axes.mode == IP))  # in each look: np.isin takes ten times as long
+
+
 def by_position(axes: Axes) -> Mask:
     """Return which axes are in a mode that ends by itself, at a set-point which was checked."""
-    return np.asarray((axes.mode == PP) | (axes.mode == CSP))
+    return np.asarray((axes.mode == PP) | is_led(axes))
 
 
 def lags(axes: Axes) -> Mask:
