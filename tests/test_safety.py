@@ -218,7 +218,7 @@ def test_an_axis_that_stands_outside_is_told_how_to_come_back(bus, drive):
     with (
         CanDrives(bus=bus, pace="lockstep", safety=Limits(position=(-1000, 1000))) as drives,
         pytest.raises(
-            SafetyError, match=r"607Ah.* would lead to 3000.* nothing was sent. Bring the axis back in pp or pv"
+            SafetyError, match=r"607Ah.* would lead to 3000.* nothing was sent.* stands outside comes back in pp or pv"
         ),
     ):
         motion.enable(drives, mode="csp")

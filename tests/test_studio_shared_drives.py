@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from drive_env import cia402
+from drive_env.devices import find_device
+from drive_env.dictionary.roles import Role
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.errors import JobStoppedError
 from drive_env.studio.shared_drives import SharedDrives
@@ -24,7 +26,7 @@ def job():
         made.asked.append(asked)
         return np.zeros(1, np.int64)
 
-    drives = SimpleNamespace(read=call, write=call, time_waits=True, num_axes=1)
+    drives = SimpleNamespace(read=call, write=call, time_waits=True, num_axes=1, device=find_device("tgz_d"))
     recorder = SimpleNamespace(period=0.001)
     made.drives = SharedDrives(drives, recorder, lambda: None, list, lambda: False, lambda: made.stopped)
     return made
@@ -60,3 +62,14 @@ def test_a_job_that_was_stopped_may_stop_and_switch_off(job, word):
     job.stopped = "the last page is gone"
     job.drives.write(cia402.CONTROLWORD, word)
     assert job.asked == [(cia402.CONTROLWORD, word)]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [0x607A, (0x60FF, 0), "Target torque", 0x60B0, 0x60B1, 0x60B2, (0x60C1, 1), Role.TARGET_INSIDE, (0x23C7, 0)],
+)
+def test_what_moves_an_axis_belongs_to_the_page_that_wrote_it(job, name):
+    job.drives.write(0x6083, 1000)
+    assert not job.drives.moved.any()
+    job.drives.write(name, 1000)
+    assert job.drives.moved.all()

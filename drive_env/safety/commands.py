@@ -298,12 +298,10 @@ class Commands:
             axis = int(wrong[0])
             farthest = rows[outside[:, axis], axis][0]
             origin = self._limits.origin(self._limits.user.position, "position", "607Dh")
-            stands_inside = bounds.low[axis] <= self._axes.position[axis] <= bounds.high[axis]
-            remedy = "Choose a target inside" if stands_inside else "Bring the axis back in pp or pv"
             raise SafetyError(
                 f"axis {axis}: {entry.label} would lead to {farthest}, beyond the limits "
-                f"{bound_text(bounds.low[axis])} to {bound_text(bounds.high[axis])}; nothing was sent. {remedy}, "
-                f"or widen {origin}"
+                f"{bound_text(bounds.low[axis])} to {bound_text(bounds.high[axis])}; nothing was sent. Choose a target "
+                f"inside (an axis that stands outside comes back in pp or pv), or widen {origin}"
             )
 
     def _check_jumps(self, entry: Entry, aim: Integers, axes: Mask) -> None:

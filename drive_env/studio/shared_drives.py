@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import object_names, whole_cycles
 from drive_env.drives.interface import Drives, Integers, Mask
 from drive_env.drives.trace import Trace
@@ -50,10 +51,11 @@ SET_POINTS = frozenset(
     for index, name in (
         (cia402.TARGET_POSITION, "Target position"), (cia402.TARGET_VELOCITY, "Target velocity"),
         (cia402.TARGET_TORQUE, "Target torque"), (cia402.VL_TARGET_VELOCITY, "vl target velocity"),
-        (cia402.VELOCITY_OFFSET, "Velocity offset"), (cia402.TORQUE_OFFSET, "Torque offset"),
+        (cia402.POSITION_OFFSET, "Position offset"), (cia402.VELOCITY_OFFSET, "Velocity offset"),
+        (cia402.TORQUE_OFFSET, "Torque offset"),
     )
     for one in (index, (index, 0), name)
-)  # fmt: skip
+) | {(cia402.INTERPOLATION_DATA, 1), Role.TARGET_INSIDE}  # fmt: skip
 
 
 def _operates(value: ArrayLike) -> bool:
@@ -102,6 +104,8 @@ class SharedDrives:
         self._hear = hear
         self._moves = moves
         self._stopped = stopped
+        roles = drives.device.roles if drives.device is not None else {}
+        self._set_points = SET_POINTS | {roles.get(Role.TARGET_INSIDE)}
         self._refused: set[tuple[Key, ...]] = set()  # what cannot be sampled at once
         self._due = time.perf_counter()
         self._start = time.monotonic()
@@ -167,7 +171,7 @@ class SharedDrives:
         except SafetyError:  # it was not sent
             self.moved = before
             raise
-        if name in SET_POINTS:
+        if name in self._set_points:
             self.moved = moves
 
     def advance(self, duration: float) -> None:
