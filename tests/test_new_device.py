@@ -6,7 +6,9 @@ the vendor's EDS alone, and by python-canopen, which knows the EDS of the folder
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import re
 import time
 import uuid
@@ -499,6 +501,15 @@ def test_a_folder_whose_factory_values_make_no_scale_is_refused(tmp_path, text, 
     with pytest.raises(ValueError, match=r"100 to 268435456 are possible; correct their DefaultValue") as refused:
         find_device(str(eds.parent))
     assert str(refused.value).startswith(f"{eds}: the factory values of ") and told in str(refused.value)
+
+
+def test_a_folder_that_found_no_room_can_be_made_again(tmp_path, monkeypatch):
+    """The empty folder that stayed was refused: "exists already"."""
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device")))
+        with pytest.raises(OSError, match="No space left"):
+            made_of(tmp_path, BASE)
+    assert made_of(tmp_path, BASE)[0].folder.is_dir()
 
 
 INTERPOLATION = (
