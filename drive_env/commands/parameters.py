@@ -272,8 +272,8 @@ def _exchange(
             if differences:
                 ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
             changes = write_all_or_none(drives, wanted, axis)
-            rows = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
-            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {bus.node}{rows}"))
+            told = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
+            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {bus.node}{told}"))
             if store:
                 drives.write((0x1010, 1), SAVE)
         # What was just written is not believed to whom wrote it: another connection reads it anew.
