@@ -234,6 +234,27 @@ def test_an_eds_of_8_kb_cannot_describe_more_entries_than_drives_have():
         parse_eds(HEAD + "".join(f"[{0x2000 + k // 16:04X}sub{k % 16:X}]\n" for k in range(20_001)))
 
 
+def test_an_eds_below_100_kb_is_read_within_seconds(tmp_path):
+    """Keys that nobody knows took 15 s and 1.3 GB, handed down to each member; objects of further axes had no end."""
+    unknown = "".join(f"k{k}=\n" for k in range(200))
+    text = HEAD + "".join(entry(f"{0x6041 + 0x800 * axis:04X}", data_type="0x0006") for axis in range(8))
+    text += compact(74)[len(HEAD) :].replace("[20", "[61").replace("CompactSubObj", unknown + "CompactSubObj")
+    assert len(text) < 100_000
+    (tmp_path / "a.eds").write_text(text)
+    begun = time.process_time()
+    describe(None, tmp_path / "a.eds").of_further_axes()
+    assert time.process_time() - begun < 5.0
+
+
+def test_an_eds_has_so_many_lines_of_so_many_letters():
+    with pytest.raises(UntrustedFileError, match="has 300001 lines, and 300000 are read; leave out those"):
+        parse_eds("\n" * 300_001)
+    file = parse_eds(HEAD + entry("2000", Note="x" * 2_000) + "Note=y\n" * 3)
+    assert len(file.sections["2000"]["Note"]) == 1000 - len("Note=")
+    assert "2005 letters: what follows the first 1000 was left out" in {one.what for one in file.repairs}
+    assert max(len(one.what) for one in file.repairs) < 1100
+
+
 @pytest.mark.parametrize("count", ["0xFFFFFFFF", "1000000000000", "255", "-1"])
 def test_an_array_has_at_most_254_members(count):
     """A count of ten digits was counted to its end."""

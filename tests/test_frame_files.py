@@ -13,6 +13,7 @@ import can
 import pytest
 from typer.testing import CliRunner
 
+from drive_env.commands import recorded_frames
 from drive_env.commands.cli import app
 from drive_env.commands.frame_files import FrameFile
 
@@ -103,6 +104,31 @@ def test_replay_names_the_formats_that_it_reads(tmp_path):
     (tmp_path / "a.pcap").write_bytes(b"")
     done = CliRunner().invoke(app, ["replay", str(tmp_path / "a.pcap")])
     assert done.exit_code == 2 and "'.pcap' is not one of .log, .blf, .asc" in done.stderr
+
+
+GOOD = b"(1.0) can0 601#2B40600000000000\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (GOOD + b"(1.5) can0 201#0F", "a.log: its last line has no end, and may be cut off; take it out"),
+        (GOOD + bytes(500), "a.log: its last line has no end"),  # as after a power cut
+        (GOOD + b"(1.5) can0 " + b"z" * 1_000_000 + b"#00\n", "..., near frame 2; is it complete?"),
+        (GOOD + b"(1.5) can0 601#R" + b"9" * 5_000 + b"\n", "value has 5000 digits, near frame 2; is it complete?"),
+        (GOOD + b"(1.5) can0 201#" + b"00" * 9 + b"\n", "frame 2 of a master has the identifier 201h and 9 bytes; "),
+        (GOOD + b"(1.5) can0 601##1" + b"00" * 64 + b"\n", "identifier 601h and 64 bytes; classic CAN has up to"),
+        (GOOD + b"(1.5) can0 FFF#R\n", "identifier FFFh and 0 bytes; classic CAN has up to 7FFh and 8"),
+    ],
+    ids=["cut", "zeros", "endless word", "endless number", "9 bytes", "FD", "identifier"],
+)
+def test_what_no_master_has_sent_is_refused_before_the_first_frame(tmp_path, monkeypatch, content, told):
+    """A frame that was cut was sent as another one; those that no bus takes ended a replay with the motor on."""
+    monkeypatch.setattr(recorded_frames, "call_limited", lambda _, function, *arguments, **__: function(*arguments))
+    (tmp_path / "a.log").write_bytes(content)
+    done = CliRunner().invoke(app, ["replay", str(tmp_path / "a.log"), "--dry-run"])
+    assert (done.exit_code, done.stdout) == (2, "") and told in done.stderr
+    assert len(done.stderr.splitlines()) == 1 and len(done.stderr) < 500
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are otherwise there")

@@ -6,7 +6,9 @@ the vendor's EDS alone, and by python-canopen, which knows the EDS of the folder
 
 from __future__ import annotations
 
+import errno
 import math
+import os
 import re
 import time
 import uuid
@@ -479,6 +481,35 @@ def test_a_scale_of_which_32_bits_hold_no_8_turns_is_told_and_not_taken(tmp_path
         motion.enable(drives, mode="pp")
         motion.move_to(drives, 4096)
         assert abs(drives.read(0x6064)[0] - 4096) < 82
+
+
+@pytest.mark.parametrize(
+    ("text", "changes", "told"),
+    [(put(BASE + RESOLUTION, "608Fsub1", DefaultValue=4096), {"608Fsub2": 0},
+      "608Fh:01 Feed constant.Feed = 4096, 608Fh:02 Feed constant.Revolutions = 0 make inf units"),
+     (BASE + FEED_36000, {"6091sub1": 1, "6091sub2": 4294967295}, "= 4294967295 make 1.54619e+14 units"),
+     (BASE + FEED_36000, {"6092sub1": 0, "6092sub2": 0}, "= 1 make nan units")],
+    ids=["608Fh:02 = 0", "6091h 1/max", "6092h 0/0"],
+)  # fmt: skip
+def test_a_folder_whose_factory_values_make_no_scale_is_refused(tmp_path, text, changes, told):
+    """Folders from before `drive-env new` looked for it: positions of -2^63, and axes that never moved."""
+    eds = made_of(tmp_path, text)[0].folder / "drive.eds"
+    content = eds.read_text()
+    for section, value in changes.items():
+        content = put(content, section, DefaultValue=value)
+    eds.write_text(content)
+    with pytest.raises(ValueError, match=r"100 to 268435456 are possible; correct their DefaultValue") as refused:
+        find_device(str(eds.parent))
+    assert str(refused.value).startswith(f"{eds}: the factory values of ") and told in str(refused.value)
+
+
+def test_a_folder_that_found_no_room_can_be_made_again(tmp_path, monkeypatch):
+    """The empty folder that stayed was refused: "exists already"."""
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device")))
+        with pytest.raises(OSError, match="No space left"):
+            made_of(tmp_path, BASE)
+    assert made_of(tmp_path, BASE)[0].folder.is_dir()
 
 
 INTERPOLATION = (

@@ -484,13 +484,14 @@ def test_what_ffmpeg_says_is_told_and_nothing_is_left(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["bin"]
 
 
-def test_a_film_broken_off_leaves_nothing(tmp_path):
+@pytest.mark.parametrize("name", ["run.gif", "run"])
+def test_a_film_broken_off_leaves_nothing(tmp_path, name):
     def broken():
         yield from three_frames()
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_film(tmp_path / "run.gif", broken(), 0.04)
+        write_film(tmp_path / name, broken(), 0.04)
     assert not list(tmp_path.iterdir())
 
 

@@ -496,11 +496,11 @@ def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     write_inputs(folder, inputs_in(found.configuration))
-    found.save(folder / "report.json")
     episode_log.save(folder / "episodes.npz", found.environment, found.configuration, found.episodes)
     evaluation_plots.save(found, folder)
     if gaps:
         write_whole(folder / "gap.txt", "\n".join(gaps) + "\n")
+    found.save(folder / "report.json")  # last: a folder that has it is whole
     if not json:
         print(f"written to {folder}")
 

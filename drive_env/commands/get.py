@@ -33,6 +33,7 @@ from drive_env.commands.options import (
     object_name,
     print_json,
     scales_of,
+    told_if_interrupted,
 )
 
 if TYPE_CHECKING:
@@ -131,9 +132,10 @@ def set_object(
             _ask_where_live(drives, f"{entry.label} = {value}", yes)
         elif cia402.cuts_voltage(wanted[0]):
             _bring_to_rest(drives, chosen)
-        _write(drives, entry, chosen, wanted if drives.description.is_number(entry) else value)
         readable = entry.access != "wo"
-        found = drives.read((entry.index, entry.sub)) if readable else wanted
+        with told_if_interrupted(f"{entry.label} may be {value} by now; drive-env get {name!r} shows it"):
+            _write(drives, entry, chosen, wanted if drives.description.is_number(entry) else value)
+            found = drives.read((entry.index, entry.sub)) if readable else wanted
         if json:
             print_json([axis_place(drives, k) | _row(entry, found[k], scales[k]) for k in chosen])
         else:

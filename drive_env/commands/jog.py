@@ -329,11 +329,11 @@ def _turn(motion: Any, one: _OneAxis, velocity: int, duration: float, is_recorde
 
 def _go(motion: Any, one: _OneAxis, velocity: int, distance: int, is_recorded: bool) -> Any:
     """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it."""
+    from drive_env.drives.lent_object import lent
+
     drives, cycle = one.drives, one.cycle
     trace = None
-    before = one.read(cia402.PROFILE_VELOCITY)
-    one.write(cia402.PROFILE_VELOCITY, velocity)
-    try:
+    with lent(drives, cia402.PROFILE_VELOCITY, velocity, one.where):
         if is_recorded:  # mapping takes a while: not with an axis enabled
             nothing = one.rows([], 0)
             one.record(0.0, {cia402.TARGET_POSITION: nothing, cia402.CONTROLWORD: nothing})
@@ -350,8 +350,6 @@ def _go(motion: Any, one: _OneAxis, velocity: int, distance: int, is_recorded: b
         else:
             motion.start_move(drives, distance, relative=True, where=one.where)
         _arrive(motion, one, velocity, 10.0 + 2.0 * abs(distance) / velocity)
-    finally:
-        one.write(cia402.PROFILE_VELOCITY, before)
     return trace
 
 

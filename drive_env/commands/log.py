@@ -31,6 +31,7 @@ from drive_env.commands.options import (
 from drive_env.drives.arguments import LONGEST
 
 MOST_CHANNELS = 0xFFFF
+HIGHEST_ID, LONGEST_DATA = 0x7FF, 8  # of the frames that are sent
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
 WRITTEN = (*FORMATS, ".pcap")
@@ -130,7 +131,7 @@ def replay(
         if not 0.0 < speed < math.inf:
             raise ValueError(f"--speed {speed:g} must be above 0")
         frames = read_frames(file, everything=everything)
-        _check_stamps(file, frames, speed)
+        _check_frames(file, frames, speed)
         if dry_run:
             for frame in frames:
                 print(show_frame(frame.arbitration_id, bytes(frame.data), frame.is_remote_frame))
@@ -144,9 +145,18 @@ def replay(
             port.close()
 
 
-def _check_stamps(file: Path, frames: list[Any], speed: float) -> None:
-    """Raise ValueError for stamps between which nobody can wait; a log goes a little back where two buses were."""
+def _check_frames(file: Path, frames: list[Any], speed: float) -> None:
+    """Raise ValueError for frames that classic CAN does not have, and stamps between which nobody can wait.
+
+    A log goes a little back where two buses were.
+    """
     for number, frame in enumerate(frames, 1):
+        size = max(len(frame.data), frame.dlc)
+        if size > LONGEST_DATA or frame.dlc < 0 or frame.arbitration_id > HIGHEST_ID:
+            raise ValueError(
+                f"{file}: frame {number} of a master has the identifier {frame.arbitration_id:X}h and {size} bytes; "
+                f"classic CAN has up to {HIGHEST_ID:X}h and {LONGEST_DATA}: take the frame out"
+            )
         after = (frame.timestamp - frames[0].timestamp) / speed
         if not -LONGEST <= after <= LONGEST:
             raise ValueError(

@@ -203,6 +203,16 @@ def ending_by(
         fail("interrupted", INTERRUPTED)
 
 
+@contextmanager
+def told_if_interrupted(what: str) -> Iterator[None]:
+    """Say what was written, if Ctrl-C ends a block before the command has said it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"drive-env: {what}", file=sys.stderr)
+        raise
+
+
 def fail(error: object, code: int) -> NoReturn:
     """End the command with a red line."""
     typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)

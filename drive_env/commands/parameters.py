@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -33,6 +34,7 @@ from drive_env.commands.options import (
     names_a_bus,
     print_json,
     scales_of,
+    told_if_interrupted,
 )
 from drive_env.commands.tables import Column, print_table
 from mechanics.untrusted import read_toml
@@ -255,25 +257,28 @@ def _exchange(
     wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
         look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
-    with _connected(*bus) as drives:
-        _check_axis(drives, axis)
-        check(drives)
-        differences = compare(drives, wanted, axis)
-        scale = scales_of(drives)[axis]
-        if not json:
-            _print(differences, "drive", name, scale, json)
-        if dry_run:
-            check_at_rest(drives, wanted, axis)
-            _tell_plan(differences, scale, bus.node, store=store, json=json)
-            return
-        if differences:
-            ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
-        changes = write_all_or_none(drives, wanted, axis)
-        if store:
-            drives.write((0x1010, 1), SAVE)
-    # What was just written is not believed to whom wrote it: another connection reads it anew.
-    with _connected(*bus) as drives:
-        left = compare(drives, wanted, axis)
+    with ExitStack() as written:
+        with _connected(*bus) as drives:
+            _check_axis(drives, axis)
+            check(drives)
+            differences = compare(drives, wanted, axis)
+            scale = scales_of(drives)[axis]
+            if not json:
+                _print(differences, "drive", name, scale, json)
+            if dry_run:
+                check_at_rest(drives, wanted, axis)
+                _tell_plan(differences, scale, bus.node, store=store, json=json)
+                return
+            if differences:
+                ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
+            changes = write_all_or_none(drives, wanted, axis)
+            told = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
+            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {bus.node}{told}"))
+            if store:
+                drives.write((0x1010, 1), SAVE)
+        # What was just written is not believed to whom wrote it: another connection reads it anew.
+        with _connected(*bus) as drives:
+            left = compare(drives, wanted, axis)
     if left:
         fail(
             f"node {bus.node} does not have the values that were written, by a second reading: "

@@ -6,6 +6,7 @@ A .blf is packed, and a .db holds whatever its writer put there: neither says ho
 from __future__ import annotations
 
 import marshal
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from mechanics.limited_child import call_limited
 from mechanics.untrusted import MOST_RECORDING, check_size
 
 MEMORY = 4_000_000_000  # bytes for the frames that are sent, some 10^7
+LONGEST_REASON = 200  # letters of what python-can says of a broken place: it may repeat a line
 TIME = 900.0  # s of the processor; MOST_RECORDING takes a tenth of it
 
 
@@ -30,10 +32,11 @@ def read_frames(file: Path, *, everything: bool) -> list[RecordedFrame]:
     """Return the frames of a master in a log, or all of them, in their order.
 
     Raises:
-        ValueError: If it cannot be read, or exceeds a limit.
+        ValueError: If it cannot be read, ends within a line, or exceeds a limit.
         OSError: If there is none.
     """
     check_size(file, MOST_RECORDING)
+    _check_end(file)
     rows = marshal.loads(call_limited(f"the log {file}", _frames_as_bytes, file, everything, memory=MEMORY, time=TIME))
     return [RecordedFrame(*row) for row in rows]
 
@@ -41,16 +44,35 @@ def read_frames(file: Path, *, everything: bool) -> list[RecordedFrame]:
 def _frames_as_bytes(file: Path, everything: bool) -> bytes:
     import can
 
+    rows, count = [], 0
     try:
         with can.LogReader(str(file)) as reader:
-            rows = [_row(frame) for frame in reader if _is_taken(frame, everything)]
+            for count, frame in enumerate(reader, 1):  # noqa: B007
+                if _is_taken(frame, everything):
+                    rows.append(_row(frame))
     except MemoryError:
         raise
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from None
     except Exception as error:  # each format's reader raises what the broken place leads to
-        raise ValueError(f"{file} cannot be read as {file.suffix}: {error}; is it complete?") from error
+        why = str(error).partition(";")[0]
+        why = why if len(why) <= LONGEST_REASON else f"{why[:LONGEST_REASON]}..."
+        raise ValueError(
+            f"{file} cannot be read as {file.suffix}: {why}, near frame {count + 1}; is it complete?"
+        ) from error
     return marshal.dumps(rows)
+
+
+def _check_end(file: Path) -> None:
+    """Raise ValueError for a candump that ends within a line: what is left of a frame that was cut is another one."""
+    if file.suffix.lower() != ".log" or file.stat().st_size == 0:
+        return
+    with file.open("rb") as content:
+        content.seek(-1, os.SEEK_END)
+        if content.read() not in b"\r\n":
+            raise ValueError(
+                f"{file}: its last line has no end, and may be cut off; take it out, or end it with a line feed"
+            )
 
 
 def _row(frame: Any) -> tuple[float, int, bytes, int, bool]:

@@ -14,7 +14,7 @@ from drive_env import cia402
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
-from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
+from drive_env.devices.own_folder import BINDINGS, check_scale, is_own_folder, naming, own_bindings, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
 from drive_env.devices.variants import (
     check_rates,
@@ -373,6 +373,7 @@ def _own_device(folder: Path) -> Device:
         dictionary = device.new_dictionary()
         for key in bindings:
             dictionary.find(key)
+        check_scale(roles, dictionary)
     return device
 
 

@@ -8,6 +8,7 @@ effect here stays an entry that can be read and written, and is listed as such.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -146,8 +147,13 @@ def new_device(
     draft = _Draft(eds, motor, velocity_unit, acceleration_unit)
     made = draft.made(folder)
     files: dict[Path, str | bytes] = {folder / name: text for name, text in draft.files(folder).items()}
-    with files_to_be(files | {folder / LIST_NAME: made.text()}):
-        pass
+    try:
+        with files_to_be(files | {folder / LIST_NAME: made.text()}):
+            pass
+    except BaseException:
+        with suppress(OSError):
+            folder.rmdir()  # it would be refused the next time
+        raise
     return made
 
 

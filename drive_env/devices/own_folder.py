@@ -18,8 +18,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drive_env.devices.variants import Key, parse_key
 from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.dictionary.position_scale import COARSEST, FINEST, is_scale, position_scale
+from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import UNITS, find_unit
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
@@ -61,6 +66,24 @@ def own_bindings(folder: Path) -> dict[Key, Binding]:
         except ValueError:
             raise ValueError(f"{text} has no unit {binding.unit!r}{did_you_mean(binding.unit, UNITS)}") from None
     return bindings
+
+
+def check_scale(roles: Mapping[Role, Key], dictionary: ObjectDictionary) -> None:
+    """Raise ValueError for factory values that make no scale of positions."""
+    scale = position_scale(roles)
+    if scale is None:
+        return
+    values = [dictionary.find(key).default for key in scale.keys]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        units = float(scale.increments([np.array(float(value)) for value in values]))
+    if not is_scale(units) and values != [0]:  # an object of its own that is 0 is set by the commissioning
+        told = ", ".join(
+            f"{dictionary.find(key).label} = {value}" for key, value in zip(scale.keys, values, strict=True)
+        )
+        raise ValueError(
+            f"the factory values of {told} make {units:g} units of position in a turn, and {COARSEST:g} to "
+            f"{FINEST:.0f} are possible; correct their DefaultValue, or make the folder anew with drive-env new"
+        )
 
 
 @contextmanager

@@ -15,11 +15,10 @@ from typing import NamedTuple
 from canopen.objectdictionary import ODVariable
 
 from drive_env import cia402
+from drive_env.dictionary.position_scale import COARSEST, FINEST, is_scale
 
 Key = tuple[int, int]
 
-# Units of position in a turn: by fewer no position could be held, and of more 32 bits hold fewer than 8 turns.
-COARSEST, FINEST = 100.0, float(2**28)
 # Codes of CiA 303-2 in 60A8h to 60AAh: powers of ten above, then numerator, denominator, and a byte that is 0.
 RADIAN, GRADIAN, DEGREE, ARC_MINUTE, ARC_SECOND = 0x10, 0x40, 0x41, 0x42, 0x43
 DIMENSIONLESS, REVOLUTIONS, INCREMENTS, PER_MINUTE = 0x00, 0xB4, 0xB5, 0xC0
@@ -234,7 +233,7 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
     position = _code(types, cia402.POSITION_UNIT)
     angle = 1.0 / (position.prefix * ANGLES[position.numerator]) if position is not None and position.is_angle else 0.0
     if units > 0 and turns > 0:
-        if _is_scale(units / turns * geared):
+        if is_scale(units / turns * geared):
             if angle and not math.isclose(angle, units / turns, rel_tol=1e-3):
                 said = f"{_shown(types, cia402.POSITION_UNIT)} says {angle:g}"
                 notes.append(("60A8h", f"6092h counts, {units / turns:g} units a turn; {said}"))
@@ -246,7 +245,7 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
                 _no_scale(f"{units * shaft} : {turns * motor}", units / turns * geared),
             )
         )
-    if _is_scale(round(angle * geared)):
+    if is_scale(round(angle * geared)):
         if has_gear:
             notes.append(("6091h", f"its factory's ratio is in the scale that 60A8h gives, {angle:g} units a turn of "
                                    "the shaft; another ratio that is written changes nothing"))  # fmt: skip
@@ -263,15 +262,10 @@ def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tup
         notes.append(("6091h", why))
     if all(key in types for key in encoder.values()):
         counts, per = _factory(types, encoder)
-        if counts <= 0 or per <= 0 or _is_scale(counts / per):
+        if counts <= 0 or per <= 0 or is_scale(counts / per):
             return encoder, 0, Feed(0.0, "608Fh")
         notes.append(("608Fh", _no_scale(f"{counts} : {per}", counts / per)))
     return {}, 0, Feed(0.0, "")
-
-
-def _is_scale(units: float) -> bool:
-    """Return whether positions can be counted in so many units a turn."""
-    return COARSEST <= units <= FINEST
 
 
 def _no_scale(ratio: str, units: float) -> str:

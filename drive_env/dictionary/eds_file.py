@@ -62,9 +62,12 @@ _COMPACT = re.compile(r"([0-9A-Fa-f]{4})(Name|Value)$", re.IGNORECASE)
 
 MOST_ENTRIES = 20_000  # sections, those included that CompactSubObj stands for: no drive's file known has a tenth
 MOST_SUB = 254  # highest sub-index (CiA 301)
+MOST_LINES = 300_000  # an entry has some ten
 LONGEST_NAME = 200  # letters of a section's name
+LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 members, and in what is told
 
 VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
+MEMBER_KEYS = (*VALUE_KEYS, "ParameterValue", "ObjFlags", "Unit", "Factor", "Description")  # that an array hands down
 
 Section = dict[str, str]
 
@@ -128,7 +131,7 @@ def parse_eds(text: str, node_id: int = 1) -> EdsFile:
         node_id: For sums with the node-ID that CiA 306 does not have.
 
     Raises:
-        UntrustedFileError: If it describes more than MOST_ENTRIES.
+        UntrustedFileError: If it describes more than MOST_ENTRIES, or has more than MOST_LINES.
     """
     return _Repairer(text, node_id).file()
 
@@ -167,8 +170,16 @@ class _Repairer:
         section: Section | None = None
         name = ""
         is_second = False
-        for number, raw in enumerate(text.lstrip("\ufeff").replace("\0", "").splitlines(), 1):
+        lines = text.lstrip("\ufeff").replace("\0", "").splitlines()
+        if len(lines) > MOST_LINES:
+            raise UntrustedFileError(
+                f"the EDS has {len(lines)} lines, and {MOST_LINES} are read; leave out those that you do not need"
+            )
+        for number, raw in enumerate(lines, 1):
             line = raw.strip()
+            if len(line) > LONGEST_LINE:
+                self._tell(f"line {number}", f"{len(line)} letters: what follows the first {LONGEST_LINE} was left out")
+                line = line[:LONGEST_LINE]
             if not line or line.startswith(";"):
                 continue
             if line.startswith(("#", "//")):
@@ -231,7 +242,7 @@ class _Repairer:
                 self._tell(f"[{name}]", f"CompactSubObj={text} must be 1 to {MOST_SUB}")
                 continue
             texts = {kind: self._sections.pop(f"{place[0]:04X}{kind}", {}) for kind in ("Name", "Value")}
-            member = {key: row[key] for key in row if key not in ("SubNumber", "ObjectType", "ParameterName")}
+            member = {key: row[key] for key in MEMBER_KEYS if key in row}
             first = {"ParameterName": "Number of entries", "DataType": "0x5", "AccessType": "ro"}
             self._sections.setdefault(object_section(place[0], 0), first | {"DefaultValue": str(count)})
             for sub in range(1, count + 1):

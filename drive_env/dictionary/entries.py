@@ -200,6 +200,8 @@ class ObjectDictionary:
 
     def has(self, name: ObjectName) -> bool:
         """Return whether there is such an object, or one that plays such a part."""
+        if type(name) is tuple and len(name) == 2:  # an error's message looks through all of them
+            return name in self._entries
         try:
             self.find(name)
         except ObjectAccessError:

@@ -18,6 +18,9 @@ from drive_env.dictionary.roles import Role
 Floats = NDArray[np.float64]
 Key = tuple[int, int]
 
+# Units of position in a turn: by fewer no position could be held, and of more 32 bits hold fewer than 8 turns.
+COARSEST, FINEST = 100.0, float(2**28)
+
 
 class PositionScale(NamedTuple):
     """The objects that say a scale, and what their values make: the increments of a revolution, of any shape."""
@@ -39,6 +42,11 @@ def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
         if all(part in roles for part in parts):
             return PositionScale(tuple(roles[part] for part in parts), increments)
     return None
+
+
+def is_scale(units: float) -> bool:
+    """Return whether positions can be counted in so many units a turn."""
+    return COARSEST <= units <= FINEST
 
 
 _RESOLUTION = (Role.ENCODER_INCREMENTS, Role.ENCODER_TURNS)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
+import signal
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -27,6 +28,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.trace import Trace
+from drive_env.held_signals import held_signals
 from drive_env.master.cycle_runner import CycleRunner
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import BusError, NoAnswerError
@@ -258,16 +260,19 @@ class BusDrives:
             return
         if self.safety is not None:
             self.safety.close()  # if something ends this, close can be called again, and is at the interpreter's end
-        self._closed = True
-        atexit.unregister(self.close)
-        try:
-            for k, node in enumerate(self.nodes):
-                if self.safety is not None and self.safety.has_lost(k):
-                    continue  # it is left to its watchdog: what it hears is what it heard
-                with _logged(f"the PDOs of node {node} stay as they are"):
-                    self._link.process.restore(k)
-        finally:
-            self._link.close()
+        with held_signals() as noted:  # between two of its PDOs a drive has neither ours nor its own
+            self._closed = True
+            atexit.unregister(self.close)
+            try:
+                for k, node in enumerate(self.nodes):
+                    if self.safety is not None and self.safety.has_lost(k):
+                        continue  # it is left to its watchdog: what it hears is what it heard
+                    with _logged(f"the PDOs of node {node} stay as they are"):
+                        self._link.process.restore(k)
+            finally:
+                self._link.close()
+        if noted:
+            signal.raise_signal(noted[0])
 
     def __enter__(self) -> Self:
         return self

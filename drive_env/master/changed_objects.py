@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import BusError
 from drive_env.master.link import NoWatchdogError, ObjectClient
@@ -59,11 +60,17 @@ class ChangedObjects:
         found = self.read(key)[: len(data)]
         if only_from is not None and found != only_from:
             return
+        is_new = key not in self._before
+        self._before.setdefault(key, found if before is None else before)
         if found != data:
-            self._sdo.write(*key, data, label, timeout)
+            try:
+                self._sdo.write(*key, data, label, timeout)
+            except ObjectAccessError:
+                if is_new:
+                    del self._before[key]
+                raise
             if (now := self.read(key)[: len(data)]) != data:
                 raise NoWatchdogError(f"node {self._node} took {data.hex()} for {label} and has {now.hex()}; {REMEDY}")
-        self._before.setdefault(key, found if before is None else before)
         self._set[key] = data
 
     def quick_stop_on_lost_connection(self) -> None:

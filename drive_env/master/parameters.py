@@ -13,6 +13,7 @@ from drive_env import cia402
 from drive_env.canopen.frames import INVALID
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.held_signals import held_signals
 from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
@@ -173,12 +174,13 @@ def _is_live(drives: BusDrives, axis: int) -> bool:
 
 
 def _roll_back(drives: BusDrives, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:
-    why = str(cause) or type(cause).__name__
+    why = "interrupted" if isinstance(cause, KeyboardInterrupt) else str(cause)
     try:
-        now = read_these(drives, before, axis)
-        changed = {key: value for key, value in reversed(list(before.items())) if now[key] != value}
-        _write(drives, changed, now, axis)
-        left = compare(drives, before, axis)
+        with held_signals():  # a second Ctrl-C would leave a mixture
+            now = read_these(drives, before, axis)
+            changed = {key: value for key, value in reversed(list(before.items())) if now[key] != value}
+            _write(drives, changed, now, axis)
+            left = compare(drives, before, axis)
     except (ObjectAccessError, BusError) as error:
         raise RollbackError(
             f"{why}; and taking it back failed: {error}. The drive holds a mixture: restore the backup once it "

@@ -67,12 +67,13 @@ def write_film(out: str | Path, frames: Iterable[Image], frame_time: float) -> N
     """
     path = check_out(out)
     stream = iter(frames)
-    if not path.suffix:
-        _write_folder(path, stream)
-        return
     with tempfile.TemporaryDirectory(dir=path.absolute().parent, prefix=".film-") as folder:
         part = Path(folder) / path.name
-        if path.suffix.lower() == VIDEO:
+        if not path.suffix:
+            _write_folder(part, stream)
+            if path.is_dir():
+                path.rmdir()  # Windows puts nothing in its place
+        elif path.suffix.lower() == VIDEO:
             _write_video(part, stream, frame_time)
         else:
             _write_animation(part, stream, frame_time)
@@ -115,7 +116,7 @@ def _with_one_palette(pictures: list[Any]) -> list[Any]:
 def _write_folder(folder: Path, frames: Iterator[Image]) -> None:
     from PIL import Image as Pillow
 
-    folder.mkdir(exist_ok=True)
+    folder.mkdir()
     for k, frame in enumerate(frames):
         Pillow.fromarray(frame).save(folder / f"frame_{k:05d}.png")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives
+from drive_env.drives.lent_object import lent
 from drive_env.master import quantities
 
 if TYPE_CHECKING:
@@ -113,11 +115,10 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
         rate = parsed(session, axis, speed, cia402.PROFILE_VELOCITY) if speed.strip() else None
         _check_enabled(drives, axis)
         motion.select_mode(drives, "pp", where=where)
-        if rate is not None:
-            if rate <= 0:
-                raise ValueError(f"a speed of {speed} moves nothing; give one above 0")
-            drives.write(cia402.PROFILE_VELOCITY, rate, where=where)
-        motion.move_to(drives, target, relative=relative, where=where, timeout=LONGEST_MOVE)
+        if rate is not None and rate <= 0:
+            raise ValueError(f"a speed of {speed} moves nothing; give one above 0")
+        with nullcontext() if rate is None else lent(drives, cia402.PROFILE_VELOCITY, rate, where):
+            motion.move_to(drives, target, relative=relative, where=where, timeout=LONGEST_MOVE)
 
     return job
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,7 +48,9 @@ def undo(
     to these drives. The axes must be disabled. Each axis is written completely or not at all, and read back.
     """
     with errors_as_exit_codes():
+        from drive_env.master.errors import BusError
         from tuning.snapshot import load_snapshot
+        from tuning.way_back import what_is_changed
 
         snapshot = load_snapshot(file, unchecked=unchecked)
         if not snapshot.bus:
@@ -58,7 +61,12 @@ def undo(
         which = f"axis {', '.join(map(str, address['axes']))} of node {nodes}" if "axes" in address else f"node {nodes}"
         ask(f"Restore {which} on {address.get('channel')}?", yes)
         keep = snapshot.stored if store is None else store
-        changed, verified = _restore(file, snapshot, address, keep, other_drive=other_drive)
+        try:
+            changed, verified = _restore(file, snapshot, dict(address), keep, other_drive=other_drive)
+        except (KeyboardInterrupt, BusError):
+            if address == snapshot.bus:
+                print(f"drive-tune: {what_is_changed(file)}", file=sys.stderr)
+            raise
     if json:
         rows = [{"axis": k, "object": c.entry.label, "found": c.found, "restored": c.wanted} for k, c in changed]
         print_json({"changed": rows, "verified": verified, "stored": keep})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -9,6 +10,7 @@ from functools import cached_property
 from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.held_signals import held_signals
 from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.dry_run import DryPort, DrySdoClient
@@ -132,12 +134,15 @@ class CanLink:
         try:
             before = self._read(0, producer)
             self._network.on_error_control = lambda node, data: beats.append(data)
-            self._write(0, producer, 1)
-            self.port.drain()
-            beats.clear()
-            time.sleep(TIME_LOOK)
-            self._read(0, producer)  # whoever is late answers after what was due before
-            self._write(0, producer, before)
+            with held_signals() as noted:
+                self._write(0, producer, 1)
+                self.port.drain()
+                beats.clear()
+                time.sleep(TIME_LOOK)
+                self._read(0, producer)  # whoever is late answers after what was due before
+                self._write(0, producer, before)
+            if noted:
+                signal.raise_signal(noted[0])
         except ObjectAccessError:
             return None
         finally:

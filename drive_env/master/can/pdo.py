@@ -154,7 +154,8 @@ class PdoConfiguration:
                 pdos.append(self._map(direction, number, axis, group))
                 used.add((direction.name, number))
         for key in [key for key in self._before if key[0] == direction.name and key not in used]:
-            self._put_back(direction, self._before.pop(key))
+            self._put_back(direction, self._before[key])
+            del self._before[key]
         if direction is OUT_OF_DRIVE:
             self._silence({pdo for _, pdo in used})
         return pdos
@@ -192,8 +193,8 @@ class PdoConfiguration:
                 if cob_id & INVALID or kind not in WITH_SYNC:
                     self._quiet.add(number)
                     continue
-                self._put(direction.communication + number, 1, cob_id | INVALID, 4, self._sdo.write)
                 self._silenced[number] = cob_id
+                self._put(direction.communication + number, 1, cob_id | INVALID, 4, self._sdo.write)
 
     def _map(self, direction: Direction, number: int, axis: int, group: Sequence[Entry]) -> RemotePdo:
         label = f"{direction.name} {number + 1} of node {self._node}"

@@ -1,0 +1,47 @@
+"""An object that has another value while something moves, and its own again afterwards."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from drive_env.drives.arguments import checked_mask
+from drive_env.drives.interface import Drives, Mask
+from drive_env.held_signals import held_signals
+
+logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def lent(drives: Drives, index: int, value: int, where: Mask | None = None) -> Iterator[None]:
+    """Have an object of axes another value while a block runs.
+
+    However the block ends, the object gets back what it had; a line in the log says where that failed, and what
+    restores it.
+
+    Args:
+        drives: The drives.
+        index: The object, sub-index 0.
+        value: As the wire carries it.
+        where: Axes; all by default.
+    """
+    before = drives.read(index)
+    try:
+        drives.write(index, value, where=where)
+        yield
+    finally:
+        with held_signals() as noted:  # a second Ctrl-C does not cut it short
+            try:
+                drives.write(index, before, where=where)
+            except Exception:
+                for axis in np.flatnonzero(checked_mask(where, drives.num_axes)):
+                    logger.warning(
+                        "axis %d: %04Xh may be %d still, and was %d; drive-env set %04X %d --raw restores it",
+                        axis, index, value, before[axis], index, before[axis],
+                    )  # fmt: skip
+                raise
+        if noted:
+            raise KeyboardInterrupt
