@@ -127,6 +127,20 @@ def test_a_mode_of_a_position_that_an_axis_cannot_come_to_rest_in_is_not_taken()
         assert int(emulated.read(0x6061)[0]) == 9
 
 
+@pytest.mark.parametrize("cycles", [10, 60])
+def test_homing_begins_from_rest(emulated, cycles):
+    """On its way back to a far set-point an axis was faster than homing ever is: its stop ended 5.4 turns outside."""
+    emulated.machine.reset()
+    with MemoryDrives(MemoryBus(emulated), safety=LIMITS) as drives:
+        motion.enable(drives, mode="csp")
+        drives.write(0x607A, round(2.9 * TURN))
+        drives.advance(cycles * 0.001)
+        with pytest.raises(SafetyError, match=r"axis 0: homing begins from rest, and it moves by .* nothing was sent"):
+            motion.select_mode(drives, "hm")
+        drives.advance(0.5)
+        motion.select_mode(drives, "hm")
+
+
 @pytest.mark.parametrize("device", ["tmcm6212", "tmcm3313"])
 def test_a_jump_that_a_stepper_cannot_follow_is_not_sent(device):
     """It lost its steps, and the stop that followed took the rotor more than a turn out of its travel."""

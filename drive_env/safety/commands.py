@@ -22,6 +22,7 @@ from drive_env.safety.objects import (
     CONTROLWORD,
     CSV,
     DEMAND,
+    HM,
     HOMING_SPEED_TO_SWITCH,
     HOMING_SPEED_TO_ZERO,
     INTERPOLATED_POSITION,
@@ -336,7 +337,9 @@ class Commands:
     def _check_mode_room(self, modes: Integers, axes: Mask) -> None:
         """Raise SafetyError for a mode of a position in which an axis would not come to rest within its travel.
 
-        The demand of such a mode is ahead of the axis, and pp without a set-point brakes by its profile's ramp.
+        The demand of such a mode is ahead of the axis, and pp without a set-point brakes by its profile's ramp. Homing
+        is checked against nothing before it moves, so it begins from rest: an axis on its way to a distant set-point
+        would be stopped, for its speed, by a ramp that is longer than that way.
         """
         bounds, speed = self._limits.bounds(), self._axes.newest_speed()
         if not (bounds.has_position and axes.any()):
@@ -345,6 +348,14 @@ class Commands:
         beyond = outside(bounds, self._axes.position + ramp)
         wrong = axes & np.isin(modes, (PP, *LED_MODES)) & (np.abs(speed) > bounds.rest)
         wrong &= beyond > np.maximum(outside(bounds, self._axes.position), bounds.slack)
+        behind = np.abs(np.nan_to_num(self._axes.led - self._axes.position)) > bounds.slack
+        distant = behind & np.isin(self._axes.mode, LED_MODES)
+        moves = axes & (modes == HM) & ((np.abs(ramp) > bounds.slack) | distant)
+        for axis in np.flatnonzero(moves & (self._modes() != modes)).tolist():
+            raise SafetyError(
+                f"axis {axis}: homing begins from rest, and it moves by {abs(speed[axis]):.0f} increments a second; "
+                "nothing was sent. Bring it to rest first"
+            )
         for axis in np.flatnonzero(wrong & (self._modes() != modes)).tolist():
             raise SafetyError(
                 f"axis {axis}: in mode {modes[axis]} it would come to rest {beyond[axis]:.0f} increments beyond the "
