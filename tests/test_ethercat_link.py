@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -329,6 +330,17 @@ def test_while_an_answer_is_waited_for_images_keep_watchdogs_quiet(master, drive
     samples = link.process.samples()
     master.alive()
     assert told == [1] and len(master.take()) == exchanges and samples.complete() == 0
+
+
+def test_who_waits_for_an_answer_does_not_wait_for_the_images_too(master, drive, clock):
+    """Two threads waited for each other for ever: one gave images by the mailbox, the other asked by it meanwhile."""
+    link = linked(master, drive, lockstep=False)
+    clock.now += 60.0
+    with link.process.turn:
+        asking = threading.Thread(target=link._while_waiting, daemon=True)
+        asking.start()
+        asking.join(5.0)
+        assert not asking.is_alive()
 
 
 def test_the_end_lets_go_of_the_segment(link, master):

@@ -121,6 +121,28 @@ def test_a_load_that_is_acceptable_does_not_stop_it_and_an_obstacle_does(stepper
         assert not prove_with_load(found, moves, SPEED, run, np.ones(1, bool)).stopped.any()
 
 
+@pytest.mark.parametrize("at", [0.05, 0.6])
+def test_an_emergency_in_the_moves_is_named(stepper, at):
+    """It said "it lost steps at 14.4 rad/s with its run current"."""
+    with target(stepper) as found:
+        detection, _ = detection_of(found)
+        found.drives.machine.fault("supply_surge", at=at, duration=0.1)
+        detection.find_threshold()
+        (reason,) = detection.found.reasons
+    assert reason.startswith("it went into fault at ") and reason.endswith(" rad/s: overvoltage (3210h)"), reason
+
+
+def test_an_emergency_with_a_load_on_the_axis_is_named(stepper, tmp_path, monkeypatch):
+    def surges(found, moves, *rest):
+        found.drives.machine.fault("supply_surge", at=0.05, duration=0.1)
+        return prove_with_load(found, moves, *rest)
+
+    monkeypatch.setattr(commissioning, "prove_with_load", surges)
+    with target(stepper) as found:
+        (axis,) = commission(found, tmp_path / "before.toml").axes
+    assert axis.reason.endswith("of the holding torque; the drive reported overvoltage (3210h)"), axis.reason
+
+
 # --- CoolStep ---------------------------------------------------------------------------------------------------------
 def test_coolstep_lowers_the_current_by_what_the_load_angle_says_and_no_step_is_lost(stepper):
     """The truth is the amplitude in the drive's record, which no bus shows."""

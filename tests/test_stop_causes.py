@@ -6,9 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from auto_stages import recorded
+from test_link_energy import proving
 
 from drive_env import motion
 from drive_env.drives.emergency import EmergencyMessage
+from tuning.auto.bench import AutoBench
+from tuning.auto.choice import try_what_changed
 from tuning.identify.identification import identify
 from tuning.response.frequency_response import measure
 from tuning.stop_causes import UNTOLD, stop_causes
@@ -62,6 +66,39 @@ def test_large_motors_are_shaken_no_more_than_the_dc_link_bears(motor):
         assert target.drives.emergencies() == []
     for name in ("anti_resonance", "resonance", "loop_delay", "velocity_filter"):
         assert found[0].estimates[name].is_known, found[0].estimates[name]
+
+
+def surge(target, at):
+    target.drives.machine.fault("supply_surge", at=at, duration=0.1)
+
+
+def test_a_recorded_move_of_auto_names_the_emergency_that_ended_it():
+    with emulated(load="inertia", num_threads=1) as target, timed(target) as (watched, _):
+        ground, gains = proving(watched)
+        everywhere = np.ones(1, bool)
+        assert ground.run(gains, everywhere).reason == ("",)
+        surge(target, 0.15)
+        (reason,) = ground.show(gains, everywhere).reason
+    assert reason.endswith("(cut off within 50 ms); the drive reported overvoltage (3210h)"), reason
+
+
+def test_a_trial_of_lowered_gains_after_which_the_drive_is_in_fault_names_the_emergency():
+    """It said "the drive went into fault" alone."""
+    with emulated(load="inertia", num_threads=1) as target, timed(target) as (watched, clock):
+        bench = AutoBench(watched, 0, clock, 12.0)
+        bench.ground, gains = proving(watched)
+        run = bench.ground.run
+
+        def then_trips(*arguments):
+            proof = run(*arguments)
+            surge(target, 0.0)
+            watched.drives.advance(0.1)
+            return proof
+
+        bench.ground.run = then_trips
+        try_what_changed(bench, recorded(gains, proven=0 * gains))
+    (reservation,) = bench.journals[0].reservations
+    assert reservation == "the lowered gains fail their trial: the drive went into fault: overvoltage (3210h)"
 
 
 def test_a_response_names_the_emergency_that_ended_it():

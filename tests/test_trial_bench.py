@@ -266,6 +266,8 @@ def test_an_axis_that_oscillates_in_them_gets_softer_gains_three_times(swings, w
         return f"found by {reach[0]:.4f}"
 
     monkeypatch.setattr(module, "OscillationWatch", watch)
+    monkeypatch.setattr(module, "ampere_per_count", lambda drives: 1e-3)
+    monkeypatch.setattr(module, "trial_reach", lambda target, inertia, holding, reach: reach)
     monkeypatch.setattr(module, "ObservedDrives", lambda drives, watch: drives)
     bench.method = SimpleNamespace(
         measures_current=True, trials=lambda drives, axes: SimpleNamespace(identify=identify)
@@ -414,22 +416,29 @@ def test_identification_ends_with_safe_gains_on_drives_that_stand(anew, measures
         module, "write_gains", lambda drives, gains, where=None: done.append(("gains", int(gains[0, 0]), where))
     )
     planned = []
+    axes = SimpleNamespace(inertia="J", offset="weight")
 
     def plan(found, scaler, reach):
         planned.append((found, scaler.tolist(), reach.tolist()))
         return "move"
 
+    def bearable(target, inertia, holding, reach):
+        assert (inertia, holding) == ("J", "weight")
+        return np.minimum(reach, 1.5)
+
+    monkeypatch.setattr(module, "trial_reach", bearable)
+
     bench.method = SimpleNamespace(
         measures_current=measures, first=lambda supply: first + int(supply[2] == 30.0) - 1,
         keep=lambda gains, kept: gains + (100 if kept is present else 0), plan=plan,
-        rule=lambda found, move, supply: rule if (found, move) == ("found", "move") else None,
-        safe=lambda found, move, supply: safe if (found, move) == ("found", "move") else None,
+        rule=lambda found, move, supply: rule if (found, move) == (axes, "move") else None,
+        safe=lambda found, move, supply: safe if (found, move) == (axes, "move") else None,
     )  # fmt: skip
     bench._trials = SimpleNamespace(recover=lambda where: done.append(("recover", where.tolist())))
 
     def moved(gains):
         done.append(("moved", int(gains[0, 0])))
-        return "found", np.array([7, 8, 9, 10])
+        return axes, np.array([7, 8, 9, 10])
 
     monkeypatch.setattr(bench, "_moved", moved)
     bench.identify()
@@ -438,8 +447,9 @@ def test_identification_ends_with_safe_gains_on_drives_that_stand(anew, measures
         *(["reset"] if anew else []), ("gains", 101, None), everywhere, ("advance", 0.1), ("moved", 101), everywhere,
         ("gains", 103, None), ("advance", 0.25),
     ]  # fmt: skip
-    assert planned == [("found", [65536] * 4, [2.0, -2.0, math.inf, 2.0])]
-    assert (bench.identified, bench.move, bench.origin.tolist()) == ("found", "move", [7, 8, 9, 10])
+    reach = [1.5, -2.0, 1.5, 1.5] if measures else [2.0, -2.0, math.inf, 2.0]  # what the DC link bears
+    assert planned == [(axes, [65536] * 4, reach)]
+    assert (bench.identified, bench.move, bench.origin.tolist()) == (axes, "move", [7, 8, 9, 10])
     assert bench.began.tolist() == [7, 8, 9, 10] and bench.began is not bench._origin
     assert (bench.rule[0, 0], bench.safe[0, 0], bench.incumbent[0, 0]) == (102, 103, 103)
     assert bench.incumbent is not bench.safe

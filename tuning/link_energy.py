@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.dictionary.roles import Role
+from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, highest_ramp, plan_move
+
 if TYPE_CHECKING:
     from drive_env.motors import Motor
     from tuning.target import Target
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 LINK_SHARE = 0.8  # of what the link holds, that is filled: the supply may be higher than what was entered
+SLOWER = 0.9  # by which positioning moves are made slower in turn that would overcharge the link
 
 
 def link_energy(target: Target) -> Floats:
@@ -58,3 +62,65 @@ def fed_back(
         emptied = np.minimum(np.minimum.accumulate(energy, axis=0), 0.0)
         most = np.maximum(most, (energy - emptied).max(axis=0))
     return most
+
+
+def trial_reach(target: Target, inertia: ArrayLike, holding: ArrayLike, reach: Floats) -> Floats:
+    """Return for what reach the moves of trials are planned so that they do not overcharge the DC link.
+
+    Args:
+        target: The drives.
+        inertia: Total inertia [kg*m^2], (num_axes,) or one for all.
+        holding: Current that holds the axis [A], alike.
+        reach: How far the rotors may turn, with the sign [rad], (num_axes,).
+    """
+    T, scale = PROFILE * CYCLE, target.drives.read(Role.POSITION_SCALE)
+    move = plan_move(target.motor, np.broadcast_to(inertia, reach.shape), scale, reach, highest_ramp(target.device))
+    planned = way = np.abs(move.distance) / move.increments
+    while (over := _overcharges(target, inertia, holding, 0.0, way, 2.0 * way / T, 4.0 * way / T**2)).any():
+        way = np.where(over, SLOWER * way, way)
+    return np.where(way < planned, np.copysign(way / TRAVEL_SHARE, reach), reach)
+
+
+def bearable_speed(
+    target: Target,
+    inertia: ArrayLike,
+    holding: ArrayLike,
+    friction: ArrayLike,
+    way: Floats,
+    speed: Floats,
+    ramp: Floats,
+) -> Floats:
+    """Return the share of speed and ramp, 1 at most, with which moves do not overcharge the DC link, (num_axes,).
+
+    Args:
+        target: The drives.
+        inertia: Total inertia [kg*m^2], (num_axes,) or one for all.
+        holding: Current that a weight takes [A], alike.
+        friction: Current that dry friction takes at least [A], alike.
+        way: Of the moves, without their sign [rad], (num_axes,).
+        speed: Of the profile [rad/s], alike.
+        ramp: Of the profile [rad/s^2], alike.
+    """
+    share = np.ones(target.num_axes)
+    while (over := _overcharges(target, inertia, holding, friction, way, share * speed, share * ramp)).any():
+        share = np.where(over, SLOWER * share, share)
+    return share
+
+
+def _overcharges(
+    target: Target,
+    inertia: ArrayLike,
+    holding: ArrayLike,
+    friction: ArrayLike,
+    way: Floats,
+    speed: Floats,
+    ramp: Floats,
+) -> NDArray[np.bool_]:
+    """Return which axes' moves would overcharge the DC link, (num_axes,); arguments as `bearable_speed` has them."""
+    way, speed, ramp = (np.maximum(row, 1e-9) for row in (way, speed, ramp))
+    rise = np.minimum(speed / ramp, np.sqrt(way / ramp))
+    end = rise + way / (ramp * rise)
+    t = np.arange(1, int(np.ceil(end.max() / CYCLE)) + 1)[:, None] * CYCLE
+    profile = ramp * np.clip(np.minimum(t, end - t), 0.0, rise)
+    most = fed_back(target.motor, profile, CYCLE, inertia, holding, friction)
+    return np.asarray(most > LINK_SHARE * link_energy(target))

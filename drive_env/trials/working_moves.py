@@ -133,9 +133,10 @@ class WorkingMoves:
                 lag = wrapped(demand - actual - shift)
                 enabled = cia402.matches(self.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
                 stopped |= where & ~enabled
-                out = where & ~lost & (np.abs(lag) > LOST * full_step)
-                if np.any(halted := out & enabled):
-                    self.drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=halted)
+                # An axis that its drive has stopped leaves its demand, and has lost no step by that.
+                out = where & ~lost & ~stopped & (np.abs(lag) > LOST * full_step)
+                if out.any():
+                    self.drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=out)
                 lost |= out
                 if look is not None:
                     look(leg, t)

@@ -57,7 +57,7 @@ def cost_on_twins(
     Returns:
         Shape (axes, sets).
     """
-    target, known = bench.target, basis.identified.twins(axes, bench.reach())
+    target, known = bench.target, basis.identified.twins(axes, basis.trial_reach(bench))
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[list(axes)]
     with Twins(target.device, target.motor, known, scaler, gains.shape[1], repeats=repeats) as twins:
         return twins.score(gains)
@@ -146,7 +146,7 @@ def standing(
 
 def _twins_of(bench: AutoBench, basis: Basis, k: int, sets: int, repeats: int, *, slippery: bool = False) -> Twins:
     """Return the twins of an axis."""
-    target, known = bench.target, basis.identified.twins([k], bench.reach())
+    target, known = bench.target, basis.identified.twins([k], basis.trial_reach(bench))
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[[k]]
     worlds = SLIPPERY_WORLDS if slippery else WORLDS
     return Twins(target.device, target.motor, known, scaler, sets, worlds=worlds, repeats=repeats)

@@ -271,10 +271,11 @@ def try_what_changed(bench: AutoBench, recorded: RecordedGains) -> RecordedGains
     except SafetyError as error:
         bench.reserve(able, f"the envelope stopped the trial of the lowered gains: {error}")
         return recorded
+    causes = bench.faults()
     faulted = reset(bench, "the lowered gains were tried, and the fault cannot be reset")
     for k in map(int, np.flatnonzero(able & bench.going)):
         if not proof.passed[k] or faulted[k]:
-            why = proof.reason[k] or "the drive went into fault"
+            why = proof.reason[k] or f"the drive went into fault: {causes[k]}"
             bench.journals[k].reserve(f"the lowered gains fail their trial: {why}")
     cost = np.where(proof.passed & ~faulted, proof.cost, np.inf)
     return replace(

@@ -7,12 +7,13 @@ the safety envelope may be faster: it quick-stops all drives, and the trial is r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
@@ -39,6 +40,7 @@ from drive_env.trials.positioning import (
 )
 from drive_env.trials.score import TRIP, Terms, cost
 from tuning.auto.fallback_gains import FallbackGains
+from tuning.link_energy import bearable_speed, trial_reach
 from tuning.oscillation_watch import SOFTER
 from tuning.stop_causes import UNTOLD, stop_causes
 
@@ -143,6 +145,7 @@ class ProvingGround:
         room: How far each rotor may turn from here [rad], low and high, each (num_axes,).
         safe: Gains known to be stable, (num_axes, count); an axis that is stopped gets them.
         reference: Gains whose softness under a load counts as 1, (num_axes, count).
+        held: Currents that a weight takes, and dry friction at least [A], (num_axes,) or one for all.
     """
 
     def __init__(
@@ -152,6 +155,7 @@ class ProvingGround:
         room: tuple[Floats, Floats],
         safe: Integers,
         reference: Integers,
+        held: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     ) -> None:
         # What a stop leaves swinging may feed safe gains as well; those that follow let the load ring down.
         self._fallback = FallbackGains(target.num_axes, target.motor.rated_current, STILL_SHAKING)
@@ -160,14 +164,16 @@ class ProvingGround:
         self.safe = safe
         self._reference = reference
         low, high = room
-        self.reach: Floats = longer_way(low, high)
         motor, drives = target.motor, target.drives
         self._ampere = ampere_per_count(drives)
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
+        ends = (-1, target.axes_per_machine)
         if target.linked:
             # What pulls at one thing goes as far and as fast as its slowest end.
-            ends = (-1, target.axes_per_machine)
             inertia = np.repeat(inertia.reshape(ends).max(axis=1), ends[1])
+        self._inertia, self._held = inertia, held
+        self.reach: Floats = trial_reach(target, inertia, held[0], longer_way(low, high))
+        if target.linked:
             shortest = np.abs(self.reach).reshape(ends).argmin(axis=1)
             self.reach = np.repeat(self.reach.reshape(ends)[np.arange(len(shortest)), shortest], ends[1])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
@@ -249,6 +255,7 @@ class ProvingGround:
         self._fallback.begin()
         self._begin(where)
         self._hold_still(where)
+        stop_causes(drives)  # of before
         write_gains(drives, gains, where)
         write_profile(drives, self.move, where)
         away = self._origin + self._direction * self.move.distance
@@ -270,7 +277,8 @@ class ProvingGround:
         way = np.sign(self._direction * self.move.distance)
         error = wrapped(position - away) * way
         size = np.maximum(np.abs(self.move.distance), 1)
-        reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
+        overshoot, left = np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size
+        reason = self._reasons(stopped[None], overshoot, left, stop_causes(drives))
         settling, noise, overshoot = move_terms(
             position.astype(float), current * self._ampere, self.move, self._t_0, rated, away, way
         )
@@ -416,8 +424,12 @@ class ProvingGround:
         drives = self.target.drives
         near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS * self._count)
         off = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
-        # A long way is not to take long.
+        # A long way is not to take long, and a weight that goes down by it not to overcharge the DC link.
         faster = np.clip(off / (RETURN_MOVES * np.maximum(np.abs(self.move.distance), 1)), 1.0, self._fastest)
+        way, speed, ramp = (
+            row / self.move.increments for row in (off, faster * self.move.velocity, faster * self.move.acceleration)
+        )
+        faster *= bearable_speed(self.target, self._inertia, *self._held, way, speed, ramp)
         back = self.move._replace(
             velocity=np.ceil(self.move.velocity * faster).astype(np.int64),
             acceleration=np.ceil(self.move.acceleration * faster).astype(np.int64),
@@ -429,7 +441,8 @@ class ProvingGround:
         write_profile(drives, back, astray)
         start(drives, wrapped(self._origin).astype(np.int64), astray)
         self.moves[astray] += 1
-        for _ in range(RETURN_LOOKS):
+        longest = np.max(off / back.velocity, where=astray, initial=0.0)
+        for _ in range(max(RETURN_LOOKS, math.ceil(longest / RETURN_LOOK) + 2)):
             # All the while: a load that was shaken swings on, and would be taken for the next gains' doing.
             seen = drives.record([cia402.POSITION_ACTUAL], RETURN_LOOK)[cia402.POSITION_ACTUAL]
             if not np.any(astray & (np.abs(wrapped(seen - self._origin)).max(axis=0) > near)):
@@ -488,16 +501,14 @@ class ProvingGround:
             terms.settling[:2].mean(axis=0),
         )
 
-    def _reasons(
-        self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str] | None = None
-    ) -> tuple[str, ...]:
+    def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]) -> tuple[str, ...]:
         """Return why axes do not pass, "" where they do.
 
         Args:
             stopped: Whether they were stopped, a row for each phase, (phases, num_axes).
             overshoot: Of the move, (num_axes,).
             left: Of the move, what was missing at its end, (num_axes,).
-            causes: What the drives have told meanwhile, if that was read.
+            causes: What the drives have told meanwhile.
         """
         counts = np.maximum(np.abs(self.move.distance) / self.move.increments * self.move.counts, 1.0)
         reasons = []
@@ -505,7 +516,7 @@ class ProvingGround:
             if stopped[:, axis].any():
                 phase = PHASE_TITLES[int(stopped[:, axis].argmax())]
                 reason = f"stopped in the {phase}: it oscillated or went into fault (cut off within 50 ms)"
-                if causes is not None and causes[axis] != UNTOLD:
+                if causes[axis] != UNTOLD:
                     reason += f"; the drive reported {causes[axis]}"
             elif overshoot[axis] > OVERSHOOT:
                 reason = (

@@ -100,7 +100,7 @@ def compute(bench: AutoBench, basis: Basis, progress: Callable[[float], None] = 
     """
     told = _Told(progress)
     target, chosen = bench.target, np.flatnonzero(bench.going).tolist()
-    known = basis.identified.twins(chosen, bench.reach())
+    known = basis.identified.twins(chosen, basis.trial_reach(bench))
     starts = []
     for axis in chosen:
         plant, _ = basis.identified.known(axis)

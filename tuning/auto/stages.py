@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tuning.auto.bench import LOOK_BACK_TIME
 from tuning.auto.twin import Known, known_of
+from tuning.link_energy import trial_reach
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
@@ -72,6 +73,19 @@ class Basis:
     reference: Integers
     fallbacks: Integers
     unsafe: tuple[str, ...]
+
+    def held(self) -> tuple[Floats, Floats]:
+        """Return the currents that a weight takes, and dry friction at least [A], 0 where not known, (num_axes,)."""
+        found = [None if one is None else one.estimates for one in self.identified.found]
+        weight = np.array([0.0 if one is None else one["offset"].value for one in found])
+        friction = np.array([0.0 if one is None else one["coulomb"].low for one in found])
+        return np.nan_to_num(weight), np.maximum(np.nan_to_num(friction), 0.0)
+
+    def trial_reach(self, bench: AutoBench) -> Floats:
+        """Return for what reach moves are planned that do not overcharge the DC link [rad], (num_axes,)."""
+        motor, plants = bench.target.motor, self.identified.plants
+        inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
+        return trial_reach(bench.target, inertia, self.held()[0], bench.reach())
 
     def look_back_time(self, bench: AutoBench) -> Floats:
         """Return the time that a move with the gains before takes [s], 0 where none is made, (num_axes,)."""

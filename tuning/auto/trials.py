@@ -83,7 +83,7 @@ def prove(bench: AutoBench, basis: Basis, candidates: Candidates) -> TriedGains:
 def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
     """Set and return where gains are tried, from where the axes are now."""
     plants = basis.identified.plants
-    bench.ground = ProvingGround(bench.target, plants, bench.room(), basis.fallbacks[-1], basis.reference)
+    bench.ground = ProvingGround(bench.target, plants, bench.room(), basis.fallbacks[-1], basis.reference, basis.held())
     return bench.ground
 
 

@@ -27,6 +27,7 @@ from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, 
 from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
 from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, read_role, switch_off
+from tuning.link_energy import trial_reach
 from tuning.oscillation_watch import shaken
 from tuning.response.frequency_response import measure
 from tuning.stop_causes import stop_causes
@@ -119,17 +120,18 @@ class _Brief(Experiments):
         # t_0 scales a figure that is not asked for here.
         trials = Trials(drives, target.motor, target.axes_per_machine, 1.0)
         inertia = np.full(target.num_axes, GUESS * target.motor.inertia)
+        reach = trial_reach(target, inertia, holding, longer_way(down, up))
         for moving in _turns(working):
-            found, _ = trials.identify(longer_way(down, up), moving)
+            found, _ = trials.identify(reach, moving)
             self._take_moved(found, moving)
             inertia[moving] = found.inertia[moving]
         working = self.calm(working)
-        working = self._move_together(working, trials)
+        working = self._move_together(working, trials, holding)
         self.begin("resonance, delay, filter", 0.55, RESPONSE)
         switch_off(drives, working.where)
         self.respond(working, inertia)
 
-    def _move_together(self, working: Working, trials: Trials) -> Working:
+    def _move_together(self, working: Working, trials: Trials, holding: NDArray[np.float64]) -> Working:
         """Find what axes of one machine push while all of them move; return those that did not oscillate."""
         target, lanes = working.target, working.target.axes_per_machine
         whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
@@ -138,7 +140,8 @@ class _Brief(Experiments):
         # With the slow gains no axis follows a move that the others shake.
         write_gains(target.drives, method_of(target.device, target.motor).first(target.supply), whole)
         down, up = working.room()
-        found, _ = trials.identify(longer_way(down, up), whole)
+        reach = trial_reach(target, GUESS * target.motor.inertia, holding, longer_way(down, up))
+        found, _ = trials.identify(reach, whole)
         self._together[whole] = found.inertia[whole]
         return self.calm(working)
 

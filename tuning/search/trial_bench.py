@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, axis_number, machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import write_gains
@@ -26,6 +27,8 @@ from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, longer_
 from drive_env.trials.score import TRIP
 from tuning.auto.fallback_gains import FallbackGains
 from tuning.identify.connected_motors import check_motors
+from tuning.identify.working_state import GUESS
+from tuning.link_energy import trial_reach
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
 from tuning.stop_causes import told_causes
 from tuning.target import Target
@@ -140,7 +143,10 @@ class TrialBench:
         self.identified, self._origin = self._moved(gains)
         self.began = self._origin.copy()
         self._trials.recover(self._where)
-        self.move = self.method.plan(self.identified, drives.read(Role.POSITION_SCALE), self._reach)
+        reach = self._reach
+        if self.method.measures_current:
+            reach = trial_reach(target, self.identified.inertia, self.identified.offset, reach)
+        self.move = self.method.plan(self.identified, drives.read(Role.POSITION_SCALE), reach)
         self.rule, self.safe = (
             self.method.keep(rule(self.identified, self.move, target.supply), present)
             for rule in (self.method.rule, self.method.safe)
@@ -163,6 +169,7 @@ class TrialBench:
             return self._trials.identify(self._reach, self._where)
         noise = target.device.stage["adc_noise"].high
         scaler = drives.read(Role.POSITION_SCALE)
+        holding = drives.read(cia402.TORQUE_ACTUAL) * ampere_per_count(drives)
         for _ in range(SOFTENINGS):
             began = drives.read(cia402.POSITION_ACTUAL)
             watch = OscillationWatch(self._where, np.full(target.num_axes, target.current), noise)
@@ -170,7 +177,8 @@ class TrialBench:
             trials = self.method.trials(watched, target.axes_per_machine)
             self.moves += MOVES_OF_IDENTIFICATION
             with suppress(OscillationError):
-                found = trials.identify(self._reach, self._where)
+                reach = trial_reach(target, GUESS * target.motor.inertia, holding, self._reach)
+                found = trials.identify(reach, self._where)
             if not watch.swung.any():
                 return found
             softer = target.device.gains.softened(gains, SOFTER, "velocity", "position")

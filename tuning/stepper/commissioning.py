@@ -7,7 +7,7 @@ let CoolStep take current away, and prove that no step is lost. The state before
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -93,8 +93,8 @@ def commission(
         bench = TrialBench(watched)
         bench.identify()
         say("trying the currents", 0.15)
-        gains, weak = _currents(bench)
-        detection, proof_figures = _commissioned(bench, watched, gains, weak, say)
+        gains, weakness = _currents(bench)
+        detection, proof_figures = _commissioned(bench, watched, gains, weakness, say)
         found = detection.found
         if target.device.gains.loop_of_kind(LOAD_ANGLE) is not None and found.going().any():
             say("tuning the closed loop", 0.9)
@@ -120,12 +120,13 @@ def commission(
 
 
 def _commissioned(
-    bench: TrialBench, target: Target, gains: Integers, weak: Mask, say: Progress
+    bench: TrialBench, target: Target, gains: Integers, weakness: Sequence[str], say: Progress
 ) -> tuple[LoadDetection, dict[str, Floats]]:
     """Return what was found at the working speed; of axes that fail there at a lower one, which it says."""
+    weak = np.array([bool(reason) for reason in weakness])
     detection, figures = _found_at(bench, target, gains, ~weak, WORK[0], say)
-    for k in np.flatnonzero(weak):
-        detection.found.reasons[k] = "it loses steps or goes into fault in trials with the motor's rated current"
+    for k in map(int, np.flatnonzero(weak)):
+        detection.found.reasons[k] = weakness[k]
     for work in WORK[1:]:
         left = ~detection.found.going() & ~weak
         if not left.any():
@@ -136,7 +137,7 @@ def _commissioned(
         write_gains(drives, gains, left)
         other, measured = _found_at(bench, target, gains, left, work, say)
         better = left & other.found.going()
-        for k in np.flatnonzero(better):
+        for k in map(int, np.flatnonzero(better)):
             other.found.reservations[k].append(
                 f"the working speed is {other.found.speed[k]:.3g} rad/s, with ramps of {work[1]:g} of the holding "
                 f"torque: at {detection.found.speed[k]:.3g} rad/s {detection.found.reasons[k]}"
@@ -174,16 +175,19 @@ def _found_at(
     return detection, _prove(target, detection, moves, speed)
 
 
-def _currents(bench: TrialBench) -> tuple[Integers, Mask]:
-    """Return the rule's currents, the rated ones where these lose steps in a trial, and who loses steps with those."""
+def _currents(bench: TrialBench) -> tuple[Integers, list[str]]:
+    """Return the rule's currents, the rated ones where these lose steps in a trial, and why axes fail with those."""
     axes = bench.target.axes_per_machine
     tried = bench.run(bench.rule)
     gains = np.where(np.repeat(tried.aborted, axes)[:, None], bench.safe, bench.rule)
-    weak = np.zeros(bench.target.num_axes, bool)
     if tried.aborted.any():
-        weak = np.repeat(bench.run(gains).aborted, axes)
+        tried = bench.run(gains)
     write_gains(bench.target.drives, gains)
-    return gains, weak
+    reasons = [""] * bench.target.num_axes
+    for k in map(int, np.flatnonzero(np.repeat(tried.aborted, axes))):
+        told = f"; the drive reported {tried.causes[k // axes]}" if tried.causes[k // axes] else ""
+        reasons[k] = f"it loses steps or goes into fault in trials with the motor's rated current{told}"
+    return gains, reasons
 
 
 def _moves(bench: TrialBench, gains: Integers, share: float) -> WorkingMoves:
@@ -224,7 +228,9 @@ def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed:
                 cooled, "with it a load of 30 % of the holding torque, which comes within 0.15 s, stops the axis"
             )
             proof = prove_with_load(target, moves, speed, run, going)
-        found.reject(going & ~proof.withstood, "it stops or loses steps with a load of 30 % of the holding torque")
+        for k in np.flatnonzero(going & ~proof.withstood):
+            told = f"; the drive reported {proof.causes[k]}" if proof.causes[k] else ""
+            found.reasons[k] = f"it stops or loses steps with a load of 30 % of the holding torque{told}"
         found.reject(going & ~proof.stopped, "an obstacle does not stop it: no stall was seen before steps were lost")
         lost = np.where(proof.stopped, proof.lost, np.nan)
         for k in np.flatnonzero(found.going() & (proof.lost > MOST_LOST)):

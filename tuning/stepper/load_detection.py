@@ -42,6 +42,7 @@ from drive_env.trials.load_reading import (
     volts,
 )
 from drive_env.trials.working_moves import Steady, WorkingMoves
+from tuning.stop_causes import stop_causes, told_causes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -200,7 +201,7 @@ class LoadDetection:
         plain = self._run_moves(self._speed)
         for _ in range(COOL_RAISES):
             self._set(LOWER, np.where(found.going(), lower, 0))
-            cooled = self._moves.run(self._speed, found.going())
+            cooled = self._move(self._speed)
             failed = found.going() & (cooled.failed | (cooled.settled > STALL_ANGLE))
             if not failed.any():
                 break
@@ -229,18 +230,26 @@ class LoadDetection:
     def prove(self) -> None:
         """Move with everything on: an axis that stops or loses steps is given up."""
         where = self.found.going()
-        last = self._moves.run(self._speed, where)
-        self.found.reject(where & last.stopped, "it was stopped in a move with its own load: a false stall")
+        last = self._move(self._speed)
+        self._reject_stopped(where & last.stopped, "it was stopped in a move with its own load")
         self.found.reject(where & last.lost, "it lost steps in a move with its own load")
 
     def _run_moves(self, speed: float) -> Steady:
         going = self.found.going()
-        steady = self._moves.run(speed, going)
-        failed = going & steady.failed
-        if failed.any():
-            self.found.reject(failed & steady.lost, f"it lost steps at {speed:.3g} rad/s with its run current")
-            self.found.reject(failed, f"it went into fault at {speed:.3g} rad/s")
+        steady = self._move(speed)
+        self.found.reject(going & steady.lost, f"it lost steps at {speed:.3g} rad/s with its run current")
+        self._reject_stopped(going & steady.stopped, f"it went into fault at {speed:.3g} rad/s")
         return steady
+
+    def _move(self, speed: float) -> Steady:
+        told_causes(self._drives)  # of before
+        return self._moves.run(speed, self.found.going())
+
+    def _reject_stopped(self, where: Mask, reason: str) -> None:
+        """Give axes up that went into fault in the last move, with what their drives have told."""
+        causes = stop_causes(self._drives) if where.any() else []
+        for k in np.flatnonzero(where):
+            self.found.reject(np.arange(len(where)) == k, f"{reason}: {causes[k]}")
 
     def _column(self, part: tuple[str, str]) -> int:
         column = self._known.column(*part)

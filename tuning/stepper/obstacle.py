@@ -31,11 +31,12 @@ STALL = "stall"  # in what a drive says by itself
 class ObstacleProof:
     """What load and obstacle did to the axes, (num_axes,) each.
 
-    withstood: Neither stopped nor lost steps with the acceptable load. stopped: Stopped by a stall at the obstacle.
-    lost: Whole teeth (four full steps) that were lost until then.
+    withstood: Neither stopped nor lost steps with the acceptable load. causes: What the drives told meanwhile, "" for
+    nothing. stopped: Stopped by a stall at the obstacle. lost: Whole teeth (four full steps) that were lost until then.
     """
 
     withstood: Mask
+    causes: list[str]
     stopped: Mask
     lost: Floats
 
@@ -78,12 +79,13 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
 
             return moves.run(speed, where, load, until_stopped=True)
 
+    told_causes(drives)  # of before
     # A load that comes by and by: the rotor would swing in its field by a sudden one.
     loaded = with_torque(np.full(target.num_axes, LOAD_SHARE * motor.rated_torque), ramp, RISE)
     drives.advance(REACTION if loaded.stopped.any() else SETTLE)
     moves.trials.recover(where)
     drives.advance(SETTLE)
-    told_causes(drives)
+    causes = told_causes(drives)
     before = moves.trials.shift()
     blocked = with_torque(OBSTACLE * holding_torque(motor, run), ramp + AFTER, RISE / 5.0)
     stalled = np.array([STALL in told for told in told_causes(drives)])
@@ -93,7 +95,7 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
     tooth = 2.0 * np.pi * moves.increments / motor.n_p
     lost = np.abs(moves.trials.shift() - before) / tooth
     enabled = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
-    return ObstacleProof(where & ~loaded.failed, where & blocked.stopped & stalled & enabled, np.rint(lost))
+    return ObstacleProof(where & ~loaded.failed, causes, where & blocked.stopped & stalled & enabled, np.rint(lost))
 
 
 @contextmanager

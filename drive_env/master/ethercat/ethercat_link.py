@@ -221,8 +221,14 @@ class EtherCatLink:
     def _while_waiting(self) -> None:
         """Say that the program waits, and keep the watchdogs quiet meanwhile."""
         self._alive()
-        if not self._lockstep and time.monotonic() - self.process.exchanged_at > FACTORY / 3.0:
-            self.process.exchange(is_cycle=False)
+        if self._lockstep or time.monotonic() - self.process.exchanged_at <= FACTORY / 3.0:
+            return
+        # Who has the images may be waiting for this mailbox; the other of the two threads must not wait for them.
+        if self.process.turn.acquire(blocking=False):
+            try:
+                self.process.exchange(is_cycle=False)
+            finally:
+                self.process.turn.release()
 
     def _recover(self, node: int) -> None:
         """Take a node to Pre-Op; tell of one that has restarted by itself."""
