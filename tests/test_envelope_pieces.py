@@ -14,6 +14,7 @@ from drive_env import CanDrives, Limits, SafetyError, motion
 from drive_env.dictionary.entries import Entry
 from drive_env.safety.envelope import Envelope
 from drive_env.safety.looks import Looks
+from drive_env.safety.objects import SET_POINTS
 
 TURN = 65536
 TRAVEL = Limits(position=(-3 * TURN, 3 * TURN))
@@ -93,7 +94,7 @@ def envelope_of(is_armed=False, live=True):
     made._drives = SimpleNamespace(
         description=SimpleNamespace(dictionary=SimpleNamespace(roles={}), has=lambda key: False, role=lambda part: None)
     )
-    made._axes = SimpleNamespace(is_armed=is_armed)
+    made._axes, made._set_points = SimpleNamespace(is_armed=is_armed), frozenset(SET_POINTS)
     made._watch, made._watchdogs = SimpleNamespace(await_stop=nothing), SimpleNamespace(check_not_held=nothing)
     made._commands = SimpleNamespace(check_write=lambda *arguments: done.append("checked"))
     made._stops = SimpleNamespace(keep_ramps=lambda *arguments: done.append("ramps kept"), lends_ramps=lambda: False)

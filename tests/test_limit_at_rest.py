@@ -102,11 +102,13 @@ def test_monitor_tells_it(monkeypatch):
     for name, value in {"INTERFACE": "virtual", "CHANNEL": channel, "TIMEOUT": "20"}.items():
         monkeypatch.setenv(f"DRIVE_ENV_{name}", value)
     with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))) as server:
+        patience = time.monotonic() + 60.0
+        while not server.is_serving and time.monotonic() < patience:  # a power cycle would repair the encoder
+            time.sleep(LOOK)
         with server.guard:
             drives.machine.fault("encoder_stuck")
         served = Served(drives, server.guard)
         set_off(served)
-        patience = time.monotonic() + 60.0
         while served.read(cia402.TORQUE_ACTUAL)[0] < 6800 and time.monotonic() < patience:
             time.sleep(LOOK)
         for options in (["--json"], []):
