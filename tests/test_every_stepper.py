@@ -81,7 +81,7 @@ def test_an_axis_that_is_rejected_has_its_speeds_from_before(tmp_path, monkeypat
 def _unseen(target, moves, speed, run, where):
     from tuning.stepper.obstacle import ObstacleProof
 
-    return ObstacleProof(where, ~where, np.zeros(len(where)))
+    return ObstacleProof(where, [""] * len(where), ~where, np.zeros(len(where)))
 
 
 @pytest.mark.slow
