@@ -269,6 +269,11 @@ class Comparison:
         modes = {step.mode for step in self.sequence.steps}
         return max(SLACK[mode] for mode in modes)
 
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the envelope made it worse, or left an axis farther outside than its slack."""
+        return self.worse_by > SAME or self.farthest > self.slack
+
     def __str__(self):
         with_it, without = (np.round(one.farthest, 3).tolist() for one in (self.watched, self.alone))
         return (
@@ -303,7 +308,7 @@ def main():
             part = job.result()
             found += part
             for one in part:
-                if one.worse_by > SAME:
+                if one.is_wrong:
                     print(one, flush=True)
             print(f"{len(found)} sequences, {time.perf_counter() - begin:.0f} s", flush=True)
     kinds = Counter((one.sequence.device, one.sequence.steps[0].mode) for one in found)
@@ -311,9 +316,12 @@ def main():
         these = [one for one in found if (one.sequence.device, one.sequence.steps[0].mode) == kind]
         print(f"{kind}: {len(these)}, farthest outside {max(one.farthest for one in these):.3f} rev, worse by "
               f"{max(one.worse_by for one in these):.3f} rev")  # fmt: skip
-    bad = sum(one.worse_by > SAME for one in found)
-    print(f"{bad} of {len(found)} farther outside with the envelope; {sum(bool(one.watched.stopped) for one in found)} "
-          f"stopped, {sum(one.alone.farthest.max() > 0 for one in found)} outside without it")  # fmt: skip
+    bad = sum(one.is_wrong for one in found)
+    stopped, outside = (sum(map(bool, rows)) for rows in (
+        (one.watched.stopped for one in found), (one.alone.farthest.max() > 0 for one in found)
+    ))  # fmt: skip
+    print(f"{bad} of {len(found)} farther outside with the envelope, or by more than their slack; {stopped} stopped, "
+          f"{outside} outside without it")  # fmt: skip
     raise SystemExit(bool(bad))
 
 
