@@ -42,7 +42,7 @@ SAME = 0.05  # rev: a stop begins some milliseconds before a turn of the set-poi
 FASTEST, FASTEST_STEPPER = 70.0, 8.0  # rev/s that are asked for
 # How far outside an axis may be [rev], by the modes that it was in: it speeds up until its ramp begins, and its loops
 # overshoot (docs/safety.md).
-SLACK = {"pp": 0.15, "csp": 0.5, "pv": 0.3, "csv": 0.5, "cst": 1.0, "hm": 0.5}
+SLACK = {"pp": 0.15, "csp": 0.6, "pv": 0.3, "csv": 0.6, "cst": 1.0, "hm": 0.6}
 SHARE = 0.07  # by which each further axis of a device is asked for less
 
 
