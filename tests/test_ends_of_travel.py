@@ -127,7 +127,7 @@ def test_a_mode_of_a_position_that_an_axis_cannot_come_to_rest_in_is_not_taken()
         assert int(emulated.read(0x6061)[0]) == 9
 
 
-@pytest.mark.parametrize("cycles", [10, 60])
+@pytest.mark.parametrize("cycles", [0, 10, 60])
 def test_homing_begins_from_rest(emulated, cycles):
     """On its way back to a far set-point an axis was faster than homing ever is: its stop ended 5.4 turns outside."""
     emulated.machine.reset()
@@ -138,6 +138,22 @@ def test_homing_begins_from_rest(emulated, cycles):
         with pytest.raises(SafetyError, match=r"axis 0: homing begins from rest, and it moves by .* nothing was sent"):
             motion.select_mode(drives, "hm")
         drives.advance(0.5)
+        motion.select_mode(drives, "hm")
+
+
+def test_a_set_point_of_csp_that_another_mode_left_behind_is_no_way_to_go(emulated):
+    """What pv did since csp counts: the axis is far from its last set-point of csp, and at rest."""
+    emulated.machine.reset()
+    with MemoryDrives(MemoryBus(emulated), safety=LIMITS) as drives:
+        motion.enable(drives, mode="csp")
+        drives.write(0x607A, TURN)
+        drives.advance(0.5)
+        motion.select_mode(drives, "pv")
+        drives.write(0x60FF, 2 * TURN)
+        drives.advance(0.3)
+        drives.write(0x60FF, 0)
+        drives.advance(0.3)
+        assert abs(int(drives.read(0x6064)[0]) - TURN) > 0.3 * TURN
         motion.select_mode(drives, "hm")
 
 

@@ -234,7 +234,7 @@ def find_object(text: str) -> Any:
 
 
 def source_of(text: str) -> str:
-    """Return the hash of the file that holds module:function, "" for what is none or has no file; as `find_object`.
+    """Return the hash of the file that holds module:function; "" if the text names no function, or it has no file.
 
     What the module itself imports is not in it.
     """

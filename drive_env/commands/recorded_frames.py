@@ -33,7 +33,7 @@ def read_frames(file: Path, *, everything: bool) -> list[RecordedFrame]:
 
     Raises:
         ValueError: If it cannot be read, ends within a line, or exceeds a limit.
-        OSError: If there is none.
+        OSError: If the file does not exist.
     """
     check_size(file, MOST_RECORDING)
     _check_end(file)

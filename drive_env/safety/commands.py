@@ -353,8 +353,8 @@ class Commands:
         moves = axes & (modes == HM) & ((np.abs(ramp) > bounds.slack) | distant)
         for axis in np.flatnonzero(moves & (self._modes() != modes)).tolist():
             raise SafetyError(
-                f"axis {axis}: homing begins from rest, and it moves by {abs(speed[axis]):.0f} increments a second; "
-                "nothing was sent. Bring it to rest first"
+                f"axis {axis}: homing begins from rest, and it moves by {abs(speed[axis]):.0f} increments a second or "
+                "is on its way to a set-point; nothing was sent. Bring it to rest first"
             )
         for axis in np.flatnonzero(wrong & (self._modes() != modes)).tolist():
             raise SafetyError(

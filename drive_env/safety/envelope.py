@@ -152,12 +152,12 @@ class Envelope:
             self._before_controlword(raw, where)
             return
         self._watchdogs.check_not_held(entry)
-        self._note_mode(key, where)
         if key in SLOW_DOWN_RAMPS:
             self._check_no_ramp_runs(entry, where)
         if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
             self._arm()
         self._commands.check_write(entry, raw, where)
+        self._note_mode(key, where)  # after the checks: what is refused changes nothing
         if key in self._set_points:
             self._arm()
         if self._axes.is_armed:

@@ -132,7 +132,7 @@ def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
 
 
 def _place_of(origin: str) -> str:
-    """Return host and port of an origin, "" of what is none."""
+    """Return host and port of an origin; "" if the text is not an origin of HTTP."""
     try:
         found = urlsplit(origin.lower())
     except ValueError:

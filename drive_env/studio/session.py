@@ -464,7 +464,7 @@ class Session:
             self._stop(self._drives.moved)
 
     def _why_left(self, job: Job | None) -> str:
-        """Return why nobody is there for a job that moves axes; "" where somebody is, or nothing moves by it."""
+        """Return why no page watches a job that moves axes; "" if a page does, or if the job moves nothing."""
         drives = self._drives
         moves = job is not None and drives is not None and not job.stopped and drives.moved.any()
         return self.presence.why_gone(job.page) if moves and job is not None and job.page else ""
