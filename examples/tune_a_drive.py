@@ -9,9 +9,9 @@ import numpy as np
 
 from drive_env import motion
 from drive_env.gains import write_gains
+from drive_env.loops.linear_model import Plant
 from mechanics.loads import LOADS
 from tuning.identify.identification import identify
-from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import RULES, propose
 from tuning.snapshot import Transaction
 from tuning.target import emulated

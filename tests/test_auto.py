@@ -14,6 +14,9 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import Gains, cascade_columns, rule_gains, write_gains
+from drive_env.loops.linear_model import Plant, position_open_loop
+from drive_env.loops.margins import margins
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import plan_move
@@ -34,9 +37,6 @@ from tuning.compare.suite import load_suite, open_machines
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
-from tuning.identify.true_plant import true_plant
-from tuning.response.linear_model import Plant, position_open_loop
-from tuning.response.margins import margins
 from tuning.rules.rules_by_name import propose
 from tuning.runs import provenance
 from tuning.snapshot import load_snapshot, restore

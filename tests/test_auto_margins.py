@@ -13,15 +13,15 @@ from auto_stages import basis, recorded
 from drive_env import cia402, motion
 from drive_env.devices import find_device
 from drive_env.gains import write_gains
+from drive_env.loops.linear_model import OPEN_LOOPS
+from drive_env.loops.margins import Margins, margins
+from drive_env.loops.true_plant import true_plant
 from tuning.auto import calmer_gains
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.calmer_gains import far_enough
 from tuning.auto.measured_margins import SENSITIVITY, SOUGHT
-from tuning.identify.true_plant import true_plant
 from tuning.response import frequency_response
-from tuning.response.linear_model import OPEN_LOOPS
-from tuning.response.margins import Margins, margins
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated, timed
 

@@ -15,6 +15,8 @@ from test_auto import gains, standing_in
 from drive_env import cia402, motion
 from drive_env.devices import find_device
 from drive_env.gains import Gains, rule_gains, write_gains
+from drive_env.loops.linear_model import Plant
+from drive_env.loops.true_plant import true_plant
 from drive_env.master.pace import Timing
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import WATCH
@@ -35,8 +37,6 @@ from tuning.auto.trials import faster
 from tuning.auto.twin import Optimum
 from tuning.identify.estimate import Estimate, Identification, refused
 from tuning.identify.moved_inertia import moved_inertia
-from tuning.identify.true_plant import true_plant
-from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import propose
 from tuning.target import emulated
 

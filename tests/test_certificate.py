@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from drive_env.devices import find_device
 from drive_env.gains import Gains, bandwidths_from_gains, gains_in_si
+from drive_env.loops.margins import Margins, margins
 from drive_env.motors import find_motor
 from tuning.certificate.certificate import (
     AxisCertificate,
@@ -36,7 +37,6 @@ from tuning.certificate.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bod
 from tuning.certificate.report import to_html
 from tuning.commands.cli import app
 from tuning.identify.estimate import Estimate, Identification, refused
-from tuning.response.margins import Margins, margins
 from tuning.response.measured_loop import AtLeast
 
 DEVICE = find_device("tmcm1636")

@@ -11,13 +11,13 @@ from test_parity import served
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
 from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, write_gains
+from drive_env.loops.linear_model import Plant, position_open_loop, velocity_open_loop
+from drive_env.loops.margins import margins
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
-from tuning.identify.true_plant import true_plant
 from tuning.response import excitation_run
 from tuning.response.frequency_response import Signal, measure
 from tuning.response.held_samples import seen_by_bus
-from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
-from tuning.response.margins import margins
 from tuning.response.measured_loop import COHERENT
 from tuning.response.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated

@@ -1,7 +1,7 @@
 """Identification against machines whose truth is known: values, intervals, refusals, and how drives are left.
 
 The truth is computed here from the machines' parameters: inertia and viscous friction from the linear model's
-eigenvectors (tuning/identify/true_plant.py), dry friction from every bearing, guide and gear.
+eigenvectors (drive_env/loops/true_plant.py), dry friction from every bearing, guide and gear.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import write_gains
+from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group, open_machines
 from tuning.identify.estimate import NAMES, refused
 from tuning.identify.identification import identify
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
-from tuning.identify.true_plant import true_plant
 from tuning.identify.working_state import borrowed
 from tuning.target import Target, emulated
 

@@ -27,6 +27,8 @@ from drive_env.gains import (
     gains_from_bandwidths,
     gains_in_si,
 )
+from drive_env.loops.linear_model import OPEN_LOOPS, Plant
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto.checks import sound_gains, unsafe_gains
 from tuning.auto.one_button import auto
@@ -34,10 +36,8 @@ from tuning.auto.twin import FrictionGuess, Known, Twins, least_gains, search
 from tuning.certificate.certificate import si_gains
 from tuning.certificate.certificate_files import load_certificate
 from tuning.commands.cli import app
-from tuning.identify.true_plant import true_plant
 from tuning.identify.winding import loop_gains
 from tuning.identify.working_state import working_state
-from tuning.response.linear_model import OPEN_LOOPS, Plant
 from tuning.rules.rules_by_name import RULES, propose
 from tuning.target import emulated
 

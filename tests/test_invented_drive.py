@@ -30,6 +30,7 @@ from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.tracking import Tracking
 from drive_env.gains import check_linear_model, gain_factors, rule_gains
+from drive_env.loops.linear_model import controllers
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto
 from tuning.certificate.certificate import si_gains
@@ -39,7 +40,6 @@ from tuning.compare.suite import SuiteMachine
 from tuning.identify.identification import identify
 from tuning.outcome import Outcome
 from tuning.response.frequency_response import measure
-from tuning.response.linear_model import controllers
 from tuning.rules.rules_by_name import propose
 from tuning.runs import sweep
 from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve

@@ -11,15 +11,11 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.emulator.loop_trace import trace_loops
 from drive_env.gains import Gains, gains_from_bandwidths, gains_in_si, write_gains
-from drive_env.motors import find_motor
-from tuning.identify.estimate import Estimate, Identification, refused
-from tuning.identify.true_plant import true_plant
-from tuning.response.linear_model import (
+from drive_env.loops.linear_model import (
     Controllers,
     Plant,
     controllers,
     current_open_loop,
-    exponential,
     mean_velocity,
     outer_loop,
     position_open_loop,
@@ -27,6 +23,10 @@ from tuning.response.linear_model import (
     velocity_open_loop,
     velocity_plant,
 )
+from drive_env.loops.sampled import exponential
+from drive_env.loops.true_plant import true_plant
+from drive_env.motors import find_motor
+from tuning.identify.estimate import Estimate, Identification, refused
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1.5e-5)

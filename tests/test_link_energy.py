@@ -11,6 +11,7 @@ from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.firmware.record import get_lanes
 from drive_env.gains import rule_gains, write_gains
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto import search as auto_search
 from tuning.auto.one_button import auto
@@ -18,7 +19,6 @@ from tuning.auto.proving import ProvingGround
 from tuning.auto.search import calm_gains
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
-from tuning.identify.true_plant import true_plant
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy, trial_reach
 from tuning.response.frequency_response import measure
 from tuning.target import emulated

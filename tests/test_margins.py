@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tuning.response.margins import _gain_margin, margins
+from drive_env.loops.margins import _gain_margin, margins
 
 F = np.geomspace(1.0, 1000.0, 2000)
 S = 2j * math.pi * F

@@ -12,6 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.gains import rule_gains, write_gains
+from drive_env.loops.linear_model import position_open_loop
+from drive_env.loops.margins import margins
+from drive_env.loops.true_plant import true_plant
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
 from tuning.auto.measured_margins import SENSITIVITY
@@ -23,10 +26,7 @@ from tuning.compare.comparison_files import save
 from tuning.compare.rule_check import rule_passes
 from tuning.compare.suite import load_suite, open_group
 from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
-from tuning.identify.true_plant import true_plant
 from tuning.outcome import Outcome
-from tuning.response.linear_model import position_open_loop
-from tuning.response.margins import margins
 from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
 from tuning.search.optimise import Optimised, Settings, TrialRow

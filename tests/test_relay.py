@@ -13,11 +13,11 @@ from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import gains_in_si, write_gains
+from drive_env.loops.linear_model import Plant
+from drive_env.loops.margins import margins
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from drive_env.trials.positioning import CYCLE
-from tuning.identify.true_plant import true_plant
-from tuning.response.linear_model import Plant
-from tuning.response.margins import margins
 from tuning.rules import relay as module
 from tuning.rules.lags import velocity_lag
 from tuning.rules.optima import take_current

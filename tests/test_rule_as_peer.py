@@ -11,6 +11,7 @@ import pytest
 from auto_stages import basis, recorded
 
 from drive_env.devices import find_device
+from drive_env.loops.true_plant import true_plant
 from drive_env.safety.envelope import SafetyError
 from tuning.auto import choice, loop_margins
 from tuning.auto import moves as auto_moves
@@ -23,7 +24,6 @@ from tuning.auto.proving import Proof, Shown
 from tuning.auto.stages import IdentifiedAxes, RuleTried
 from tuning.auto.trials import faster
 from tuning.identify.quick_identification import identify_briefly
-from tuning.identify.true_plant import true_plant
 from tuning.target import emulated
 
 RULE, OWN = [4000, 1500, 700, 1800, 700], [4000, 1000, 2000, 4800, 2000]

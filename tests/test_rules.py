@@ -14,11 +14,11 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
+from drive_env.loops.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
+from drive_env.loops.margins import Margins, margins
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import MOTORS, find_motor
 from tuning.identify.estimate import Estimate, Identification, refused
-from tuning.identify.true_plant import true_plant
-from tuning.response.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
-from tuning.response.margins import Margins, margins
 from tuning.rules import side_by_side
 from tuning.rules.internal_model import imc_first_order, simc_first_order, simc_integrating
 from tuning.rules.lags import current_lag, slow_enough, velocity_lag, velocity_noise

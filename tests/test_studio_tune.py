@@ -12,11 +12,11 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 from drive_env import EmulatedDrives, cia402
 from drive_env.devices import find_device
 from drive_env.gains import read_gains
+from drive_env.loops.margins import Margins
 from drive_env.master.description import describe
 from drive_env.studio import motion_jobs
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.session import Session
-from tuning.response.margins import Margins
 from tuning.snapshot import load_snapshot, take_of
 from tuning.studio import gain_card, response_card, step_card, tune_jobs
 from tuning.studio.tune_desk import LAST, StepRecording, TuneDesk, TunerSession

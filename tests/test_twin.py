@@ -12,6 +12,8 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.dictionary.units import RPM
 from drive_env.gains import Gains, rule_gains
+from drive_env.loops.linear_model import Plant
+from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from drive_env.trials.oscillation import OSCILLATION
 from tuning.auto import twin
@@ -28,8 +30,6 @@ from tuning.auto.twin import (
     twin_parameters,
 )
 from tuning.identify.estimate import Estimate, Identification, refused
-from tuning.identify.true_plant import true_plant
-from tuning.response.linear_model import Plant
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 22.0, 2e-5, R=0.41, L=5.5e-4, velocity_filter=260.0)

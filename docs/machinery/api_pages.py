@@ -68,7 +68,7 @@ PAGES = {
             ("tuning.runs.sweep", "run SweepResult"),
             ("tuning.identify.identification", "identify"),
             ("tuning.identify.estimate", "Identification"),
-            ("tuning.response.linear_model", "Plant"),
+            ("drive_env.loops.linear_model", "Plant"),
             ("tuning.rules.rules_by_name", "propose"),
             ("tuning.auto.one_button", "auto"),
             ("tuning.certificate.certificate", "Certificate AxisCertificate StepResponse FrequencyResponse"),

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.loops.linear_model import OPEN_LOOPS
+from drive_env.loops.margins import Margins, margins
 from tuning.auto.load_step import NOISE, SWING
 from tuning.certificate.certificate import (
     AxisCertificate,
@@ -18,8 +20,6 @@ from tuning.certificate.certificate import (
     identified,
     si_gains,
 )
-from tuning.response.linear_model import OPEN_LOOPS
-from tuning.response.margins import Margins, margins
 from tuning.runs.inputs import hashes
 from tuning.runs.provenance import versions
 

@@ -8,16 +8,16 @@ import numpy as np
 
 from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
+from drive_env.loops.linear_model import OPEN_LOOPS
+from drive_env.loops.margins import margins
 from tuning.auto.measured_margins import SOUGHT
-from tuning.response.linear_model import OPEN_LOOPS
-from tuning.response.margins import margins
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from tuning.identify.estimate import Identification
-    from tuning.response.linear_model import Plant
     from tuning.target import Target
 
 SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with

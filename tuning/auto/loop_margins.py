@@ -34,9 +34,9 @@ from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
+    from drive_env.loops.margins import Margins
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
-    from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 Integers = NDArray[np.int64]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.response.margins import Margins, margins
+from drive_env.loops.margins import Margins, margins
 
 if TYPE_CHECKING:
     from tuning.auto.stages import Basis

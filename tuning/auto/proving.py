@@ -45,7 +45,7 @@ from tuning.oscillation_watch import SOFTER
 from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
-    from tuning.response.linear_model import Plant
+    from drive_env.loops.linear_model import Plant
     from tuning.target import Target
 
 Floats = NDArray[np.float64]

@@ -14,13 +14,13 @@ from tuning.certificate.certificate import verdict
 from tuning.lateness import late_first
 
 if TYPE_CHECKING:
+    from drive_env.loops.linear_model import Plant
+    from drive_env.loops.margins import Margins
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.auto.stages import Basis, RecordedGains, Verdict
     from tuning.certificate.certificate import StepResponse
     from tuning.identify.estimate import Identification
-    from tuning.response.linear_model import Plant
-    from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 Floats = NDArray[np.float64]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
 from drive_env.gains import bandwidth_gains, rule_gains
+from drive_env.loops.linear_model import Plant
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.auto.calmer_gains import REPEATS
@@ -20,7 +21,6 @@ from tuning.auto.trial_order import BOLD, OTHERS, SLIPPERY
 from tuning.auto.twin import SLIPPERY_WORLDS, WORLDS, Known, Optimum, Twins, search
 from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
-from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import RULES, propose
 from tuning.target import Target
 

@@ -14,12 +14,12 @@ from tuning.auto.twin import Known, known_of
 from tuning.link_energy import trial_reach
 
 if TYPE_CHECKING:
+    from drive_env.loops.linear_model import Plant
+    from drive_env.loops.margins import Margins
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.certificate.certificate import StepResponse
     from tuning.identify.estimate import Identification
-    from tuning.response.linear_model import Plant
-    from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 Floats = NDArray[np.float64]

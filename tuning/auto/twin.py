@@ -22,9 +22,9 @@ from drive_env.trials.score import RobustScore
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
     from tuning.identify.estimate import Identification
-    from tuning.response.linear_model import Plant
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

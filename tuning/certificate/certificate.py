@@ -23,8 +23,8 @@ from drive_env.whole_file import content_hash
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.devices.gain_set import Gain
+    from drive_env.loops.margins import Margins
     from tuning.identify.estimate import Identification
-    from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast
     from tuning.target import Target
 

@@ -28,7 +28,7 @@ from tuning.commands.options import (
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
-    from tuning.response.linear_model import Plant
+    from drive_env.loops.linear_model import Plant
     from tuning.rules.side_by_side import AxisRules
     from tuning.snapshot import Transaction
     from tuning.target import Target

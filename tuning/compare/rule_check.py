@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import wrapped
 from tuning.auto.loop_margins import FREE_WINDOW, LEAST_WAY
@@ -23,7 +24,6 @@ from tuning.auto.proving import ProvingGround
 from tuning.auto.search import calm_gains
 from tuning.auto.stages import Basis, IdentifiedAxes
 from tuning.response.frequency_response import measure
-from tuning.response.linear_model import Plant
 
 if TYPE_CHECKING:
     from tuning.target import Target

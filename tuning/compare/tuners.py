@@ -115,7 +115,7 @@ class RuleTuner:
         self, target: Target, found: Sequence[Identification], before: Integers, seconds: float = 0.0
     ) -> Outcome:
         """Return the gains for what was identified; an axis without a proposal keeps those before, and says why."""
-        from tuning.response.linear_model import Plant
+        from drive_env.loops.linear_model import Plant
 
         gains, notes = before.copy(), []
         for axis, identified in enumerate(found):

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.loops.linear_model import Plant, position_open_loop, velocity_open_loop
 from drive_env.whole_file import write_picture
-from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
 from tuning.response.measured_loop import COHERENT, MeasuredLoop
 
 if TYPE_CHECKING:

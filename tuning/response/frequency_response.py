@@ -19,6 +19,7 @@ from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.gains import check_linear_model, read_gains
+from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency
 from tuning.identify.dead_time import dead_time_resistance
@@ -28,7 +29,6 @@ from tuning.oscillation_watch import OscillationError, shaken, watch_of
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.response.held_samples import split, unhold
-from tuning.response.linear_model import Plant, controllers
 from tuning.response.measured_loop import COHERENT, GOOD_MISFIT, MeasuredLoop, merged
 from tuning.response.plant_fit import PlantFit, Seen, fit_plant
 from tuning.response.transfer import directions, transfer

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.response import margins as margins_
-from tuning.response.linear_model import controllers, outer_loop, velocity_open_loop
+from drive_env.loops import margins as margins_
+from drive_env.loops.linear_model import controllers, outer_loop, velocity_open_loop
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from tuning.identify.estimate import Estimate
-    from tuning.response.linear_model import Plant
     from tuning.response.plant_fit import PlantFit
 
 Floats = NDArray[np.float64]

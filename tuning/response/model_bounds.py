@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tuning.response.linear_model import outer_loop, velocity_open_loop
-from tuning.response.margins import margins
+from drive_env.loops.linear_model import outer_loop, velocity_open_loop
+from drive_env.loops.margins import margins
 from tuning.response.measured_loop import GOOD_MISFIT, MODEL_LOW, MODEL_POINTS, NYQUIST, AtLeast
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.gains import RawGains
+    from drive_env.loops.linear_model import Plant
     from tuning.identify.estimate import Identification
-    from tuning.response.linear_model import Plant
 
 # Estimates whose intervals have corners, and what a plant calls them; the first two go up and down together, since
 # they change the outer loops by little.

@@ -18,8 +18,8 @@ from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from drive_env.loops.linear_model import Plant, controllers, velocity_open_loop, velocity_plant
 from tuning.response.held_samples import seen_by_bus
-from tuning.response.linear_model import Plant, controllers, velocity_open_loop, velocity_plant
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

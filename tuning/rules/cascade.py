@@ -16,8 +16,8 @@ from tuning.rules.proposal import Proposal, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 SPREAD = 3.0  # a: 53 degrees of phase margin, what commissioning engineers prefer to the textbook's 37
 POSITION = 0.25  # k_v over the velocity loop's crossover

@@ -16,8 +16,8 @@ from tuning.rules.proposal import Proposal, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 # Closed-loop time constants over the dead time, which the rule ignores and must stay clear of.
 IMC_CURRENT = 4.0

@@ -11,7 +11,7 @@ from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING, velocity_filt
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.response.linear_model import Plant
+    from drive_env.loops.linear_model import Plant
     from tuning.rules.proposal import Workbench
 
 ANTI_RESONANCE_SHARE = (

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.response.linear_model import controllers, current_open_loop, mean_velocity, velocity_plant
-from tuning.response.margins import Margins, margins
+from drive_env.loops.linear_model import controllers, current_open_loop, mean_velocity, velocity_plant
+from drive_env.loops.margins import Margins, margins
 from tuning.rules.proposal import Proposal, Rule, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.gains import Part
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 Complex = NDArray[np.complex128]
 

@@ -15,8 +15,8 @@ from tuning.rules.proposal import Proposal, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 SPREAD = 2.0  # a of the symmetrical optimum
 POSITION = 0.5  # k_v over the velocity loop's crossover: modulus optimum, the velocity loop as one lag

@@ -14,8 +14,8 @@ from tuning.rules.proposal import Proposal, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 CURRENT_DAMPING, VELOCITY_DAMPING = 0.9, 1.0
 # Crossover, about 2 zeta w_0, times the lags: 0.35 rad is 20 degrees of phase that the design does not know of.

@@ -11,8 +11,8 @@ from drive_env.gains import Part, check_linear_model, integers_per_si
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.devices.gain_set import Gain
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 COARSE = 0.05  # a gain that an integer misses by more than this share is worth a note
 

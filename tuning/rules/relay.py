@@ -25,8 +25,8 @@ from tuning.rules.proposal import Proposal, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
     from tuning.target import Target
 
 Floats = NDArray[np.float64]

@@ -20,8 +20,8 @@ from tuning.rules.relay import relay_rule
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.response.linear_model import Plant
 
 RULES: Mapping[str, Rule] = {
     "modulus_optimum": modulus_rule,

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.gains import write_gains
+from drive_env.loops.linear_model import Plant, velocity_open_loop
+from drive_env.loops.margins import margins
 from drive_env.safety.envelope import swinging_allowed
-from tuning.response.linear_model import Plant, velocity_open_loop
-from tuning.response.margins import margins
 from tuning.rules.rules_by_name import propose
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.response.margins import Margins
+    from drive_env.loops.margins import Margins
     from tuning.rules.proposal import Proposal
     from tuning.target import Target
 

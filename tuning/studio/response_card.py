@@ -9,8 +9,8 @@ import numpy as np
 from nicegui import ui
 
 from drive_env.gains import check_linear_model
+from drive_env.loops.margins import Margins, margins
 from drive_env.studio import charts
-from tuning.response.margins import Margins, margins
 from tuning.studio import tune_jobs
 
 if TYPE_CHECKING:

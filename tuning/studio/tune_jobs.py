@@ -279,9 +279,9 @@ def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
     """Return the job that identifies every axis, and has the rules propose gains for each."""
 
     def job(drives: Drives) -> None:
+        from drive_env.loops.linear_model import Plant
         from drive_env.safety.envelope import swinging_allowed
         from tuning.identify.identification import identify
-        from tuning.response.linear_model import Plant
         from tuning.rules.rules_by_name import RULES
         from tuning.rules.side_by_side import AxisRules, proposals
 

@@ -14,22 +14,44 @@ All angles are the rotor's; f is in Hz throughout.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.gains import RawGains, cascade_columns, gain_factors
+from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, held, response, window
+from drive_env.loops.sampled import mean_velocity as mean_velocity_of
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
-    from tuning.identify.estimate import Identification
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+
+class KnownValue(Protocol):
+    """A value that was identified; nan with a reason where it was refused."""
+
+    @property
+    def value(self) -> float:
+        """The value."""
+
+    @property
+    def reason(self) -> str:
+        """Why it was refused; "" if it was not."""
+
+
+class KnownAxis(Protocol):
+    """What was identified of an axis, by name."""
+
+    @property
+    def estimates(self) -> Mapping[str, KnownValue]:
+        """The values."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +124,7 @@ class Plant:
         return cls(**_data_sheet(device, motor) | {"supply": supply, "inertia": inertia} | more)
 
     @classmethod
-    def from_identification(cls, device: Device, motor: Motor, supply: float, identification: Identification) -> Plant:
+    def from_identification(cls, device: Device, motor: Motor, supply: float, identification: KnownAxis) -> Plant:
         """Return an axis as identified; what was refused is taken from the data sheet, an elastic pair as rigid.
 
         Raises:
@@ -136,11 +158,11 @@ def current_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLik
         f: Frequencies [Hz], shape (n,).
     """
     at = _below(f, device.current_rate)
-    A, B = _machine(plant)
+    one = linear(plant)
     T = 1.0 / device.current_rate
-    Phi, Gamma, _, _ = _held(A, B, T)
+    Phi, Gamma, _, _ = held(one.A, one.B, one.speed, T)
     z = np.exp(2j * math.pi * at * T)
-    winding = _response(Phi, Gamma, np.eye(len(B))[_CURRENT], z)
+    winding = response(Phi, Gamma, one.current, z[None])[0, :, 0, 0]
     return np.asarray(controllers(device, gains).current(z) * plant.supply * winding / z)
 
 
@@ -245,38 +267,27 @@ def mean_velocity(device: Device, plant: Plant, gains: RawGains, f: Floats) -> C
     """Return the difference of rotor angles over a window [rad/s] per demanded current [A], held for the window."""
     regulator = controllers(device, gains)
     at = np.ascontiguousarray(f, float).tobytes()
-    return _mean_velocity(
-        device.current_rate, device.velocity_rate, regulator.current_p, regulator.current_i, plant, at
-    )  # fmt: skip
+    return _mean_velocity(LoopRates.of(device), regulator.current_p, regulator.current_i, plant, at)
 
 
 @lru_cache(maxsize=256)
-def _mean_velocity(
-    current_rate: float, velocity_rate: float, P: float, share: float, plant: Plant, frequencies: bytes
-) -> Complex:
-    A, B = _machine(plant)
-    Phi, Gamma, angle_of_state, angle_of_voltage = _held(A, B, 1.0 / current_rate)
-    n = len(B)
-    # States: the machine's, the voltage that is computed and not yet applied, the regulator's integral.
-    tick, drive = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
-    tick[:n, :n] = Phi
-    tick[:n, n] = Gamma
-    tick[n, _CURRENT] = -plant.supply * P * (1.0 + share)
-    tick[n, n + 1] = plant.supply
-    drive[n] = plant.supply * P * (1.0 + share)
-    tick[n + 1, _CURRENT] = -P * share
-    tick[n + 1, n + 1] = 1.0
-    drive[n + 1] = P * share
-    turned = np.concatenate([angle_of_state, [angle_of_voltage, 0.0]])
-    window, held = np.eye(n + 2), np.zeros(n + 2)
-    angle, angle_of_demand = np.zeros(n + 2), 0.0
-    for _ in range(round(current_rate / velocity_rate)):
-        angle, angle_of_demand = angle + turned @ window, angle_of_demand + float(turned @ held)
-        window, held = tick @ window, tick @ held + drive
-    z = np.exp(2j * math.pi * np.frombuffer(frequencies) / velocity_rate)
-    result = velocity_rate / z * (_response(window, held, angle, z) + angle_of_demand)
+def _mean_velocity(rates: LoopRates, P: float, share: float, plant: Plant, frequencies: bytes) -> Complex:
+    one = np.ones((1, 1))
+    gains = CascadeGains(P * one, share * one, one, one, one)
+    f = np.frombuffer(frequencies)
+    result = mean_velocity_of(rates, window(rates, linear(plant), gains), f[None])[0, :, 0, 0]
     result.setflags(write=False)  # it is handed out to every caller
     return np.asarray(result)
+
+
+def linear(plant: Plant) -> LinearMachines:
+    """Return an axis as one machine of a set."""
+    A, B = _machine(plant)
+    rows = np.eye(len(B))[None]
+    return LinearMachines(
+        A[None], B[None, :, None], rows[:, [_CURRENT]], rows[:, [_SPEED]], np.array([[plant.supply]]),
+        np.array([[plant.velocity_filter]]),
+    )  # fmt: skip
 
 
 _CURRENT, _SPEED = 0, 1  # states
@@ -305,42 +316,6 @@ def _machine(plant: Plant) -> tuple[Floats, Floats]:
     B = np.zeros(size)
     B[_CURRENT] = 1.0 / plant.L
     return A, B
-
-
-def _held(A: Floats, B: Floats, T: float) -> tuple[Floats, Floats, Floats, float]:
-    """Return Phi, Gamma of a system whose input is held for T [s], and what the rotor turns meanwhile, likewise."""
-    n = len(B)
-    block = np.zeros((n + 2, n + 2))
-    block[:n, :n], block[:n, n] = A * T, B * T
-    block[n + 1, _SPEED] = T
-    step = exponential(block)
-    return step[:n, :n], step[:n, n], step[n + 1, :n], float(step[n + 1, n])
-
-
-def exponential(X: Floats) -> Floats:
-    """Return exp(X) of a small matrix to rounding: Taylor's series of X / 2^k, squared k times.
-
-    SciPy's takes 20 ms instead of 0.1 where cores are busy, for its threads; a fit needs hundreds.
-    """
-    norm = float(np.abs(X).sum(axis=0).max())
-    halvings = max(0, math.ceil(math.log2(norm)) + 1) if norm > 0.0 else 0
-    small = X / 2.0**halvings
-    result = np.eye(len(X))
-    for k in range(_TERMS, 0, -1):
-        result = np.eye(len(X)) + small @ result / k
-    for _ in range(halvings):
-        result = result @ result
-    return np.asarray(result)
-
-
-_TERMS = 14  # of |X| <= 1/2: 2e-17 are left
-
-
-def _response(Phi: Floats, Gamma: Floats, row: Floats, z: Complex) -> Complex:
-    """Return row (z - Phi)^-1 Gamma, in the shape of z, by the modes of Phi, which are simple."""
-    poles, shapes = np.linalg.eig(Phi)
-    residues = (row @ shapes) * np.linalg.solve(shapes, Gamma.astype(complex))
-    return np.asarray((residues / (z[:, None] - poles)).sum(axis=1))
 
 
 def _below(f: ArrayLike, rate: float) -> Floats:

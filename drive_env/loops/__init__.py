@@ -1,0 +1,1 @@
+"""Control loops of a drive and its machine as linear systems: open loops, margins, dynamics."""

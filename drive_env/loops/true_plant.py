@@ -1,0 +1,160 @@
+"""What emulated machines truly are, linearised where their loads start: the truth that scores and tests measure by.
+
+Flanks that transmit count as pressed, dry friction and gravity as none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.loops.linear_model import Plant
+from drive_env.loops.sampled import LinearMachines
+from mechanics.packed import PackedLoad
+
+if TYPE_CHECKING:
+    from drive_env.drives.interface import Drives
+
+Floats = NDArray[np.float64]
+
+RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
+
+
+def true_plant(drives: Drives, axis: int = 0) -> Plant:
+    """Return the plant of an emulated axis, with its first resonance.
+
+    Raises:
+        ValueError: For drives on a bus, whose truth nobody knows, and for a machine with several axes.
+    """
+    if drives.machine is None:
+        raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
+    emulated = drives.machine.drives  # whoever observes them
+    if emulated.load.num_axes != 1:
+        raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
+    true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
+    group = next(g for g in emulated.inside.groups if g.machines.start <= axis < g.machines.stop)
+    J, viscous, pair = _first_resonance(mechanics(group.load), axis - group.machines.start, group.load.load.name)
+    motor = emulated.motor
+    psi = true["motor.psi_m"]
+    factor = 1.0 if motor.kind == "dc" else 1.5
+    known = {} if pair is None else {"anti_resonance": pair[0], "resonance": pair[1], "damping": pair[2]}
+    return Plant(
+        R=true["motor.R_s"],
+        L=true["motor.L_q"],
+        supply=float(drives.machine.supply[axis]),
+        torque_constant=factor * motor.n_p * psi,
+        emf_constant=motor.n_p * psi,
+        inertia=J,
+        viscous=viscous,
+        delay=1.0 / emulated.device.velocity_rate,
+        velocity_filter=true["stage.velocity_filter"],
+        counts=round(motor.encoder_counts * true["motor.encoder_interpolation"]),
+        **known,
+    )
+
+
+class Mechanics(NamedTuple):
+    """M q'' + D q' + K q = torque: (copies, D, D) each, and what each rotor turns by joint, (axes, D)."""
+
+    M: Floats
+    D: Floats
+    K: Floats
+    rotors: Floats
+
+
+def mechanics(load: PackedLoad) -> Mechanics:
+    """Return the copies of a load at their present position."""
+    values, row = load.values, load.load
+    unit = np.eye(load.num_dofs)
+    K, D = values.stiffness[:, :, None] * unit, values.damping[:, :, None] * unit
+    turned = [*load.plant.axis_motion, *(_row(load, friction.motion) for friction in row.frictions)]
+    for k, motion in enumerate(turned):
+        D = D + values.friction[:, k, 3, None, None] * np.outer(motion, motion)
+    for k, contact in enumerate(row.contacts):
+        if contact.transmits:
+            both = np.outer(*[_row(load, contact.motion)] * 2)
+            K, D = K + values.contact[:, k, 2, None, None] * both, D + values.contact[:, k, 3, None, None] * both
+    return Mechanics(load.mass_matrix(), D, K, load.plant.axis_motion)
+
+
+def true_machines(drives: Drives) -> LinearMachines:
+    """Return emulated machines with all that they move, each with all its axes.
+
+    Raises:
+        ValueError: For drives on a bus, whose truth nobody knows.
+    """
+    if drives.machine is None:
+        raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
+    emulated = drives.machine.drives
+    axes, motor = emulated.load.num_axes, emulated.motor
+    true = {
+        name: np.asarray(values, float).reshape(-1, axes)
+        if np.size(values) == emulated.num_axes
+        else np.repeat(np.asarray(values, float)[:, None], axes, axis=1)
+        for name, values in drives.machine.parameters.items()
+    }
+    parts = [mechanics(group.load) for group in emulated.inside.groups]
+    M, D, K = (np.concatenate([getattr(part, name) for part in parts]) for name in ("M", "D", "K"))
+    rotors = parts[0].rotors
+    emf = motor.n_p * true["motor.psi_m"]
+    torque = (1.0 if motor.kind == "dc" else 1.5) * emf
+    count, joints = M.shape[:2]
+    # What springs hold are the twists along the eigenvectors of K; what turns freely is no state of an angle.
+    squares, twists = np.linalg.eigh(K)
+    elastic = squares.max(axis=0) > RIGID * max(float(squares.max()), 1e-300)
+    squares, twists = squares[:, elastic], twists[:, :, elastic]
+    springs, size = int(elastic.sum()), axes + joints + int(elastic.sum())
+    A, B = np.zeros((count, size, size)), np.zeros((count, size, axes))
+    one, speeds, held = np.arange(axes), slice(axes, axes + joints), slice(axes + joints, size)
+    L = true["motor.L_q"]
+    A[:, one, one] = -true["motor.R_s"] / L
+    A[:, :axes, speeds] = -(emf / L)[:, :, None] * rotors
+    A[:, speeds, :axes] = np.linalg.solve(M, torque[:, None, :] * rotors.T)
+    A[:, speeds, speeds] = -np.linalg.solve(M, D)
+    if springs:
+        A[:, speeds, held] = -np.linalg.solve(M, twists * squares[:, None, :])
+        A[:, held, speeds] = np.swapaxes(twists, 1, 2)
+    B[:, one, one] = 1.0 / L
+    current, speed = np.zeros((count, axes, size)), np.zeros((count, axes, size))
+    current[:, one, one] = 1.0
+    speed[:, :, speeds] = rotors
+    supply = np.asarray(drives.machine.supply, float).reshape(count, axes)
+    return LinearMachines(A, B, current, speed, supply, true["stage.velocity_filter"])
+
+
+def _first_resonance(found: Mechanics, copy: int, name: str) -> tuple[float, float, tuple[float, float, float] | None]:
+    """Return inertia and viscous friction at the rotor, and anti-resonance, resonance [Hz], damping of the first."""
+    M, D, K, rotor = found.M[copy], found.D[copy], found.K[copy], found.rotors[0]
+    squares, modes = _modes(M, K)
+    free = squares <= RIGID * max(squares.max(), 1.0)
+    turning = np.flatnonzero(free)
+    if turning.size != 1:
+        raise ValueError(f"load {name!r} has {turning.size} motions without a spring; the model has one")
+    rigid = modes[:, turning[0]]
+    swing = float(rotor @ rigid)
+    J, viscous = 1.0 / swing**2, float(rigid @ D @ rigid) / swing**2
+    if free.all():
+        return J, viscous, None
+    first = int(np.flatnonzero(~free)[0])
+    w = math.sqrt(squares[first])
+    # With the rotor held, what is left swings at the anti-resonances.
+    others = np.linalg.svd(rotor[None, :])[2][1:].T
+    locked, _ = _modes(others.T @ M @ others, others.T @ K @ others)
+    damping = float(modes[:, first] @ D @ modes[:, first]) / (2.0 * w)
+    return J, viscous, (math.sqrt(locked[0]) / (2.0 * math.pi), w / (2.0 * math.pi), damping)
+
+
+def _modes(M: Floats, K: Floats) -> tuple[Floats, Floats]:
+    """Return squared angular frequencies, ascending, and the modes of M q'' + K q = 0 with unit modal mass."""
+    from scipy.linalg import eigh
+
+    squares, modes = eigh(K, M)
+    return np.asarray(squares), np.asarray(modes)
+
+
+def _row(load: PackedLoad, motion: Mapping[str, float]) -> Floats:
+    return np.array([motion.get(name, 0.0) for name in load.joints])
