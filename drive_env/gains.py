@@ -265,6 +265,11 @@ def check_linear_model(device: Device) -> None:
         )
 
 
+def has_linear_model(device: Device) -> bool:
+    """Return whether a device's loops are those of the linear model."""
+    return not _lacks(device)
+
+
 def _lacks(device: Device) -> str:
     """Return what a device lacks for the linear model, "" for nothing."""
     if device.gains.cascade != PI:

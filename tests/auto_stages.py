@@ -4,38 +4,47 @@ from __future__ import annotations
 
 import numpy as np
 
-from tuning.auto import one_button
+from tuning.auto import correction, design, one_button
 from tuning.auto.stages import Basis, IdentifiedAxes, RecordedGains, TriedGains
 
 
 def basis(reference, *, before=None, plant=None, found=None):
-    """Return what a search starts from: the rule's gains, (num_axes, count), and one plant for all axes."""
+    """Return what a design starts from: reference and calm gains, (num_axes, count), and one plant for all axes."""
     reference = np.asarray(reference)
     n = len(reference)
     before = reference if before is None else np.asarray(before)
-    return Basis(
-        IdentifiedAxes((found,) * n, (plant,) * n), before, reference, np.tile(reference, (3, 1, 1)), ("",) * n
-    )
+    return Basis(IdentifiedAxes((found,) * n, (plant,) * n), before, reference, reference, ("",) * n)
 
 
-def recorded(gains, *, spare=0, **known):
+def recorded(gains, **known):
     """Return gains, (num_axes, count), of which nothing more than this is known."""
-    tried = TriedGains.only(np.asarray(gains))
-    values = vars(RecordedGains.of(tried)) | {"spare": np.full_like(tried.spare, spare)} | known
-    return RecordedGains(**values)
+    return RecordedGains(**(vars(RecordedGains.of(TriedGains.only(np.asarray(gains)))) | known))
+
+
+def designs(replace, gains, again=None):
+    """Have auto design gains, (num_axes, count), at once, and others where it corrects; `replace` is setattr."""
+
+    def design_axes(bench, basis, where, say=None, recorded=None, dynamics=None, most=None):
+        wanted = gains if recorded is None or again is None else again
+        n = len(bench.before)
+        one = np.ones(n)
+        return np.array(np.resize(wanted, (n, bench.before.shape[1]))), one, one
+
+    replace(one_button, "design_axes", design_axes)
+    replace(correction, "design_axes", design_axes)
+
+
+def short_designs(replace):
+    """Have auto look at few sets of gains; `replace` is monkeypatch.setattr or setattr."""
+    for name, value in (("FINALISTS", 2), ("EACH", 1), ("STEPS", (1.15,)), ("PROMISING", 4)):
+        replace(design, name, value)
 
 
 def skip_stages(replace, gains):
     """Have auto find gains, (num_axes, count), and move nothing; `replace` is monkeypatch.setattr or setattr."""
-
-    def stays(bench, basis, recorded, *more):
-        return recorded
-
-    replace(
-        one_button, "identify", lambda bench, experiments: IdentifiedAxes((None,) * len(gains), (None,) * len(gains))
-    )
+    n = len(gains)
+    replace(one_button, "identify", lambda bench, experiments: IdentifiedAxes((None,) * n, (None,) * n))
     replace(one_button, "prepare", lambda bench, identified: basis(gains, before=bench.before))
-    replace(one_button, "compute", lambda bench, basis, *more: None)
-    replace(one_button, "prove", lambda bench, basis, candidates: TriedGains.only(gains.copy()))
-    for name in ("show", "measure", "look_back"):
-        replace(one_button, name, stays)
+    replace(one_button, "on_twins", lambda bench, basis, say: TriedGains.only(gains.copy()))
+    replace(one_button, "correct", lambda bench, basis, tried, target, say: RecordedGains.of(tried))
+    replace(one_button, "look_back", lambda bench, basis, recorded: recorded)

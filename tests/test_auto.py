@@ -7,30 +7,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from auto_stages import designs, short_designs
 from test_parity import served
 from thinning import part
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import Gains, cascade_columns, rule_gains, write_gains
-from drive_env.loops.linear_model import Plant, position_open_loop
+from drive_env.gains import Gains, rule_gains, write_gains
+from drive_env.loops.dynamics import find_dynamics
+from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins
-from drive_env.loops.true_plant import true_plant
+from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, open_loops, step_overshoot, window
+from drive_env.loops.true_plant import true_machines, true_plant
 from drive_env.motors import find_motor
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
-from tuning.auto import choice, refinement
-from tuning.auto import loop_margins as auto_margins
+from tuning.auto import correction
+from tuning.auto import identified as auto_identified
 from tuning.auto import one_button as auto_module
-from tuning.auto import proving as proving_module
-from tuning.auto import search as auto_search
-from tuning.auto import trials as auto_trials
+from tuning.auto import trying as auto_trying
 from tuning.auto.certify import SETTLING, certificate
-from tuning.auto.checks import sound_gains, unsafe_gains
-from tuning.auto.measured_margins import SENSITIVITY, SOUGHT, first_far_enough
-from tuning.auto.moves import OVERTIME
+from tuning.auto.checks import unsafe_gains
+from tuning.auto.loop_margins import MS_ERROR
 from tuning.auto.one_button import BUDGET, auto
 from tuning.auto.proving import ProvingGround
 from tuning.compare.suite import load_suite, open_machines
@@ -42,6 +42,7 @@ from tuning.runs import provenance
 from tuning.snapshot import load_snapshot, restore
 from tuning.target import Target, emulated
 
+POSITION_P = Gains._fields.index("position_p")
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 NORMAL, EMPTY, WILD, REVERSED, SHORT = range(5)  # axes of `five`
@@ -60,6 +61,7 @@ def settings(drives):
 
 
 FIVE_BUDGET = 12.0  # s: of five axes some wait for others
+OVERTIME = 1.0  # s, by which a step may take longer than it was planned for
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +77,7 @@ def five(tmp_path_factory):
         target = replace(target, low=low, high=high)
         before = gains(drives), settings(drives)
         file = tmp_path_factory.mktemp("auto") / "before.toml"
-        result = auto(target, file, seed=1, budget=FIVE_BUDGET)
+        result = auto(target, file, budget=FIVE_BUDGET)
         yield target, result, before, (gains(drives), settings(drives)), file
 
 
@@ -89,16 +91,49 @@ def test_a_drive_is_tuned_whatever_gains_it_had(five, axis):
     found = result.axes[axis]
     assert found.accepted, found.reason
     assert tuple(after[axis]) == found.after
-    # The trial of the rule's gains has some time more, and who shakes at rest.
-    assert result.drive_seconds[axis] < FIVE_BUDGET + choice.OVERTIME + (OVERTIME if found.eased else 0.0)
+    assert result.drive_seconds[axis] < FIVE_BUDGET + OVERTIME
     drives = target.drives
     hidden = RobustScore("tmcm1636", "inertia", "qbl4208", 1)
     J = np.array([true_plant(drives, axis).inertia])
     hidden.set_machines({k: v[[axis]] for k, v in drives.machine.parameters.items()}, drives.machine.supply[[axis]])
     hidden.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0))[[axis]], np.array([np.inf])))
-    rule = hidden.set_reference(rule_gains(drives.device, drives.motor, J)).robust_cost[0]
-    assert hidden.score(after[[axis]]).robust_cost[0] < 0.8 * rule
+    rule = hidden.set_reference(rule_gains(drives.device, drives.motor, J)).performance[0]
+    scores = hidden.score(after[[axis]])
+    assert scores.performance[0] < 1.3 * rule and scores.slack[0] > -0.1, scores
     hidden.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", ["inertia", "belt"])
+def test_what_it_ends_with_keeps_the_dynamics_of_the_true_machine(load, tmp_path):
+    """Nothing that auto has measured counts: the loops are those of the emulated machine, linearised."""
+    with emulated(load=load, num_threads=1) as target:
+        (axis,) = auto(target, tmp_path / "before.toml").axes
+        machines, device = true_machines(target.drives), target.device
+    assert axis.verdict == "accepted", axis
+    assert axis.slack > 0.0 and not axis.is_kept
+    rates, one = LoopRates.of(device), CascadeGains.of(device, np.array(axis.after)[None, None])
+    f = np.geomspace(1.0, 0.49 * device.velocity_rate, 4000)
+    loops = open_loops(rates, machines, one, f[None])
+    velocity, position = (margins(f, loop[0, 0]) for loop in (loops.velocity, loops.position))
+    for found in (velocity, position):
+        assert found.phase_deg >= 40.0 and found.ms <= 2.1 and found.gain_db >= 7.0, found
+    assert position.crossover_hz < velocity.crossover_hz
+    overshoot = step_overshoot(rates, closed_loops(rates, machines, one, window(rates, machines, one)))
+    assert overshoot.max() <= 0.22
+
+
+@pytest.mark.slow
+def test_softer_dynamics_are_slower_and_farther_from_instability(quick, tmp_path):
+    found = []
+    for dynamics in ("soft", "stiff"):
+        with emulated(load="inertia", num_threads=1) as target:
+            (axis,) = auto(target, tmp_path / f"{dynamics}.toml", dynamics=dynamics, experiments=standing_in).axes
+        assert axis.accepted, axis
+        found.append(axis)
+    soft, stiff = found
+    assert max(one.ms for one in soft.margins.values()) < max(one.ms for one in stiff.margins.values())
+    assert soft.after[POSITION_P] < stiff.after[POSITION_P]
 
 
 @pytest.mark.slow
@@ -167,9 +202,7 @@ def test_the_certificate_says_what_was_done(five):
     for shown in (new, new_position):
         ms = shown.margins["Ms"]
         assert f"{shown.name} Ms {ms:.1f}" in tuned.reason
-        assert 1.0 < ms <= SENSITIVITY
-        near = f"the {shown.name} is near to instability: Ms {ms:.1f}"  # where what was sought would cost too much
-        assert any(text.startswith(near) for text in tuned.reservations) == (ms > SOUGHT)
+        assert 1.0 < ms <= MS_ERROR * find_dynamics("standard").ms
     assert np.isnan(old.coherence).all()
     assert "model" in old.source
     low = int(np.searchsorted(new.frequency, 20.0))
@@ -204,74 +237,6 @@ def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before,
     assert bool(why) == bool(words)
 
 
-@pytest.mark.parametrize("position_p", [118, 1420, 21595])
-def test_gains_are_lowered_until_the_outer_loops_are_sound_by_the_model(position_p):
-    """Against the margins of the loops themselves; what is sound already stays as it is."""
-    device, motor = find_device("tmcm1636"), find_motor("qbl4208")
-    plant = Plant.from_data_sheet(device, motor, 24.0, 1.5e-5)
-    gains = Gains(4021, 1573, 445, 329, position_p)
-    found = sound_gains(device, plant, gains)
-    f = np.geomspace(1.0, 2400.0, 3000)
-    now, then = (margins(f, position_open_loop(device, plant, one, f)) for one in (found, gains))
-    assert now.ms <= 1.02 * SOUGHT
-    assert found[:4] == gains[:4]
-    if then.ms <= SOUGHT:
-        assert found == gains
-    else:
-        assert now.ms > 0.7 * SOUGHT and found[4] < position_p  # and no farther than that
-
-
-@pytest.mark.parametrize(
-    ("peaks", "taken"),
-    [
-        ((1.5, 1.2), 0),  # as they are
-        ((3.5, SOUGHT, 1.2), 1),  # the first within what is sought
-        ((3.6, 3.5, 3.2), 0),  # none is: the first that is allowed, and a reservation
-        ((9.0, SENSITIVITY, 5.0), 1),
-        ((9.0, 4.01), None),
-        ((), None),
-    ],
-)
-def test_gains_are_lowered_to_what_is_sought_and_else_to_what_is_allowed(peaks, taken):
-    assert first_far_enough(iter(peaks)) == taken
-
-
-def test_bounds_are_close_where_what_is_sought_leaves_less():
-    """Ms bounds both margins from below: 2 asin(1/2Ms) and Ms/(Ms - 1)."""
-    assert np.degrees(2.0 * np.arcsin(0.5 / SOUGHT)) >= auto_margins.CLOSE["phase"] == 19.0
-    assert 20.0 * np.log10(SOUGHT / (SOUGHT - 1.0)) == pytest.approx(auto_margins.CLOSE["gain"], abs=0.1)
-
-
-@pytest.mark.slow
-def test_gains_that_a_last_stage_has_changed_are_tried_before_they_are_certified(quick, monkeypatch, tmp_path):
-    """A trial that they fail takes the plain accept away, whatever the faster ones before have shown."""
-    run, tried = ProvingGround.run, []
-
-    def changed(bench, basis, recorded, target):
-        # Of position P alone: with all of them lower the position loop is nearer to instability, which is told, too.
-        lowered = recorded.gains[0].copy()
-        position_p = cascade_columns(target.device)[4]
-        lowered[position_p] = lowered[position_p] * 9 // 10
-        return recorded.with_gains(0, lowered)
-
-    def fails(self, wanted, where, heavier=False):
-        tried.append(wanted[0].tolist())
-        proof = run(self, wanted, where, heavier)
-        return proof._replace(reason=("it oscillated",)) if len(tried) > 1 and wanted[0].tolist() == last else proof
-
-    monkeypatch.setattr(auto_module, "refine", changed)
-    monkeypatch.setattr(ProvingGround, "run", fails)
-    with emulated(load="inertia", num_threads=1) as target:
-        last = None
-        (axis,) = auto(target, tmp_path / "first.toml", experiments=standing_in).axes
-        assert tried[-1] == list(axis.after) and axis.verdict == "accepted", axis
-        last = list(axis.after)
-    with emulated(load="inertia", num_threads=1) as target:
-        (axis,) = auto(target, tmp_path / "second.toml", experiments=standing_in).axes
-    assert list(axis.after) == last and axis.verdict == "accepted with reservations"
-    assert axis.reservations == ("the lowered gains fail their trial: it oscillated",)
-
-
 # --- rolling back -----------------------------------------------------------------------------------------------------
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
@@ -291,24 +256,28 @@ def standing_in(target, where=None):
     return found
 
 
+# Of `inertia`: a step in csp overshoots by a third with the first ones.
+LIVELY, SLOWER = [8009, 9699, 1000, 1600, 1700], [8009, 9699, 900, 900, 700]
+
+
 @pytest.fixture
 def quick(monkeypatch):
-    """Make the searches on twins short ones."""
-    monkeypatch.setattr(auto_search, "GENERATIONS", 3)
-    monkeypatch.setattr(auto_search, "OTHER_GENERATIONS", 1)
+    """Make the designs on twins short ones."""
+    short_designs(monkeypatch.setattr)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "stage", ["compute", "prove", "show", "measure", "look_back", "try_rule", "keep_the_better", "refine",
-              "try_what_changed"]
-)  # fmt: skip
+    "stage", ["on_twins", "try_gains", "show", "step", "measure", "load", "_corrected", "_try", "look_back"]
+)
 def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path, stage):
     def interrupted(bench, *handed):
         write_gains(bench.target.drives, np.full((1, 5), 77))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(auto_module, stage, interrupted)
+    monkeypatch.setattr(auto_module if hasattr(auto_module, stage) else correction, stage, interrupted)
+    # Gains that show a step to overshoot, so that they are corrected.
+    designs(monkeypatch.setattr, LIVELY, again=SLOWER) if stage != "on_twins" else None
     with emulated(load="inertia", num_threads=1) as target:
         before = gains(target.drives)
         with pytest.raises(KeyboardInterrupt):
@@ -319,14 +288,9 @@ def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path
 
 @pytest.mark.slow
 def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick, monkeypatch, tmp_path):
-    def shaky(device, motor, plant):
-        return propose("margin_55", device, motor, plant)._replace(gains=Gains(4021, 1573, 32767, 32767, 32767))
-
-    monkeypatch.setattr(auto_search, "RULES", dict.fromkeys(auto_search.RULES, shaky))
-    monkeypatch.setattr(auto_search, "propose", lambda name, *plant: auto_search.RULES[name](*plant))
-    monkeypatch.setattr(auto_search, "rule_gains", lambda *motor, **supply: np.full((1, 5), 32767))
-    monkeypatch.setattr(auto_search, "calm_gains", lambda target, plant: np.full(5, 32767))
-    monkeypatch.setattr(auto_trials, "faster", lambda known, gains, factor: np.full_like(gains, 32767))
+    designs(monkeypatch.setattr, [4021, 1573, 32767, 32767, 32767])
+    monkeypatch.setattr(auto_identified, "calm_gains", lambda target, plant: np.full(5, 32767))
+    monkeypatch.setattr(auto_trying, "faster", lambda known, gains, factor: np.full_like(gains, 32767))
     with emulated(load="inertia", num_threads=1) as target:
         before = np.array([[4021, 1573, 445, 329, 0]])  # no way back to gains that would pass
         write_gains(target.drives, before)
@@ -372,36 +336,6 @@ def answers(monkeypatch, change):
 
     monkeypatch.setattr(module, "measure", changed)
     return called
-
-
-def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, monkeypatch, tmp_path):
-    tried = []
-    run = ProvingGround.run
-
-    def seen(self, gains, where, heavier=False):
-        tried.append(gains[0].copy())
-        return run(self, gains, where, heavier)
-
-    monkeypatch.setattr(ProvingGround, "run", seen)
-    monkeypatch.setattr(proving_module, "RESTLESS", 1.0)  # or it would be slowed before
-    monkeypatch.setattr(auto_margins, "LEAST_LINES", 1)
-    monkeypatch.setattr(auto_margins, "SOFTER", (1.0, 0.5))
-    measured, full = auto_margins.margins_with, []
-
-    def lively(basis, response, gains, k):
-        full.append(gains[2])
-        found = measured(basis, response, gains, k)
-        return found | {"velocity": found["velocity"]._replace(ms=9.0 if gains[2] > 0.75 * full[0] else 2.0)}
-
-    monkeypatch.setattr(auto_margins, "margins_with", lively)
-    with emulated(load="inertia", num_threads=1) as target:
-        result = auto(target, tmp_path / "before.toml", experiments=standing_in)
-    (axis,) = result.axes
-    assert axis.accepted, axis.reason
-    assert any("lowered to 50 %" in note for note in axis.notes), axis.notes
-    order = [gains.tolist() for gains in tried]
-    calmed = order.index(list(axis.after))  # the baseline rule's gains may make their trial after it
-    assert 2.0 in [round(gains[2] / axis.after[2], 1) for gains in order[:calmed]]
 
 
 @pytest.mark.slow
@@ -458,7 +392,8 @@ def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick
 
 
 @pytest.mark.slow
-def test_a_response_that_the_time_does_not_allow_is_said(quick, tmp_path):
+def test_a_response_that_the_time_does_not_allow_is_said(monkeypatch, tmp_path):
+    designs(monkeypatch.setattr, SLOWER)
     with emulated(load="inertia", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in, budget=2.5)
     (axis,) = result.axes
@@ -566,7 +501,7 @@ def test_on_a_bus_it_tunes_inside_the_envelope_and_the_drive_keeps_it(tmp_path, 
         result = auto(target, tmp_path / "before.toml")
         assert result.accepted.all(), result.axes[0].reason
         assert result.kept
-        assert result.drive_seconds[0] < BUDGET + choice.OVERTIME
+        assert result.drive_seconds[0] < BUDGET + OVERTIME
         after = gains(drives)
         assert not np.array_equal(after, before)
         drives.reset_node()
@@ -575,7 +510,7 @@ def test_on_a_bus_it_tunes_inside_the_envelope_and_the_drive_keeps_it(tmp_path, 
 
 # --- the suite --------------------------------------------------------------------------------------------------------
 def hidden_ratio(target, machines, found):
-    """Return the robust cost over that of the best baseline rule for the true inertia, (machines,)."""
+    """Return robust performance over that of the baseline rule for the true inertia, and slack, (machines,) each."""
     drives = target.drives
     axes = target.axes_per_machine
     score = RobustScore(drives.device.name, drives.load.name, drives.motor.name, len(machines),
@@ -585,10 +520,10 @@ def hidden_ratio(target, machines, found):
     reach = np.where(target.high >= -target.low, target.high, target.low)
     score.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0)), reach))
     rule = [rule_gains(drives.device, drives.motor, j, supply=v)[0] for j, v in zip(J, target.supply, strict=True)]
-    reference = score.set_reference(np.array(rule)).robust_cost
-    ratio = score.score(found).robust_cost / reference
+    reference = score.set_reference(np.array(rule)).performance
+    scores = score.score(found)
     score.close()
-    return ratio
+    return scores.performance / reference, scores.slack
 
 
 @pytest.mark.slow
@@ -596,20 +531,22 @@ def test_on_the_public_machines_it_is_far_better_than_the_baseline_rule_and_stay
     """Every fourth one of the 46 of one axis; side by side they wait for each other: that counts as drive time."""
     machines = [machine for machine in load_suite("public") if machine.load not in ("gantry", "robot")]
     machines = machines[:: -(-len(machines) // part(12, 4))]
-    ratios, accepted, seconds, violations = [], [], [], 0
+    ratios, slacks, accepted, seconds, violations = [], [], [], [], 0
     for target, indices in open_machines(machines):
         chosen = [machines[k] for k in indices]
-        result = auto(target, tmp_path / f"{chosen[0].name}.toml", seed=5)
+        result = auto(target, tmp_path / f"{chosen[0].name}.toml")
         found = np.array([axis.after for axis in result.axes], np.int64)
         np.testing.assert_array_equal(found, gains(target.drives))
-        ratios += hidden_ratio(target, chosen, found).tolist()
+        ratio, slack = hidden_ratio(target, chosen, found)
+        ratios, slacks = ratios + ratio.tolist(), slacks + slack.tolist()
         accepted += result.accepted.tolist()
         seconds += result.drive_seconds.tolist()
         violations += int(result.violations.sum())
-    assert len(ratios) == len(machines) and sum(accepted) >= len(machines) - 1
-    assert np.median(ratios) <= 0.6
+    assert len(ratios) == len(machines) and sum(accepted) >= len(machines) - 2
+    assert np.median(ratios) <= 0.8  # of a rule that breaks the margins on each
+    assert np.median(slacks) > -0.05
     assert violations == 0
-    assert np.median(seconds) < 2.5 * BUDGET and max(seconds) < BUDGET + refinement.OVERTIME + OVERTIME
+    assert max(seconds) < BUDGET + OVERTIME
 
 
 def test_brief_identification_is_right_and_quick():

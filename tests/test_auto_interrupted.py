@@ -18,8 +18,8 @@ from drive_env import CanDrives, motion
 from drive_env.devices import find_device
 from drive_env.motors import find_motor
 from tuning.auto import one_button as auto_module
-from tuning.auto import trials as auto_trials
 from tuning.auto.one_button import auto
+from tuning.auto.proving import ProvingGround
 from tuning.snapshot import Transaction
 from tuning.target import Target, emulated
 
@@ -34,7 +34,7 @@ def is_off(drives):
 
 def while_it_moves(monkeypatch):
     """Press Ctrl-C in the middle of the first trial."""
-    run = auto_trials.ProvingGround.run
+    run = ProvingGround.run
 
     def interrupted(self, tried, where):
         self._begin(where)
@@ -42,7 +42,7 @@ def while_it_moves(monkeypatch):
         signal.raise_signal(signal.SIGINT)
         return run(self, tried, where)
 
-    monkeypatch.setattr(auto_trials.ProvingGround, "run", interrupted)
+    monkeypatch.setattr(ProvingGround, "run", interrupted)
 
 
 def on_bus(drives):

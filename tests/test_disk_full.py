@@ -301,7 +301,7 @@ def test_a_journal_that_finds_no_room_ends_a_search_and_is_named(tmp_path):
 # Command and options, kB that are left, the file that finds no room, and the option with which it goes on.
 COMMANDS = [
     ("rank", ("-t", "baseline", "--count", 1), 8, "run/tuners.csv", "--resume"),
-    ("rank", ("-t", "factory", "-t", "baseline", "--count", 1), 24, "run/comparison.png", "--resume"),
+    ("rank", ("-t", "factory", "-t", "baseline", "--count", 1), 36, "run/comparison.png", "--resume"),
     ("optimise", ("--load", "inertia", "--trials", 1, "--sampler", "random"), 8, "run.unfinished/part-0", ""),
     ("optimise", ("--load", "inertia", "--trials", 1, "--sampler", "random"), 24, "run/trials.png", "--resume"),
     ("sweep", ("--config", "small.toml"), 4, "run.unfinished/settings.toml", ""),

@@ -125,11 +125,16 @@ def test_a_swing_is_the_largest_of_any_window_of_25_ms_and_each_axis_has_its_own
     np.testing.assert_allclose(swing(current, 2.0), [max(0.25, np.sqrt(2 * 4.0 / 24) / 2.0), 0.0])
 
 
-def test_a_swing_at_rest_is_about_its_mean_and_of_the_last_45_ms_before_the_load_step():
-    current = np.zeros((TRIAL, 2))
+def test_a_swing_at_rest_is_about_its_trend_and_of_the_last_45_ms_before_the_load_step():
+    current = np.zeros((TRIAL, 3))
     current[:QUIET], current[SETTLED:] = 9.0, -9.0  # the move, and the load step
-    current[QUIET:SETTLED, 0] = 5.0 + 0.4 * np.sin(2.0 * np.pi * np.arange(SETTLED - QUIET) / 15.0)
-    np.testing.assert_allclose(resting_swing(current, 2.0), [0.4 / np.sqrt(2.0) / 2.0, 0.0], atol=1e-12)
+    late = np.arange(SETTLED - QUIET) - (SETTLED - QUIET - 1) / 2.0
+    wave = 0.4 * np.cos(2.0 * np.pi * late / 15.0)
+    current[QUIET:SETTLED] = np.stack(
+        [5.0 + wave, wave - 0.03 * late, 5.0 + 0.03 * late], axis=1
+    )  # the last one creeps
+    rms = 0.4 / np.sqrt(2.0) / 2.0
+    np.testing.assert_allclose(resting_swing(current, 2.0), [rms, rms, 0.0], atol=1e-12)
 
 
 # --- identification -------------------------------------------------------------------------------------------------

@@ -145,9 +145,9 @@ def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
         if row["tuner"] == "factory":
             assert gains == factory
         if row["tuner"] == "baseline":
-            assert float(row["relative"]) == pytest.approx(1.0, abs=0.3)  # the inertia that moves show is the true one
+            assert float(row["relative"]) > 1.0  # nothing is better than what is searched on the machine itself
         assert (row["failed"] == "True") == (row["tuner"] == "simc")
-    assert list(rows[0])[-5:] == [*NAMES, "note", "rule_passes"]
+    assert list(rows[0])[-4:] == [*NAMES, "note"]
     assert {row["note"] for row in rows if row["tuner"] == "simc"} == {f"ValueError: {NO_MODEL}"}
 
 

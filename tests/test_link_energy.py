@@ -13,10 +13,9 @@ from drive_env.firmware.record import get_lanes
 from drive_env.gains import rule_gains, write_gains
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
-from tuning.auto import search as auto_search
+from tuning.auto.identified import calm_gains
 from tuning.auto.one_button import auto
 from tuning.auto.proving import ProvingGround
-from tuning.auto.search import calm_gains
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy, trial_reach
@@ -158,8 +157,6 @@ def test_the_reach_of_trials_is_less_by_a_weight_and_as_it_was_where_the_link_ho
 @pytest.mark.parametrize(("seed", "motor"), [(GUARD_SEED, "class_1kw"), (1, "class_750w")])
 def test_of_twenty_vertical_axes_that_auto_tunes_none_overcharges_its_link(monkeypatch, tmp_path, seed, motor):
     """7 and 2 of 20 did, up to nine times each."""
-    monkeypatch.setattr(auto_search, "GENERATIONS", 3)
-    monkeypatch.setattr(auto_search, "OTHER_GENERATIONS", 1)
     options = {"randomise": True, "num_machines": 20, "num_threads": 1}
     with emulated(load="vertical_screw", motor=motor, seed=seed, **options) as target:
         told = []

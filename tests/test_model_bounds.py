@@ -102,7 +102,7 @@ def test_a_model_that_is_none_gives_no_bound_and_says_why():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("load", ["inertia", "two_mass", "belt", "winder"])
+@pytest.mark.parametrize("load", ["two_mass", "belt", "winder"])
 def test_an_axis_whose_drive_time_runs_out_has_bounds_and_is_amber(load, tmp_path):
     with emulated(load=load, num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", budget=SPENT)

@@ -28,7 +28,7 @@ from drive_env.phase_current import (
 )
 from drive_env.trials.method import OpenLoop, check_tried, method_of
 from drive_env.trials.open_loop import OpenLoopTerms, open_loop_cost
-from drive_env.trials.score import VARIANTS
+from drive_env.trials.score import STEPPER_VARIANTS, VARIANTS
 from tuning.commands.cli import app
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
@@ -204,8 +204,9 @@ def test_gain_tuning_draws_steppers_by_the_loads_shipped_set(stepper):
         env.close()
 
 
-def test_servo_drives_keep_their_variants():
-    assert [v.name for v in VARIANTS if v.run_current != 1.0] == ["run current x 0.8"]
+def test_a_variant_of_the_run_current_is_the_steppers_alone():
+    assert [v.name for v in STEPPER_VARIANTS if v.run_current != 1.0] == ["run current x 0.8"]
+    assert all(v.run_current == 1.0 for v in VARIANTS)
 
 
 # --- the commands ---------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Tuners compared: scored by the robust cost over the rule's, counted by the meter, whoever wrote them."""
+"""Tuners compared: judged by the constrained oracle and by true margins, counted by the meter, whoever wrote them."""
 
 from __future__ import annotations
 
@@ -12,20 +12,17 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.gains import rule_gains, write_gains
-from drive_env.loops.linear_model import position_open_loop
-from drive_env.loops.margins import margins
-from drive_env.loops.true_plant import true_plant
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
-from tuning.auto.measured_margins import SENSITIVITY
 from tuning.commands.cli import app
 from tuning.compare import comparison as compare_module
-from tuning.compare import rule_check, tuners
-from tuning.compare.comparison import REPEATS, compare
+from tuning.compare import tuners
+from tuning.compare.comparison import compare
 from tuning.compare.comparison_files import save
-from tuning.compare.rule_check import rule_passes
+from tuning.compare.oracle import find_oracles
 from tuning.compare.suite import load_suite, open_group
 from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
+from tuning.compare.yardstick import REPEATS
 from tuning.outcome import Outcome
 from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
@@ -55,7 +52,9 @@ def true_rule():
 
 
 def knows_the_truth(target, rng):
-    return outcome(target, true_rule()[0])
+    """Take the oracle's gains of the rigid machines."""
+    best = find_oracles(RIGID[: target.num_axes])
+    return outcome(target, np.concatenate([best[machine.name].gains for machine in RIGID[: target.num_axes]]))
 
 
 def moves_and_slows(target, rng):
@@ -70,41 +69,64 @@ def moves_and_slows(target, rng):
     return outcome(target, gains, "slowed")
 
 
+def shakes(target, rng):
+    """Take gains with which the velocity loop oscillates, which is worse than the rule anywhere."""
+    gains = read_gains(target)
+    gains[:, 2] *= 60
+    write_gains(target.drives, gains)
+    return outcome(target, gains, "shaken")
+
+
 def breaks(target, rng):
     write_gains(target.drives, np.tile([4021, 1573, 700, 500, 200], (target.num_axes, 1)))
     raise RuntimeError("out of ideas\nentirely")
 
 
 # --- the score ----------------------------------------------------------------------------------------------------
-def test_the_rule_with_the_true_inertia_is_the_yardstick():
+def test_the_oracle_is_the_yardstick():
     found = compare(RIGID, {"truth": knows_the_truth})
     assert [row.relative for row in found.rows] == pytest.approx([1.0] * 4, rel=1e-12)
+    assert all(row.kept and row.near and row.phase_deg > 44.0 and row.ms < 2.1 for row in found.rows)
 
 
-def test_the_score_is_hidden_j_of_the_machine():
+def test_the_cost_is_the_robust_cost_of_the_machine():
     found = compare(RIGID, {"factory": find_tuner("factory")})
     gains, inertia = true_rule()
     hidden = RobustScore("tmcm1636", "inertia", "qbl4208", 4, repeats=REPEATS)
     with open_group(RIGID) as target:
         hidden.set_machines(target.drives.machine.parameters, target.supply)
         hidden.set_moves(plan_move(target.motor, inertia, target.drives.read((0x2058, 0)), np.full(4, np.inf)))
-        rule = hidden.set_reference(gains).robust_cost
-        expected = hidden.score(read_gains(target)).robust_cost
+        hidden.set_reference(gains)
+        expected = hidden.score(read_gains(target))
     hidden.close()
-    assert [row.robust_cost for row in found.rows] == pytest.approx(expected)
-    assert [row.rule for row in found.rows] == pytest.approx(rule)
-    assert [row.relative for row in found.rows] == pytest.approx(expected / rule)
+    assert [row.robust_cost for row in found.rows] == pytest.approx(expected.robust_cost)
+    assert [row.performance for row in found.rows] == pytest.approx(expected.performance)
+    assert [row.slack for row in found.rows] == pytest.approx(expected.slack)
+    best = find_oracles(RIGID)
+    assert [row.relative for row in found.rows] == pytest.approx(
+        expected.performance / [best[machine.name].performance for machine in RIGID]
+    )
 
 
 def test_a_summary_is_of_all_machines():
-    found = compare(RIGID, {"slow": moves_and_slows, "truth": knows_the_truth})
-    slow, relative = next(row for row in found.tuners if row.tuner == "slow"), [r.relative for r in found.of("slow")]
+    found = compare(RIGID, {"wild": shakes, "truth": knows_the_truth})
+    wild, relative = next(row for row in found.tuners if row.tuner == "wild"), [r.relative for r in found.of("wild")]
     ordered = sorted(relative)
-    assert slow.median == pytest.approx(0.5 * (ordered[1] + ordered[2]))
-    assert slow.p95 == pytest.approx(ordered[2] + 0.85 * (ordered[3] - ordered[2]))  # 0.95 * 3 = 2.85
-    assert slow.worse == sum(value > 1.05 for value in relative) / 4 == 1.0
-    assert slow.machines == 4 and slow.failed == 0
-    assert [row.tuner for row in found.tuners] == ["truth", "slow"]  # the best first
+    assert wild.median == pytest.approx(0.5 * (ordered[1] + ordered[2]))
+    assert wild.p95 == pytest.approx(ordered[2] + 0.85 * (ordered[3] - ordered[2]))  # 0.95 * 3 = 2.85
+    assert wild.machines == 4 and wild.failed == 0
+    assert (wild.kept, wild.near, wild.accepted) == (0.0, 0.0, 1.0)
+    assert wild.phase_deg < 20.0 and wild.ms > 3.0
+    assert [row.tuner for row in found.tuners] == ["truth", "wild"]  # the best first
+
+
+def test_what_a_tuner_does_not_vouch_for_is_not_accepted():
+    def doubts(target, rng):
+        return outcome(target, read_gains(target))._replace(accepted=np.array([True, False, True, True]))
+
+    found = compare(RIGID, {"doubts": doubts, "broken": breaks})
+    assert [row.accepted for row in found.of("doubts")] == [True, False, True, True]
+    assert {row.tuner: row.accepted for row in found.tuners} == {"doubts": 0.75, "broken": 0.0}
 
 
 # --- what tuners do -----------------------------------------------------------------------------------------------
@@ -219,10 +241,10 @@ def test_machines_of_several_axes_are_tuned_by_everybody(load, name):
     (row,) = compare(machines, {name: find_tuner(name)}).rows
     axes = {"gantry": 2, "robot": 6}[load]
     assert not row.failed, row.note
-    assert 0.0 < row.relative < 30.0
+    assert 0.0 < row.relative < 100.0
     assert row.violations == 0 or name in ("random", "factory"), row.kinds
     if name == "baseline":
-        assert row.moves == 2 * axes and row.relative < 1.3
+        assert row.moves == 2 * axes
     if name == "auto":
         assert row.drive_seconds < 10.0 * axes
     if name not in ("factory", "baseline"):
@@ -241,15 +263,15 @@ def test_the_tuners_of_the_issue_are_there():
 def test_the_factory_leaves_and_the_baseline_rule_computes():
     found = compare(RIGID, {name: find_tuner(name) for name in ("factory", "baseline")})
     assert {row.gains["velocity_p"] for row in found.of("factory")} == {445}
-    assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("baseline"))
+    assert all(row.moves == 2 for row in found.of("baseline"))
 
 
 @pytest.mark.slow
-def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
+def test_searches_come_near_the_optimum_and_the_safe_one_is_stopped_less():
     names = {"tpe": False, "tpe-safe": True}
     found = compare(RIGID, {name: find_tuner(name) for name in names})
     by_name = {row.tuner: row for row in found.tuners}
-    assert by_name["tpe"].median < 0.9 and by_name["tpe-safe"].median < 1.0
+    assert by_name["tpe"].median < 6.0 and by_name["tpe-safe"].median < 6.0  # of the machine's own optimum
     assert by_name["tpe-safe"].aborts < by_name["tpe"].aborts
 
 
@@ -263,35 +285,7 @@ def test_a_rule_identifies_once_for_all_rules(monkeypatch):
     simc, modulus = found.of("simc")[0], found.of("modulus_optimum")[0]
     assert simc.drive_seconds == modulus.drive_seconds > 1.0
     assert simc.gains["velocity_i"] != modulus.gains["velocity_i"]
-    assert not simc.failed and simc.relative < 2.0
-
-
-def test_a_rule_that_fails_the_checks_of_auto_is_no_peer_there():
-    """The first of four like machines has wild gains, which shake; the second is too near to instability by Ms only."""
-    gains, inertia = true_rule()
-    gains[0] = [4021, 1573, 30_000, 3000, 30_000]
-    gains[1, 4] *= 3
-    with open_group(RIGID) as target:
-        plants = [true_plant(target.drives, axis) for axis in range(4)]
-        f = np.geomspace(1.0, 2400.0, 2000)
-        ms = [margins(f, position_open_loop(target.device, plants[k], gains[k], f)).ms for k in range(4)]
-        assert ms[1] > SENSITIVITY > max(ms[2:])
-        assert rule_passes(target, gains, inertia).tolist() == [False, False, True, True]
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(rule_check, "_far_from_instability", lambda target, plants, gains, where, origin: where)
-            assert rule_passes(target, gains, inertia).tolist() == [False, True, True, True]
-
-
-def test_figures_are_of_all_machines_and_of_those_where_the_rule_passes(monkeypatch):
-    monkeypatch.setattr(
-        compare_module, "rule_passes", lambda target, gains, inertia: np.array([True, False, True, True])
-    )
-    found = compare(RIGID, {"slow": moves_and_slows})
-    assert [row.rule_passes for row in found.rows] == [True, False, True, True]
-    (summary,), there = found.tuners, [row.relative for row in found.rows if row.rule_passes]
-    assert summary.machines == 4 and summary.rule_passes == 3
-    assert summary.median_there == pytest.approx(sorted(there)[1]) and summary.worse_there == 1.0
-    assert summary.p95_there == pytest.approx(np.percentile(there, 95))
+    assert not simc.failed and simc.relative < 10.0
 
 
 class Entry:
@@ -374,7 +368,7 @@ def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     folder = tmp_path / "out"
     result = run("rank", "-t", "factory", "-t", "baseline", "--count", 3, "--out", folder)
     assert result.exit_code == 0
-    assert "Robust cost relative to the baseline rule on 3 machines" in result.output
+    assert "Robust performance over the constrained oracle's on 3 machines" in result.output
     names = {path.name for path in folder.iterdir()}
     assert names == {"tuners.csv", "rivals.csv", "machines.csv", "comparison.png", "settings.toml"}
     told = run("rank", "-t", "baseline", "--count", 3, "--json", "--out", tmp_path / "again")
@@ -397,7 +391,7 @@ def test_a_run_that_is_interrupted_prints_the_figures_it_has(monkeypatch, tmp_pa
     result = run("rank", "-t", "stops", "--count", 2, "--out", tmp_path / "out")
     assert result.exit_code == 130
     assert "interrupted: of 2 machines these are done" in result.stdout
-    assert "Robust cost relative to the baseline rule on 1 machine" in result.stdout
+    assert "Robust performance over the constrained oracle's on 1 machine" in result.stdout
     assert "--resume" in result.stderr
 
 

@@ -1,8 +1,9 @@
-"""J and the robust cost, against numbers worked out by hand, and what they must say of gains and machines."""
+"""J, performance and robust cost, against numbers worked out by hand, and what they say of gains and machines."""
 
 from __future__ import annotations
 
 from types import MappingProxyType, SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,15 +15,29 @@ from drive_env.emulator.parameters import WIRING
 from drive_env.gains import (
     BASELINE_RULE,
     Gains,
+    bandwidth_gains,
     bandwidths_from_gains,
     gains_from_bandwidths,
     rule_gains,
     small_time_constants,
 )
+from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import MOTORS
 from drive_env.trials import score as module
 from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped
-from drive_env.trials.score import VARIANTS, CurrentSwings, RobustScore, Terms, cost, robust_cost
+from drive_env.trials.score import (
+    BORDER,
+    RESTING,
+    STEPPER_VARIANTS,
+    TRIPPED,
+    VARIANTS,
+    CurrentSwings,
+    RobustScore,
+    Terms,
+    cost,
+    robust_cost,
+    robust_performance,
+)
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
 from research import fit_rule
@@ -53,18 +68,25 @@ def test_cost(given, J):
     assert cost(given) == pytest.approx(J)
 
 
-@pytest.mark.parametrize(("j", "hidden"), [
+@pytest.mark.parametrize(("j", "performance"), [
     ([2.0, 1.0, 1.0, 1.0, 1.0], 2.0),    # nothing is worse than the nominal machine
     ([2.0, 3.0, 6.0, 1.0, 1.0], 4.0),
     ([2.0, 2.0, 2.0, 2.0, 30.0], 16.0),  # the probe trips
 ])  # fmt: skip
-def test_hidden_cost_is_half_nominal_and_half_the_worst(j, hidden):
-    assert robust_cost(np.array([j])) == pytest.approx([hidden])
+def test_performance_is_half_nominal_and_half_the_worst(j, performance):
+    assert robust_performance(np.array([j])) == pytest.approx([performance])
 
 
 def test_variants_are_those_of_the_score():
-    rows = {variant.name: variant[1:] for variant in VARIANTS}
-    assert rows == {
+    assert {variant.name: variant[1:] for variant in VARIANTS} == {
+        "nominal": (1.0, 1.0, 1.0, 1.0),
+        "load inertia x 2": (2.0, 1.0, 1.0, 1.0),
+        "load inertia x 0.5": (0.5, 1.0, 1.0, 1.0),
+        "stiffness x 0.8": (1.0, 0.8, 1.0, 1.0),
+        "velocity P x 1.5": (1.0, 1.0, 1.5, 1.0),
+        "velocity P x 0.67": (1.0, 1.0, 0.67, 1.0),
+    }
+    assert {variant.name: variant[1:] for variant in STEPPER_VARIANTS} == {
         "nominal": (1.0, 1.0, 1.0, 1.0),
         "load inertia x 1.3": (1.3, 1.0, 1.0, 1.0),
         "load inertia x 0.7": (0.7, 1.0, 1.0, 1.0),
@@ -72,6 +94,49 @@ def test_variants_are_those_of_the_score():
         "velocity P x 1.5": (1.0, 1.0, 1.5, 1.0),
         "run current x 0.8": (1.0, 1.0, 1.0, 0.8),  # of a stepper in open loop, in place of the one before
     }
+    assert VARIANTS[0].name == STEPPER_VARIANTS[0].name == "nominal"  # which the performance counts by half
+
+
+# --- the robust cost by performance and slack -------------------------------------------------------------------------
+@pytest.mark.parametrize(("performance", "slack", "expected"), [
+    (2.0, np.inf, 2.0),                           # no constraints, or far from all: performance alone
+    (2.0, 0.5, 2.0),
+    (2.0, BORDER * np.log(2.0), np.sqrt(2.0 * 30.0)),   # g = 1/2: the geometric mean of performance and a trip's
+    (2.0, 0.0, 30.0),                             # the border
+    (0.1, 0.0, 30.0),
+    (30.0, 0.5, 30.0),                            # useless, but feasible: no worse than the border
+    (45.0, 0.5, 30.0),
+    (0.1, -np.log(2.0), 45.0),                    # 30 (2 - 1/2), however well it performs
+    (2.0, -np.log(2.0), 45.0),
+    (2.0, -60.0, 60.0),
+    (2.0, TRIPPED, 30.0 * (2.0 - np.exp(-5.0))),
+])  # fmt: skip
+def test_robust_cost(performance, slack, expected):
+    assert robust_cost(np.array([performance]), np.array([slack])) == pytest.approx([expected])
+
+
+def test_whatever_keeps_the_constraints_comes_before_whatever_does_not():
+    rng = np.random.default_rng(0)
+    performance, slack = rng.uniform(0.05, 40.0, (200, 1)), np.geomspace(1e-6, 3.0, 60)
+    feasible, infeasible = robust_cost(performance, slack), robust_cost(performance, -slack)
+    assert feasible.max() <= 30.0 + 1e-12 < infeasible.min()  # to rounding
+    assert (np.diff(feasible, axis=1) <= 1e-12).all() and (
+        np.diff(infeasible, axis=1) > 0.0
+    ).all()  # more slack is better
+    np.testing.assert_array_equal(infeasible, np.broadcast_to(infeasible[:1], infeasible.shape))
+    # Of two that keep them by the same slack, the one that performs better costs less.
+    ranked = robust_cost(np.linspace(0.1, 29.0, 100)[:, None], slack)
+    assert (np.diff(ranked, axis=0) > 0.0).all()
+
+
+@pytest.mark.parametrize("performance", [0.1, 1.0, 29.0])
+def test_the_robust_cost_is_continuous_over_the_border_and_its_slope_is_bounded(performance):
+    """Towards the border it rises by ln(30 / performance) / 2 % of itself, beyond by 30 per unit of slack."""
+    s = np.linspace(-0.2, 0.2, 40_001)
+    found = robust_cost(np.full(s.shape, performance), s)
+    steepest = max(30.0 * np.log(30.0 / performance) / BORDER, 30.0)
+    assert np.abs(np.diff(found)).max() <= 1.01 * steepest * (s[1] - s[0])
+    assert (np.diff(found) <= 1e-9).all()
 
 
 # --- the terms of a move ----------------------------------------------------------------------------------------------
@@ -211,8 +276,8 @@ def test_a_fit_never_ends_worse_than_the_rule_in_force(monkeypatch):
 
 
 # --- the robust cost of machines --------------------------------------------------------------------------------------
-def bench(load, machines, repeats=1, **parameters):
-    score = RobustScore("tmcm1636", load, "qbl4208", machines, num_threads=1, repeats=repeats)
+def bench(load, machines, repeats=1, dynamics="standard", **parameters):
+    score = RobustScore("tmcm1636", load, "qbl4208", machines, num_threads=1, repeats=repeats, dynamics=dynamics)
     with EmulatedDrives(load=load, num_machines=machines, num_threads=1, parameters=parameters) as drives:
         axes = drives.load.num_axes
         score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
@@ -238,6 +303,14 @@ def times(factor, machines=4):
     return gains
 
 
+def bandwidths(velocity, position, axes=1):
+    """Gains of one machine of three rotor inertias, by the bandwidths of its loops [Hz]."""
+    gains = bandwidth_gains(
+        DEVICE, MOTOR, 3 * MOTOR.inertia, current_hz=1000.0, velocity_hz=velocity, position_hz=position
+    )
+    return np.repeat(gains[None], axes, axis=0)
+
+
 def test_a_load_has_the_variants_that_it_can_have():
     names = {}
     for load in ("inertia", "two_mass", "ball_screw"):
@@ -254,16 +327,16 @@ def test_the_rules_disturbance_is_the_scale(two_mass):
 
 
 def test_variants_are_parallel_machines_with_their_parameters(two_mass):
-    stiffness = two_mass._drives.machine.parameters["load.stiffness"].reshape(4, 5)
-    inertia = two_mass._drives.machine.parameters["load.inertia"].reshape(4, 5)
-    assert stiffness[0] / stiffness[0, 0] == pytest.approx([1, 1, 1, 0.8, 1])
-    assert inertia[0] / inertia[0, 0] == pytest.approx([1, 1.3, 0.7, 1, 1])
+    stiffness = two_mass._drives.machine.parameters["load.stiffness"].reshape(4, 6)
+    inertia = two_mass._drives.machine.parameters["load.inertia"].reshape(4, 6)
+    assert stiffness[0] / stiffness[0, 0] == pytest.approx([1, 1, 1, 0.8, 1, 1])
+    assert inertia[0] / inertia[0, 0] == pytest.approx([1, 2, 0.5, 1, 1, 1])
 
 
 def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
     """E_0 is the mean of all runs, too: no run is measured by a scale of its own."""
     repeated, alone, gains = bench("two_mass", 2, repeats=3), bench("two_mass", 2), times(1.4, 2)
-    seeds = repeated._drives.inside.noise_seeds.reshape(2, 3, len(VARIANTS) - 1)
+    seeds = repeated._drives.inside.noise_seeds.reshape(2, 3, len(VARIANTS))
     assert (seeds == seeds[:1, :, :1]).all(), "variants are compared under the same noise, and machines are"
     assert seeds[0, 0, 0] == alone._drives.inside.noise_seeds[0], "the first run is that of a score without repeats"
     nominal, found = [], []
@@ -277,8 +350,15 @@ def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
     repeated.set_reference(times(1.0, 2))
     scores = repeated.score(gains)
     repeated.close(), alone.close()
-    assert len({one.robust_cost[0] for one in found}) == 3
-    np.testing.assert_allclose(scores.robust_cost, np.mean([one.robust_cost for one in found], axis=0))
+    assert len({one.performance[0] for one in found}) == 3
+    np.testing.assert_allclose(scores.performance, np.mean([one.performance for one in found], axis=0))
+    # Loops have no noise; what swings at rest counts by its mean.
+    for alike in found:
+        np.testing.assert_array_equal(scores.clearance, alike.clearance)
+        np.testing.assert_array_equal(scores.overshoot, alike.overshoot)
+    of_loops = find_dynamics("standard").slack(scores.clearance[:, 0], scores.clearance[:, 1:], scores.overshoot)
+    np.testing.assert_allclose(scores.slack, np.minimum(of_loops, 1.0 - scores.rest[:, 0] / RESTING))
+    np.testing.assert_allclose(scores.robust_cost, robust_cost(scores.performance, scores.slack))
     np.testing.assert_allclose(scores.j, np.mean([one.j for one in found], axis=0))
     np.testing.assert_allclose(scores.terms.settling, np.mean([one.terms.settling for one in found], axis=0))
     np.testing.assert_allclose(scores.swing, np.max([one.swing for one in found], axis=0))
@@ -296,39 +376,105 @@ def test_a_score_depends_on_machine_and_gains_alone(two_mass):
     assert np.ptp(first.robust_cost) == 0.0  # four equal machines
 
 
-def test_the_probe_is_the_machine_with_velocity_p_times_1_5(two_mass):
+@pytest.mark.parametrize(("variant", "factor"), [("velocity P x 1.5", 1.5), ("velocity P x 0.67", 0.67)])
+def test_a_variant_of_the_gains_is_the_machine_with_those_gains(two_mass, variant, factor):
     two_mass.set_reference(times(1.0))
-    probe = two_mass.score(times(1.0)).j[0, -1]
+    k = [variant.name for variant in two_mass.variants].index(variant)
+    found = two_mass.score(times(1.0))
     gains = times(1.0)
-    gains[:, P] = np.rint(gains[:, P] * 1.5)
-    assert two_mass.score(gains).j[0, 0] == pytest.approx(probe)
+    gains[:, P] = np.rint(gains[:, P] * factor)
+    there = two_mass.score(gains)
+    assert there.j[0, 0] == pytest.approx(found.j[0, k])
+    assert there.clearance[0, 0] == pytest.approx(found.clearance[0, k])
 
 
-def test_too_much_and_too_little_gain_are_worse(two_mass):
+def test_too_much_and_too_little_gain_perform_worse(two_mass):
     two_mass.set_reference(times(1.0))
-    slow, right, shaking = (float(two_mass.score(times(f)).robust_cost[0]) for f in (0.2, 1.0, 8.0))
+    slow, right, shaking = (float(two_mass.score(times(f)).performance[0]) for f in (0.2, 1.0, 8.0))
     assert slow > 1.3 * right
     assert shaking > 3.0 * right
 
 
-def test_a_machine_that_cannot_be_enabled_scores_30():
-    score = bench("two_mass", 2)
-    with EmulatedDrives(num_machines=2, num_threads=1) as drives:
-        score.set_machines(drives.machine.parameters, np.array([24.0, 5.0]))  # under-voltage
-    hidden = score.score(times(1.0, 2)).robust_cost
+def test_too_much_and_too_little_gain_cost_more():
+    score = bench("inertia", 3)
+    gains = np.concatenate([bandwidths(20.0, 4.0), bandwidths(80.0, 30.0), bandwidths(1000.0, 30.0)])
+    score.set_reference(times(1.0, 3))
+    found = score.score(gains)
     score.close()
-    assert hidden[1] == 30.0
-    assert hidden[0] < 10.0
+    slow, right, shaking = found.robust_cost
+    assert slow > 1.3 * right and shaking > 3.0 * right
+    assert found.slack[0] > 0.0 and found.slack[1] > 0.0 > found.slack[2]  # slow is worse by its performance alone
+    assert shaking > 30.0 > slow
+
+
+def test_a_machine_that_cannot_be_enabled_performs_as_a_trip_and_is_farther_off_than_any():
+    score = bench("inertia", 3)
+    with EmulatedDrives(load="inertia", num_machines=3, num_threads=1) as drives:
+        score.set_machines(drives.machine.parameters, np.array([24.0, 5.0, 24.0]))  # under-voltage
+    right = bandwidths(80.0, 30.0)
+    found = score.score(np.concatenate([right, right, bandwidths(1000.0, 30.0)]))
+    score.close()
+    assert found.performance[1] == 30.0 and found.terms.tripped[1].all()
+    assert found.slack[1] == TRIPPED and found.robust_cost[1] == pytest.approx(30.0 * (2.0 - np.exp(-5.0)))
+    assert found.robust_cost[0] < 10.0
+    assert found.slack.min() == TRIPPED, "nothing is farther off, however it swings"
+    assert found.robust_cost.max() == found.robust_cost[1]
 
 
 def test_a_machine_is_as_good_as_its_worst_axis():
     score = bench("gantry", 1)
     gains = np.repeat(RULE, 2, axis=0)
     score.set_reference(gains)
-    equal = float(score.score(gains).robust_cost[0])
-    gains[1, P] *= 20
-    assert float(score.score(gains).robust_cost[0]) > 2.0 * equal
+    found = []
+    for one_axis in (gains, bandwidths(20.0, 4.0, axes=2)):
+        worse = one_axis.copy()
+        worse[1, P] *= 20
+        found += [score.score(one_axis), score.score(worse)]
     score.close()
+    of_rule, worse, slow, shaking = found
+    assert float(worse.performance[0]) > 2.0 * float(of_rule.performance[0])
+    assert worse.clearance[0, 0] < 0.0 < of_rule.clearance[0, 0]
+    assert float(shaking.robust_cost[0]) > 2.0 * float(slow.robust_cost[0])  # the slow ones keep all margins
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_of_two_axes_the_loop_with_the_least_clearance_counts(axis):
+    """One axis alone close to its border leaves the machine less slack, whichever it is."""
+    score = bench("gantry", 1)
+    gains = bandwidths(20.0, 4.0, axes=2)
+    both = float(score.set_reference(gains).clearance[0, 0])
+    gains[axis, P] *= 2
+    assert 0.0 < float(score.score(gains).clearance[0, 0]) < both
+    score.close()
+
+
+def test_soft_standard_and_stiff_ask_different_margins_of_one_machine():
+    """Its performance is that of one machine; what is left of the constraints is less the more they ask."""
+    found = {}
+    for name in ("soft", "standard", "stiff"):
+        score = bench("inertia", 1, dynamics=name)
+        score.set_reference(times(1.0, 1))
+        found[name] = score.score(bandwidths(100.0, 30.0))
+        score.close()
+    soft, standard, stiff = found.values()
+    assert soft.slack[0] < standard.slack[0] < stiff.slack[0]
+    assert soft.slack[0] < 0.0 < standard.slack[0], "50 degrees are enough for standard and too few for soft"
+    assert soft.performance[0] == standard.performance[0] == stiff.performance[0]
+    assert soft.robust_cost[0] > 30.0 > standard.robust_cost[0] > stiff.robust_cost[0] >= stiff.performance[0]
+
+
+def test_a_score_does_not_depend_on_where_the_machine_stood_when_it_was_set():
+    """A robot's inertia is another where the last move ended, and a run begins where the load starts."""
+    score = bench("robot", 1)
+    gains = np.repeat(RULE, 6, axis=0)
+    with EmulatedDrives(load="robot", num_machines=1, num_threads=1) as drives:
+        parameters, supply = drives.machine.parameters, drives.machine.supply[:1]
+        first = score.set_reference(gains)
+        score.set_machines(parameters, supply)
+    again = score.score(gains)
+    score.close()
+    np.testing.assert_array_equal(first.clearance, again.clearance)
+    np.testing.assert_array_equal(first.robust_cost, again.robust_cost)
 
 
 def test_a_constant_load_pulls_in_every_variant_and_through_the_load_step():
@@ -411,6 +557,7 @@ def scored(variants=VARIANTS[:3], repeats=1, **recorded):
     made = RobustScore.__new__(RobustScore)
     made.variants, made.num_machines, made.repeats = variants[: 3 // repeats], 2, repeats
     made._runs, made._axes = 3, (2, 3, 2)
+    made.dynamics, made._has_loops = find_dynamics("standard"), False
     made._drives = Machines(**recorded)
     made._constant, made._load_torque = np.zeros(6), -0.25
     made._factors = np.tile(np.repeat([1.0, 2.0, 3.0], 2), 2)
@@ -424,7 +571,7 @@ LOAD = {f"load.{name}": np.ones(2) for name in ("inertia", "mass", "stiffness", 
 
 
 def test_machines_have_their_parameters_in_all_variants_each_with_its_factor():
-    made = scored((VARIANTS[1], VARIANTS[3], VARIANTS[0]))
+    made = scored((STEPPER_VARIANTS[1], STEPPER_VARIANTS[3], STEPPER_VARIANTS[0]))
     two = np.array([1.0, 2.0])
     given = {f"load.{name}": two for name in ("inertia", "mass", "stiffness", "contact", "stuff", "friction")}
     made.set_machines(given | {"motor.R_s": two}, np.array([20.0, 30.0]))
@@ -544,7 +691,7 @@ def test_a_machine_is_its_worst_axis_and_its_robust_cost_half_its_worst_variant(
     made._reference = np.array([[2.0, 2.0], [1.0, 1.0]])
     found = made._scores(terms, np.ones((2, 3, 2)) * [[[2.0]], [[1.0]]], CurrentSwings(moving, resting))
     np.testing.assert_allclose(found.j, [[4.0, 1.0, 16.0], [4.0, 4.0, 1.0]])
-    np.testing.assert_allclose(found.robust_cost, [0.5 * 4.0 + 0.5 * 16.0, 4.0])
+    np.testing.assert_allclose(found.performance, [0.5 * 4.0 + 0.5 * 16.0, 4.0])
     assert found.terms.settling.tolist() == [[32.0, 1.0, 1024.0], [32.0, 32.0, 1.0]]
     assert found.swing.tolist() == [[1.0, 3.0, 5.0], [7.0, 9.0, 11.0]]
     assert found.rest.tolist() == [[0.0, -2.0, -4.0], [-6.0, -8.0, -10.0]]
@@ -555,7 +702,7 @@ def test_runs_that_are_repeated_count_by_their_mean_and_a_swing_by_its_largest()
     terms = by_hand([[[1.0, 1.0], [32.0, 1.0], [1.0, 1024.0]], [[1.0, 1e10], [1.0, 1.0], [1.0, 1.0]]])
     three = np.arange(12.0).reshape(2, 3, 2)
     found = made._scores(terms, np.ones((2, 3, 2)), CurrentSwings(three, three))
-    np.testing.assert_allclose(found.robust_cost, [7.0, (30.0 + 2.0) / 3.0])
+    np.testing.assert_allclose(found.performance, [7.0, (30.0 + 2.0) / 3.0])
     np.testing.assert_allclose(found.j, [[7.0], [32.0 / 3.0]])
     np.testing.assert_allclose(found.terms.settling[0], [(1.0 + 32.0 + 1024.0) / 3.0])
     assert found.terms.tripped.tolist() == [[False], [True]]
@@ -573,6 +720,86 @@ def test_the_baseline_rules_disturbance_is_that_of_its_nominal_runs_of_machines_
     assert made._reference.tolist() == [[1.0, 2.0], [1.0, 2.0]]
     assert found.terms.disturbance[0, 0] == 1.0
     assert made.score(None).j.tolist() == found.j.tolist()
+
+
+# --- without a machine: what the constraints make of a performance ----------------------------------------------------
+class Few(NamedTuple):
+    """What stands for linear machines here: a number of each."""
+
+    number: np.ndarray
+
+
+def constrained(monkeypatch, clearance, overshoot=0.0, rest=0.0, tripped=False, performance=4.0):
+    """Two machines of three variants and two axes, the second wide of every border; return their scores."""
+    made, asked = scored(), []
+    made._has_loops, made._loops = True, Few(np.arange(6))
+
+    def loop_clearance(dynamics, rates, machines, gains):
+        asked.append((dynamics, machines, gains))
+        wide = np.array([*clearance, 1.5, 1.5, 1.5])
+        return wide, np.array([overshoot, 9.0, 9.0, 0.0, 9.0, 9.0])  # that of variants does not count
+
+    monkeypatch.setattr(module, "loop_clearance", loop_clearance)
+    monkeypatch.setattr(module, "LinearMachines", Few)
+    monkeypatch.setattr(module, "CascadeGains", SimpleNamespace(of=lambda device, raw: raw))
+    monkeypatch.setattr(module, "LoopRates", SimpleNamespace(of=lambda device: None))
+    terms = by_hand([[[1.0, 1.0]] * 3] * 2)
+    terms = terms._replace(tripped=np.broadcast_to(np.array([tripped, False])[:, None, None], (2, 3, 2)))
+    swings = CurrentSwings(np.zeros((2, 3, 2)), np.broadcast_to(np.array([rest, 0.0])[:, None, None], (2, 3, 2)))
+    scores = made._scores(terms, np.ones((2, 3, 2)), swings)._replace(performance=np.array([performance, 4.0]))
+    return made._constrained(scores, np.array([[1000, 200, 800, 100, 50]] * 4)), asked[0]
+
+
+@pytest.mark.parametrize(("given", "slack"), [
+    ({"clearance": [1.3, 1.3, 1.3]}, 0.3),
+    ({"clearance": [0.8, 1.3, 1.3]}, -0.2),
+    ({"clearance": [1.3, 0.3, 1.3]}, -0.25),   # a variant is asked for 0.4: 0.3 / 0.4 - 1
+    ({"clearance": [1.3, 1.3, 0.44]}, 0.1),
+    ({"clearance": [1.3, 1.3, 1.3], "overshoot": 0.18}, 0.1),   # of 20 %
+    ({"clearance": [1.3, 1.3, 1.3], "overshoot": 0.3}, -0.5),
+    ({"clearance": [1.3, 1.3, 1.3], "overshoot": np.inf}, -4.0),
+    ({"clearance": [1.3, 1.3, 1.3], "rest": 0.045}, 0.1),       # of 5 % of the rated current
+    ({"clearance": [1.3, 1.3, 1.3], "rest": 0.1}, -1.0),
+    ({"clearance": [1.3, 1.3, 1.3], "rest": 3.0}, TRIPPED),     # -59: no farther off than a trip
+    ({"clearance": [1.3, 1.3, 1.3], "tripped": True}, TRIPPED),
+    ({"clearance": [-1.0, -1.0, -1.0], "overshoot": np.inf, "tripped": True}, TRIPPED),
+])  # fmt: skip
+def test_the_slack_is_the_least_of_all_constraints(monkeypatch, given, slack):
+    found, _ = constrained(monkeypatch, **given)
+    assert found.slack == pytest.approx([slack, 0.5])
+    performance = [4.0, 4.0]
+    assert found.robust_cost == pytest.approx(robust_cost(np.array(performance), np.array([slack, 0.5])))
+    assert found.clearance.tolist() == [given["clearance"], [1.5] * 3]
+    assert found.overshoot.tolist() == [given.get("overshoot", 0.0), 0.0]
+
+
+def test_loops_are_asked_for_with_each_variants_gains_and_once_of_runs_that_are_repeated(monkeypatch):
+    _, (dynamics, machines, raw) = constrained(monkeypatch, clearance=[1.0, 1.0, 1.0])
+    assert dynamics is find_dynamics("standard") and machines.number.tolist() == list(range(6))
+    assert raw[:, :, 2].tolist() == [[800, 800], [1600, 1600], [2400, 2400]] * 2
+    made = scored(repeats=3)
+    made._has_loops, made._loops, made._factors = True, Few(np.arange(6)), np.ones(12)
+    asked = []
+    monkeypatch.setattr(
+        module, "loop_clearance", lambda *of: (asked.append(of[2].number.tolist()), (np.ones(2), np.zeros(2)))[1]
+    )
+    three = np.zeros((2, 3, 2))
+    scores = made._scores(by_hand(three + 1.0), np.ones((2, 3, 2)), CurrentSwings(three, three))
+    assert made._constrained(scores, np.ones((4, 5))).clearance.shape == (2, 1)
+    assert asked == [[0, 3]]
+
+
+def test_where_there_is_no_linear_model_the_robust_cost_is_the_performance():
+    made = scored()
+    made._run = lambda gains: (
+        by_hand([[[32.0, 1.0]] * 3] * 2),
+        np.ones((2, 3, 2)),
+        CurrentSwings(*np.ones((2, 2, 3, 2))),
+    )
+    found = made.score(None)
+    np.testing.assert_array_equal(found.robust_cost, found.performance)
+    assert found.slack.tolist() == [np.inf, np.inf] and np.isnan(found.clearance).all()
+    assert found.clearance.shape == (2, 3) and np.isnan(found.overshoot).all()
 
 
 def test_a_load_step_is_three_tenths_of_the_rated_torque_against_the_move():

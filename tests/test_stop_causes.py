@@ -6,13 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from auto_stages import recorded
 from test_link_energy import proving
 
 from drive_env import motion
 from drive_env.drives.emergency import EmergencyMessage
-from tuning.auto.bench import AutoBench
-from tuning.auto.choice import try_what_changed
 from tuning.identify.identification import identify
 from tuning.response.frequency_response import measure
 from tuning.stop_causes import UNTOLD, stop_causes
@@ -80,25 +77,6 @@ def test_a_recorded_move_of_auto_names_the_emergency_that_ended_it():
         surge(target, 0.15)
         (reason,) = ground.show(gains, everywhere).reason
     assert reason.endswith("(cut off within 50 ms); the drive reported overvoltage (3210h)"), reason
-
-
-def test_a_trial_of_lowered_gains_after_which_the_drive_is_in_fault_names_the_emergency():
-    """It said "the drive went into fault" alone."""
-    with emulated(load="inertia", num_threads=1) as target, timed(target) as (watched, clock):
-        bench = AutoBench(watched, 0, clock, 12.0)
-        bench.ground, gains = proving(watched)
-        run = bench.ground.run
-
-        def then_trips(*arguments):
-            proof = run(*arguments)
-            surge(target, 0.0)
-            watched.drives.advance(0.1)
-            return proof
-
-        bench.ground.run = then_trips
-        try_what_changed(bench, recorded(gains, proven=0 * gains))
-    (reservation,) = bench.journals[0].reservations
-    assert reservation == "the lowered gains fail their trial: the drive went into fault: overvoltage (3210h)"
 
 
 def test_a_response_names_the_emergency_that_ended_it():

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from tuning.compare.comparison import Comparison, MachineRow, TunerRow
-from tuning.compare.comparison_picture import WORSE, draw
+from tuning.compare.comparison_picture import BROKEN, draw
 from tuning.runs.experiment import DEFAULT
 
 ROOT = Path(__file__).parent.parent
@@ -247,22 +247,35 @@ def test_a_travel_that_is_too_short_is_told_in_turns_with_its_remedy(tmp_path):
     assert "rejected" not in done.stdout
 
 
-def test_the_picture_of_a_comparison_names_its_colour_and_has_every_median_at_its_tuner(tmp_path, monkeypatch):
+def test_the_picture_of_a_comparison_names_its_colour_and_has_what_keeps_the_constraints_at_its_tuner(
+    tmp_path, monkeypatch
+):
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: figures.append(figure))
     rows = [
-        MachineRow(tuner, f"machine {k}", J, J, 1.0, 2.0, 3, 0, 0, "", False, {"torque_p": 1}, "")
-        for tuner, relative in (("auto", (0.6, 0.68, 0.8)), ("modulus", (0.9, 1.0, 1.4)))
+        MachineRow(tuner, f"machine {k}", J, J, 1.0, J, slack, 46.0, 9.0, 1.9, True, True, 2.0, 3, 0, 0, "", False,
+                   {"torque_p": 1}, "")
+        for tuner, relative, slack in (("auto", (1.1, 1.2, 1.3), 0.1), ("modulus", (0.9, 1.0, 1.4), -0.1))
         for k, J in enumerate(relative)
+    ]  # fmt: skip
+    tuners = [
+        TunerRow(name, 3, 1.2, 1.3, kept, 1.0, 46.0, 46.0, 9.0, 1.9, 1.9, 1.0, 2.0, 3, 0, 0, 0)
+        for name, kept in (("auto", 1.0), ("modulus", 0.0))
     ]
-    medians = {"auto": 0.68, "modulus": 1.0}
-    tuners = [TunerRow(name, 3, median, 1.2, 0.0, 2.0, 3, 0, 0, 0) for name, median in medians.items()]
     draw(Comparison(tuple(rows), tuple(tuners)), tmp_path / "comparison.png")
-    score, *_ = figures[0].axes
-    assert [label.get_text() for label in score.get_yticklabels()] == ["modulus, median 1.00", "auto, median 0.68"]
+    score, phase, *_ = figures[0].axes
+    assert [label.get_text() for label in score.get_yticklabels()] == [
+        "modulus, 0 % keep them",
+        "auto, 100 % keep them",
+    ]
     assert not score.texts  # which would stand beside the next panel
-    assert "orange: more than 5 % worse" in score.get_title()
-    red, green, blue = to_rgb(WORSE)
+    assert "orange: breaks a constraint" in score.get_title()
+    assert "phase margin" in phase.get_xlabel()
+    broken = [
+        points.get_offsets() for points in score.collections if tuple(points.get_facecolor()[0][:3]) == to_rgb(BROKEN)
+    ]
+    assert [len(points) for points in broken if len(points)] == [3]  # those of the tuner that breaks them
+    red, green, blue = to_rgb(BROKEN)
     assert red > green > blue  # orange
 
 

@@ -278,7 +278,7 @@ def test_a_brushed_motor_s_encoder_is_told_by_a_push_of_milliseconds(direction):
 # --- auto -------------------------------------------------------------------------------------------------------------
 def tuned(tmp_path, rows, **options):
     with emulated(load="inertia", num_machines=len(rows), parameters=wired(rows), num_threads=2, **options) as target:
-        result = auto(target, tmp_path / "before.toml", seed=1, budget=12.0)
+        result = auto(target, tmp_path / "before.toml", budget=12.0)
         assert result.accepted.all(), [axis.reason for axis in result.axes]
         return settings(target.drives), [[note for note in axis.notes if "is 0 now" in note or "is 1 now" in note]
                                          for axis in result.axes], turn(target.drives, ENCODER)  # fmt: skip

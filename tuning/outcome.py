@@ -23,6 +23,7 @@ class Outcome(NamedTuple):
     aborts: What had to be stopped, (num_axes,).
     violations: How often it left its limits, (num_axes,).
     notes: What there is to say, one text per axis; "" is nothing.
+    accepted: Axes whose gains the tuner vouches for, (num_axes,); None is all.
     """
 
     gains: Integers
@@ -31,6 +32,7 @@ class Outcome(NamedTuple):
     aborts: Integers
     violations: Integers
     notes: tuple[str, ...]
+    accepted: NDArray[np.bool_] | None = None
 
 
 Tuner = Callable[[Target, np.random.Generator], Outcome]

@@ -142,8 +142,8 @@ def _sensor(drives: Drives | None, joint: int | None) -> Callable[[], Any] | Non
 def _add_robust_cost(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> None:
     """Add the robust cost of the answers; it needs the true machines, which are known here."""
     from drive_env.motors import find_motor
-    from tuning.compare.comparison import Yardstick
     from tuning.compare.suite import SuiteMachine
+    from tuning.compare.yardstick import Yardstick
 
     group = [
         SuiteMachine(str(k), row.device, row.load, row.motor_name, row.parameters, find_motor(row.motor_name).voltage)
@@ -152,7 +152,7 @@ def _add_robust_cost(machines: Sequence[Machine], sides: Sequence[Evaluation]) -
     yardstick = Yardstick(group, num_threads=1)
     try:
         for side in sides:
-            costs = yardstick.score(np.concatenate([_answer(episode) for episode in side.episodes]))
+            costs = yardstick.score(np.concatenate([_answer(episode) for episode in side.episodes])).robust_cost
             side.values = {ROBUST_COST: list(map(float, costs / yardstick.rule)), **side.values}
             side.lower_is_better = {ROBUST_COST: True, **side.lower_is_better}
     finally:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.tuner.tune_target import TrialShown, best_unstopped, tune_target
+from agents.tuner.tune_target import TrialShown, tune_target
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
@@ -88,12 +88,12 @@ def run(
 
 
 def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> TriedGains:
-    """Make the policy's trials; return its answer and the second best gains, and set where moves start."""
+    """Make the policy's trials; return its answer, and set where moves start."""
     from dataclasses import replace
 
     from drive_env.safety.envelope import SafetyError, swinging_allowed
     from tuning.auto.stages import TriedGains
-    from tuning.auto.trials import BY_TRIAL, proving_ground, watch_following
+    from tuning.auto.trying import BY_TRIAL, proving_ground, watch_following
 
     target, going = bench.target, bench.going
     if not going.all():
@@ -103,7 +103,7 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
     try:
         # The trials stop by themselves what oscillates, within 50 ms, and go on.
         with bench.spending(going), swinging_allowed(target.drives):
-            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=basis.fallbacks[-1])
+            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=basis.calm)
     except SafetyError as error:
         bench.stop(going, f"the envelope stopped the trials: {error}")
         return TriedGains.only(basis.before)
@@ -112,7 +112,7 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
     ground.aborts += np.repeat(np.sum([trial.aborted for trial in tuned.trials], axis=0), lanes)
     ground.moves += tuned.moves
     watch_following(bench, going)
-    spare, proof, verified = tried.spare, tried.proof, list(tried.verified)
+    proof, verified = tried.proof, list(tried.verified)
     for machine in range(target.num_axes // lanes):
         own = slice(machine * lanes, (machine + 1) * lanes)
         answer = tuned.trials[int(tuned.answers[machine])]
@@ -121,14 +121,10 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
                 np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the baseline rule's too"
             )
             continue
-        others = [trial for trial in tuned.trials if not np.array_equal(trial.gains[own], tuned.gains[own])]
-        second = best_unstopped(others, machine)
-        if second is not None:
-            spare[own] = second.gains[own]
         proof[own], verified[own] = float(answer.measured[machine]), [BY_TRIAL] * lanes
         if tuned.overruled[machine]:
             for journal in bench.journals[own]:
                 journal.note(
                     "the agent's own choice was stopped in its trial; the best trial that was not stopped is kept"
                 )
-    return replace(tried, spare=spare, proof=proof, verified=tuple(verified))
+    return replace(tried, proof=proof, verified=tuple(verified))

@@ -71,6 +71,7 @@ PAGES = {
             ("drive_env.loops.linear_model", "Plant"),
             ("tuning.rules.rules_by_name", "propose"),
             ("tuning.auto.one_button", "auto"),
+            ("drive_env.loops.dynamics", "Dynamics find_dynamics"),
             ("tuning.certificate.certificate", "Certificate AxisCertificate StepResponse FrequencyResponse"),
             ("tuning.certificate.certificate_files", "load_certificate save_certificate"),
             ("drive_env.gains", "read_gains write_gains"),

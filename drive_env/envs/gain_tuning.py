@@ -30,6 +30,7 @@ from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.gains import read_gains
+from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.motors import Motor, find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost
 from drive_env.trials.load_detection import is_load_detection
@@ -56,6 +57,7 @@ class GainTuningConfig:
     waveform: Points of the last move's error that are observed besides, 0...250.
     privileged: Whether the observation is a dict with the true machine beside it, for asymmetric critics.
     travel: How far the rotors may turn from where they are, with the sign [rev]; None is the load's own.
+    dynamics: What the loops must keep for the robust cost: soft, standard, stiff, or numbers as 45/8/2.0.
     num_threads: As `EmulatedDrives` takes it.
     """
 
@@ -73,6 +75,7 @@ class GainTuningConfig:
     privileged: bool = False
     travel: float | None = None
     num_threads: int | None = None
+    dynamics: str = DEFAULT
 
     def __post_init__(self) -> None:
         known = find_device(self.device).gains
@@ -85,6 +88,7 @@ class GainTuningConfig:
             check_tried(find_device(self.device), self.chosen)
         if not self.chosen or len(set(self.chosen)) != len(self.chosen):
             raise ValueError(f"gains must be different ones of {', '.join(known.searched)}, not {self.gains}")
+        find_dynamics(self.dynamics)
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.step < math.inf:
@@ -246,7 +250,14 @@ class GainTuning(VectorEnvironment):
         self._defaults = machine_of(self.drives).parameters
         if not is_load_detection(self._device, c.chosen):  # else J by measured terms is all there is
             self._score = new_score(
-                c.device, c.load, c.motor, num_envs, gains=c.chosen, num_threads=c.num_threads, friction=c.friction
+                c.device,
+                c.load,
+                c.motor,
+                num_envs,
+                gains=c.chosen,
+                num_threads=c.num_threads,
+                friction=c.friction,
+                dynamics=c.dynamics,
             )
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:

@@ -74,7 +74,7 @@ class CascadeGains(NamedTuple):
         return cls(*(raw[..., k] * factors[k] for k in cascade_columns(device)))
 
 
-class Window(NamedTuple):
+class LoopWindow(NamedTuple):
     """What happens in a window of the velocity loop while the demanded currents i are held: x' = W x + H i.
 
     W: (machines, states, states). H: (machines, states, axes). turn, turn_of_demand: How far the rotors turn [rad] by
@@ -118,7 +118,7 @@ def exponential(X: Floats) -> Floats:
     return np.asarray(result)
 
 
-def window(rates: LoopRates, machines: LinearMachines, gains: CascadeGains) -> Window:
+def window(rates: LoopRates, machines: LinearMachines, gains: CascadeGains) -> LoopWindow:
     """Return a window of machines whose current loops have these gains, currents regulated."""
     A, B, current, speed, supply, _ = machines
     Phi, Gamma, of_state, of_voltage = held(A, B, speed, 1.0 / rates.current_rate)
@@ -142,7 +142,7 @@ def window(rates: LoopRates, machines: LinearMachines, gains: CascadeGains) -> W
     for _ in range(round(rates.current_rate / rates.velocity_rate)):
         turn, turn_of_demand = turn + turned @ W, turn_of_demand + turned @ H
         W, H = tick @ W, tick @ H + drive
-    return Window(np.asarray(W), H, turn, turn_of_demand)
+    return LoopWindow(np.asarray(W), H, turn, turn_of_demand)
 
 
 def response(W: Floats, H: Floats, rows: Floats, z: Complex) -> Complex:
@@ -164,7 +164,7 @@ def response(W: Floats, H: Floats, rows: Floats, z: Complex) -> Complex:
     return np.asarray((weights @ residues.reshape(count, states, -1)).reshape(count, -1, outputs, inputs))
 
 
-def mean_velocity(rates: LoopRates, one: Window, f: Floats) -> Complex:
+def mean_velocity(rates: LoopRates, one: LoopWindow, f: Floats) -> Complex:
     """Return the mean velocity of rotors over a window [rad/s] per demanded current [A], (machines, n, axes, axes).
 
     Args:
@@ -185,7 +185,7 @@ class OuterLoops(NamedTuple):
 
 
 def open_loops(
-    rates: LoopRates, machines: LinearMachines, gains: CascadeGains, f: Floats, one: Window | None = None
+    rates: LoopRates, machines: LinearMachines, gains: CascadeGains, f: Floats, one: LoopWindow | None = None
 ) -> OuterLoops:
     """Return the open outer loops of machines, for each axis with all loops of the others closed.
 
@@ -231,7 +231,7 @@ class ClosedLoops(NamedTuple):
         return np.asarray(np.log(np.maximum(radius, 1e-300)))
 
 
-def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains, one: Window) -> ClosedLoops:
+def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains, one: LoopWindow) -> ClosedLoops:
     """Return machines with all loops closed."""
     from drive_env.emulator.parameters import velocity_filter
 
@@ -272,8 +272,9 @@ def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains
 def step_overshoot(rates: LoopRates, closed: ClosedLoops, duration: float = 0.3) -> Floats:
     """Return how far each axis goes beyond a step of its set-point in csp, over the step, (machines, axes).
 
-    The set-point moves there within a communication cycle, as csp interpolates it, and the angle is looked at once a
-    cycle. Of an unstable machine it is infinite.
+    The larger of two steps counts: of its own set-point alone, and of all axes together, as a gantry moves, whose
+    bridge otherwise holds each axis at the other one. The set-point moves there within a communication cycle, as csp
+    interpolates it, and the angle is looked at once a cycle. Of an unstable machine it is infinite.
     """
     cycle = round(rates.velocity_rate / rates.communication_rate)
     A, ramp, constant = np.broadcast_to(np.eye(closed.A.shape[-1]), closed.A.shape), 0.0 * closed.B, 0.0 * closed.B
@@ -284,7 +285,8 @@ def step_overshoot(rates: LoopRates, closed: ClosedLoops, duration: float = 0.3)
     state, most = ramp, np.zeros((len(A), closed.B.shape[-1]))
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(round(duration * rates.communication_rate)):
-            most = np.fmax(most, np.einsum("mas,msa->ma", closed.C, state))
+            moved = closed.C @ state  # by axis that moves and axis whose set-point does
+            most = np.fmax(most, np.fmax(np.einsum("maa->ma", moved), moved.sum(axis=-1)))
             state = A @ state + constant
     stable = closed.growth[:, None] <= STILL
     return np.where(stable & np.isfinite(most), np.maximum(most - 1.0, 0.0), np.inf)

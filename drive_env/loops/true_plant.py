@@ -37,7 +37,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
         raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
     true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
     group = next(g for g in emulated.inside.groups if g.machines.start <= axis < g.machines.stop)
-    J, viscous, pair = _first_resonance(mechanics(group.load), axis - group.machines.start, group.load.load.name)
+    J, viscous, pair = _first_resonance(linear_load(group.load), axis - group.machines.start, group.load.load.name)
     motor = emulated.motor
     psi = true["motor.psi_m"]
     factor = 1.0 if motor.kind == "dc" else 1.5
@@ -57,7 +57,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
     )
 
 
-class Mechanics(NamedTuple):
+class LinearLoad(NamedTuple):
     """M q'' + D q' + K q = torque: (copies, D, D) each, and what each rotor turns by joint, (axes, D)."""
 
     M: Floats
@@ -66,7 +66,7 @@ class Mechanics(NamedTuple):
     rotors: Floats
 
 
-def mechanics(load: PackedLoad) -> Mechanics:
+def linear_load(load: PackedLoad) -> LinearLoad:
     """Return the copies of a load at their present position."""
     values, row = load.values, load.load
     unit = np.eye(load.num_dofs)
@@ -78,7 +78,7 @@ def mechanics(load: PackedLoad) -> Mechanics:
         if contact.transmits:
             both = np.outer(*[_row(load, contact.motion)] * 2)
             K, D = K + values.contact[:, k, 2, None, None] * both, D + values.contact[:, k, 3, None, None] * both
-    return Mechanics(load.mass_matrix(), D, K, load.plant.axis_motion)
+    return LinearLoad(load.mass_matrix(), D, K, load.plant.axis_motion)
 
 
 def true_machines(drives: Drives) -> LinearMachines:
@@ -97,7 +97,7 @@ def true_machines(drives: Drives) -> LinearMachines:
         else np.repeat(np.asarray(values, float)[:, None], axes, axis=1)
         for name, values in drives.machine.parameters.items()
     }
-    parts = [mechanics(group.load) for group in emulated.inside.groups]
+    parts = [linear_load(group.load) for group in emulated.inside.groups]
     M, D, K = (np.concatenate([getattr(part, name) for part in parts]) for name in ("M", "D", "K"))
     rotors = parts[0].rotors
     emf = motor.n_p * true["motor.psi_m"]
@@ -126,7 +126,7 @@ def true_machines(drives: Drives) -> LinearMachines:
     return LinearMachines(A, B, current, speed, supply, true["stage.velocity_filter"])
 
 
-def _first_resonance(found: Mechanics, copy: int, name: str) -> tuple[float, float, tuple[float, float, float] | None]:
+def _first_resonance(found: LinearLoad, copy: int, name: str) -> tuple[float, float, tuple[float, float, float] | None]:
     """Return inertia and viscous friction at the rotor, and anti-resonance, resonance [Hz], damping of the first."""
     M, D, K, rotor = found.M[copy], found.D[copy], found.K[copy], found.rotors[0]
     squares, modes = _modes(M, K)

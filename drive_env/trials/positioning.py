@@ -192,13 +192,18 @@ def swing(current: Floats, rated_current: float) -> Floats:
 
 
 def resting_swing(current: Floats, rated_current: float) -> Floats:
-    """Return how the current swings about its mean late in a move (RMS), over the rated one, (num_axes,).
+    """Return how the current swings about its trend late in a move (RMS), over the rated one, (num_axes,).
+
+    The trend is a straight line: what still creeps to its place, as coupled axes do that work against each other, does
+    not swing.
 
     Args:
         current: Of a move from its start on, before any load step [A], (SETTLED cycles, num_axes).
         rated_current: Of the motor, peak i_q [A].
     """
-    return np.asarray(current[QUIET:SETTLED].std(axis=0) / rated_current)
+    late = current[QUIET:SETTLED] - current[QUIET:SETTLED].mean(axis=0)
+    time = np.arange(len(late)) - (len(late) - 1) / 2.0
+    return np.asarray((late - np.outer(time, time @ late) / (time @ time)).std(axis=0) / rated_current)
 
 
 def wrapped(increments: Floats | Integers) -> Floats:

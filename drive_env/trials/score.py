@@ -1,6 +1,6 @@
-"""The cost of a tuning: J of a positioning move and a load step, and the robust cost over variants of the machine.
+"""The cost of a tuning: margins that loops must keep, and J of a positioning move and a load step among those that do.
 
-Lower is better. Every machine is judged on its own scales:
+Lower is better. The performance J judges every machine on its own scales:
 
     J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a fault scores 30
 
@@ -13,8 +13,16 @@ Lower is better. Every machine is judged on its own scales:
 
 An open-loop stepper has a J of its own (`open_loop.py`).
 
-The robust cost is half of J plus half of the largest J of the machine as it is and its variants (`VARIANTS`). It is for
-scoring and training, never something to observe: a load step, and the machine's variants, do not exist on hardware.
+The *robust performance* is half of J plus half of the largest J of the machine as it is and its variants. It counts
+among gains that keep the constraints: the margins of the dynamics (drive_env/loops/dynamics.py) in every outer loop of
+the true linear machine, weaker ones on its variants, the overshoot of a csp step, no swing at rest. The *robust cost*
+puts whatever keeps them before whatever does not, without a step between:
+
+    s = least slack of the constraints, relative: 0 where one is just kept
+    s > 0: performance^g 30^(1-g), g = 1 - exp(-s / 1 %);  else 30 (2 - exp(s))
+
+A stepper's loops have no linear model here: its robust cost is its robust performance. Both are for scoring and
+training, never something to observe: a load step, and the machine's variants, do not exist on hardware.
 """
 
 from __future__ import annotations
@@ -31,7 +39,10 @@ from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.emulator.parameters import WIRING
-from drive_env.gains import small_time_constants, write_gains
+from drive_env.gains import has_linear_model, small_time_constants, write_gains
+from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics, loop_clearance
+from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
+from drive_env.loops.true_plant import true_machines
 from drive_env.trials.positioning import (
     CYCLE,
     SETTLED,
@@ -80,12 +91,24 @@ class Variant(NamedTuple):
 
 VARIANTS = (
     Variant("nominal"),
+    Variant("load inertia x 2", inertia=2.0),
+    Variant("load inertia x 0.5", inertia=0.5),
+    Variant("stiffness x 0.8", stiffness=0.8),
+    Variant("velocity P x 1.5", velocity_p=1.5),
+    Variant("velocity P x 0.67", velocity_p=0.67),
+)
+# A stepper's step rates are near to what its torque allows: twice the inertia is another machine.
+STEPPER_VARIANTS = (
+    Variant("nominal"),
     Variant("load inertia x 1.3", inertia=1.3),
     Variant("load inertia x 0.7", inertia=0.7),
     Variant("stiffness x 0.8", stiffness=0.8),
     Variant("velocity P x 1.5", velocity_p=1.5),
     Variant("run current x 0.8", run_current=0.8),
 )
+RESTING = 0.05  # what the current may swing about its trend at rest (RMS), over the rated one
+TRIPPED = -5.0  # slack of a machine that trips: none is farther from what is asked for
+BORDER = 0.01  # slack beyond which performance is all that counts
 
 
 class Terms(NamedTuple):
@@ -120,18 +143,27 @@ def cost(terms: Terms) -> Floats:
     return np.where(terms.tripped | ~np.isfinite(raw), TRIP, np.minimum(raw, TRIP))
 
 
-def robust_cost(j: Floats) -> Floats:
-    """Return the robust cost of the variants' J, the nominal machine's first in the last dimension."""
+def robust_performance(j: Floats) -> Floats:
+    """Return the robust performance by the variants' J, the nominal machine's first in the last dimension."""
     return np.asarray(0.5 * j[..., 0] + 0.5 * j.max(axis=-1))
+
+
+def robust_cost(performance: Floats, slack: Floats) -> Floats:
+    """Return the robust cost by performance and slack, in their shape; a slack of infinity is of no constraints."""
+    inside = 1.0 - np.exp(-np.maximum(slack, 0.0) / BORDER)
+    kept = np.minimum(performance, TRIP) ** inside * TRIP ** (1.0 - inside)
+    return np.where(slack > 0.0, kept, TRIP * (2.0 - np.exp(np.minimum(slack, 0.0))))
 
 
 # --- the robust cost of emulated machines -----------------------------------------------------------------------------
 class Scores(NamedTuple):
     """Of every machine: the robust cost (num_machines,), and J and its terms, (num_machines, variants).
 
-    A machine with several axes is as good as its worst. Of several runs it is the mean of each. swing: What a trial
+    A machine with several axes is as good as its worst. Of several runs it is the mean of each. performance, slack:
+    What the robust cost is made of, (num_machines,). clearance: Of the outer loops, (num_machines, variants), and
+    overshoot: of a csp step, (num_machines,); nan where there is no linear model. swing: What a trial
     would measure, the largest RMS increment of the current over 25 ms until the load step, over the rated one,
-    likewise, and the largest of several runs; J does not count it. rest: How the current swings about its mean before
+    likewise, and the largest of several runs; J does not count it. rest: How the current swings about its trend before
     the load step (RMS), over the rated one, likewise, and the mean of several runs; neither does J count that.
     """
 
@@ -140,12 +172,16 @@ class Scores(NamedTuple):
     terms: Terms
     swing: Floats
     rest: Floats
+    performance: Floats
+    slack: Floats
+    clearance: Floats
+    overshoot: Floats
 
 
 class CurrentSwings(NamedTuple):
     """How currents swing, over the rated one, each of shape (machines, runs, axes); nan where no current is measured.
 
-    moving: The largest RMS increment over 25 ms until the load step. resting: RMS about the mean before it.
+    moving: The largest RMS increment over 25 ms until the load step. resting: RMS about its trend before it.
     """
 
     moving: Floats
@@ -170,6 +206,7 @@ class RobustScore:
         num_threads: Threads that run them; the number of cores by default.
         friction: Model of the load's friction, as in EmulatedDrives.
         repeats: Runs of every variant of every machine, whose scores are averaged.
+        dynamics: What the loops must keep.
     """
 
     def __init__(
@@ -182,6 +219,7 @@ class RobustScore:
         num_threads: int | None = None,
         friction: str = "stribeck",
         repeats: int = 1,
+        dynamics: str | Dynamics = DEFAULT,
     ) -> None:
         from drive_env.devices import find_device
         from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -189,11 +227,13 @@ class RobustScore:
         from mechanics.shaft import one, way
 
         found = find_load(load)
-        by_current = self._tries_current(find_device(device).gains.is_open_loop)
+        known = find_device(device)
+        self.dynamics, self._has_loops = find_dynamics(dynamics), has_linear_model(known)
+        by_current = self._tries_current(known.gains.is_open_loop)
         fields = {parameter.field for parameter in found.parameters}
         self.variants = tuple(
             variant
-            for variant in VARIANTS
+            for variant in (VARIANTS if self._has_loops else STEPPER_VARIANTS)
             if (variant.inertia == 1.0 or fields & set(_INERTIA))
             and (variant.stiffness == 1.0 or fields & set(_STIFFNESS))
             and (variant.velocity_p == 1.0 or not by_current)
@@ -201,9 +241,11 @@ class RobustScore:
         )
         self.num_machines, self.repeats = num_machines, repeats
         self._runs = repeats * len(self.variants)  # of a machine
+        # Half the inertia behind a nut or a flank resonates faster than the physics' step allows the machine as it is.
+        faster = self._has_loops and "contact_stiffness" in fields
         self._drives: EmulatedDrives = EmulatedDrives(
             device, found, motor, num_machines * self._runs, identical=True, num_threads=num_threads,
-            friction=friction,
+            friction=friction, physics_steps=2 if faster else 1,
         )  # fmt: skip
         if repeats > 1:  # the first noise is that of a score without repeats, and the variants of a run share it
             seeds = np.tile(np.repeat(_NOISE * np.arange(1.0, repeats + 1.0), len(self.variants)), num_machines)
@@ -243,6 +285,9 @@ class RobustScore:
         machine.supply = np.where(np.repeat(each, self._axes[2]), volts, machine.supply)
         filters = machine.parameters["stage.velocity_filter"]
         self._t_0 = np.repeat(self._settling_scale(filters), self._axes[2])
+        if self._has_loops:
+            machine.reset()  # a load is linearised where it stands, and each run begins at its start
+            self._loops = true_machines(self._drives)
 
     def set_constant_load(self, torque: Floats) -> None:
         """Set a constant load [N*m], (num_machines,), signed as `machine.load_torque`."""
@@ -267,11 +312,47 @@ class RobustScore:
         measured = self._run(gains)
         nominal = measured[1][:, :: len(self.variants)].mean(axis=1)
         self._reference = np.where(mask[:, None], nominal, self._reference)
-        return self._scores(*measured)
+        return self._constrained(self._scores(*measured), gains)
 
     def score(self, gains: Integers) -> Scores:
         """Return the scores of gains, raw integers of shape (num_machines * axes, count) in the device's order."""
-        return self._scores(*self._run(gains))
+        return self._constrained(self._scores(*self._run(gains)), gains)
+
+    def _constrained(self, scores: Scores, gains: Integers) -> Scores:
+        """Return scores with what the constraints make of their performance."""
+        if not self._has_loops:
+            return scores
+        clearance, overshoot = self._clearance(gains, np.ones(self.num_machines, bool), len(self.variants))
+        slack = self.dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
+        slack = np.minimum(slack, 1.0 - scores.rest[:, 0] / RESTING)
+        slack = np.where(scores.terms.tripped[:, 0], TRIPPED, np.maximum(slack, TRIPPED))
+        return scores._replace(
+            robust_cost=robust_cost(scores.performance, slack), slack=slack, clearance=clearance, overshoot=overshoot
+        )
+
+    def loop_slack(self, gains: Integers, where: Mask, nominal: bool = False) -> Floats:
+        """Return by how much the loops of machines keep the margins and the overshoot, relative, (chosen machines,).
+
+        Args:
+            gains: Raw integers, (num_machines * axes, count).
+            where: Which machines, (num_machines,).
+            nominal: Whether to look at the machines as they are alone, not at their variants.
+        """
+        clearance, overshoot = self._clearance(gains, where, 1 if nominal else len(self.variants))
+        return self.dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
+
+    def _clearance(self, gains: Integers, where: Mask, variants: int) -> tuple[Floats, Floats]:
+        """Return the clearance of chosen machines' first variants, (chosen, variants), and overshoots, (chosen,)."""
+        machines, runs, axes = self._axes
+        # The variants of the first run are those of all.
+        chosen = (np.arange(machines * runs) % runs < variants) & np.repeat(where, runs)
+        device = self._drives.device
+        raw = device.gains.with_velocity_p(self._spread(np.asarray(gains, np.int64)), self._factors)
+        raw = raw.reshape(machines * runs, axes, -1)[chosen]
+        linear = LinearMachines(*(values[chosen] for values in self._loops))
+        found = loop_clearance(self.dynamics, LoopRates.of(device), linear, CascadeGains.of(device, raw))
+        clearance, overshoot = (values.reshape(-1, variants) for values in found)
+        return clearance, overshoot[:, 0]
 
     def close(self) -> None:
         """Close the drives."""
@@ -348,8 +429,12 @@ class RobustScore:
         if self.repeats > 1:
             tripped = of_worst.tripped.reshape(shape).any(axis=1)
             of_worst = of_worst.each(lambda value: value.reshape(shape).mean(axis=1))._replace(tripped=tripped)
-        cost_of_runs = robust_cost(j)
-        return Scores(cost_of_runs.mean(axis=1), j.mean(axis=1), of_worst, moving.max(axis=1), resting.mean(axis=1))
+        worth = robust_performance(j).mean(axis=1)
+        nothing = np.full(self.num_machines, np.nan)
+        return Scores(
+            worth, j.mean(axis=1), of_worst, moving.max(axis=1), resting.mean(axis=1), worth,
+            np.full(self.num_machines, np.inf), np.full((self.num_machines, len(self.variants)), np.nan), nothing,
+        )  # fmt: skip
 
 
 def swings(current: Floats, rated_current: float, shape: tuple[int, ...]) -> CurrentSwings:

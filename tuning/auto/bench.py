@@ -19,6 +19,7 @@ from tuning.identify.wiring import Key, write_wiring
 from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
     from tuning.auto.proving import ProvingGround
     from tuning.target import DriveTime, Target
 
@@ -64,9 +65,9 @@ class AutoBench:
 
     Args:
         target: What is tuned; its time is counted.
-        seed: Of the search on twins.
         clock: That counts the target's time.
         budget: Most time that may pass on the drives [s].
+        dynamics: What the loops must keep.
 
     Attributes:
         journals: The remarks about each axis.
@@ -78,10 +79,10 @@ class AutoBench:
             their own.
     """
 
-    def __init__(self, target: Target, seed: int, clock: DriveTime, budget: float) -> None:
+    def __init__(self, target: Target, clock: DriveTime, budget: float, dynamics: Dynamics) -> None:
         drives = target.drives
         self.target = target
-        self.rng = np.random.default_rng(seed)
+        self.dynamics = dynamics
         self.journals = tuple(Journal() for _ in range(target.num_axes))
         self.before: Integers = read_gains(drives)
         self.modes: Integers = drives.read(cia402.MODE)

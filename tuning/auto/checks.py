@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.dictionary.roles import Role
-from drive_env.gains import cascade_columns
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import margins
-from tuning.auto.measured_margins import SOUGHT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,8 +20,6 @@ if TYPE_CHECKING:
 
 SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with
 LOOKED_AT = 400  # frequencies of the model
-# By how much position P is lowered at a time, and how often at most: what 0.06 of it does not help lies elsewhere.
-STEP, STEPS = 0.85, 18
 
 
 def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
@@ -42,20 +38,6 @@ def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
                 "degrees are needed"
             )
     return ""
-
-
-def sound_gains(device: Device, plant: Plant, gains: Sequence[int]) -> tuple[int, ...]:
-    """Return gains with position P lowered as far as the model demands; unchanged if that does not help.
-
-    A search by J alone may end with eight degrees of phase margin: without disturbances that is the fastest.
-    """
-    f = np.geomspace(1.0, 0.49 * device.velocity_rate, LOOKED_AT)
-    *_, position_p = cascade_columns(device)
-    for lowered in range(STEPS):
-        less = tuple(max(round(STEP**lowered * gain), 1) if k == position_p else gain for k, gain in enumerate(gains))
-        if margins(f, OPEN_LOOPS["position"](device, plant, less, f)).ms <= SOUGHT:
-            return less
-    return tuple(gains)
 
 
 def wrong_wiring(target: Target, identified: Identification) -> str:

@@ -1,4 +1,4 @@
-"""The frequency response of the velocity loop with the new gains; gains too near to instability are lowered."""
+"""The frequency response of the velocity loop with the new gains, and what it says of the loops."""
 
 from __future__ import annotations
 
@@ -13,27 +13,18 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
+from drive_env.loops.dynamics import find_dynamics
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
-from tuning.auto.calmer_gains import far_enough, twins_tell
-from tuning.auto.measured_margins import (
-    CALMED,
-    SENSITIVITY,
-    SOUGHT,
-    first_far_enough,
-    judged_loops,
-    margins_with,
-    sensitivity,
-)
-from tuning.auto.moves import show
+from tuning.auto.measured_margins import MeasuredAxis, judged_loops
+from tuning.auto.proving import STEP_SIZE
 from tuning.auto.stages import Verdict
-from tuning.auto.trials import BY_TRIAL, faster, watch_following
+from tuning.auto.trying import BY_TRIAL, watch_following
 from tuning.response.measured_loop import merged
 from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
-    from drive_env.devices.gain_set import GainSet
+    from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.margins import Margins
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
@@ -42,10 +33,10 @@ if TYPE_CHECKING:
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+MEASURED = 0.08  # relative: what a measured slack may be off
+# What a measured margin may be off, one standard deviation of repeated measurements at most.
+PHASE_ERROR, GAIN_ERROR, MS_ERROR, OVERSHOOT_ERROR = 2.0, 0.5, 1.05, 0.02
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
-CLOSE = {"phase": 19.0, "gain": 3.5}  # margins that Ms as it is sought leaves at least [degrees, dB]
-SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
-OVERTIME = 0.5  # s beyond the budget for a response: so near to the end margins are worth more than the time
 LONGER = 2  # times as long it is shaken where too little was seen
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
 ALONE = (
@@ -56,13 +47,12 @@ ALONE = (
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
-def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
-    """Measure the velocity loop's response with the gains; lower those that are too near to instability."""
-    going = bench.going
-    # A move with the gains before matters more: without it nobody knows whether the new ones are better.
-    late = going & ~bench.affordable(bench.response_time + basis.look_back_time(bench) - OVERTIME)
-    recorded = _without_response(bench, recorded, late, "the drive time of the run was used up")
-    going &= ~late
+def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
+    """Measure the velocity loop's response of axes with their gains, and how far their loops keep the dynamics."""
+    going = where & bench.going & np.array([not why for why in recorded.failed])
+    late = going & ~bench.affordable(bench.response_time)
+    recorded = _without_response(recorded, late, "the drive time of the run was used up")
+    going = bench.whole_machines(going & ~late)
     if not going.any():
         return recorded
     from tuning.response import frequency_response
@@ -76,7 +66,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Recorded
     try:
         with bench.spending(going):
             response = frequency_response.measure(here, "velocity", where=going)
-            if (longer := _unclear(bench, basis, recorded.gains, response, going)).any():
+            if (longer := _unclear(bench, basis, recorded, response, going)).any():
                 again = frequency_response.measure(
                     here, "velocity", where=longer, periods=LONGER * frequency_response.PERIODS
                 )
@@ -87,28 +77,51 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Recorded
     except (ValueError, RuntimeError, TimeoutError) as error:
         if isinstance(error, BusError):
             raise
-        return _without_response(bench, recorded, going, str(error))
+        return _without_response(recorded, going, str(error))
     finally:
         watch_following(bench, going)
-    assert bench.ground is not None, "proving makes it"
-    recorded, faults = replace(recorded, response=response), bench.faults()
+    assert bench.ground is not None, "trying makes it"
     bench.ground.begin_here(going)
-    calmed = np.zeros(bench.target.num_axes, bool)
-    for axis in map(int, np.flatnonzero(going & bench.going)):
-        if axis not in faults:
-            before, recorded = recorded.gains[axis], calm(bench, basis, recorded, axis, response)
-            calmed[axis] = not np.array_equal(before, recorded.gains[axis])
-    recorded = _try_again(bench, basis, recorded, calmed & bench.going)
-    return _go_on_after_faults(bench, basis, recorded, faults)
+    unseen, slack = list(recorded.unseen), recorded.slack.copy()
+    whole = response if recorded.response is None else recorded.response.replaced(response, going)
+    recorded, faults = replace(recorded, response=whole), bench.faults()
+    for k in map(int, np.flatnonzero(going)):
+        seen = _seen(response, k)
+        unseen[k] = ""
+        if k in faults:
+            unseen[k] = f"the drive went into fault during the measurement ({faults[k]})"
+        elif seen < LEAST_LINES:
+            why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
+            unseen[k] = "; ".join([why, *response.notes[k]])
+    recorded = replace(recorded, unseen=tuple(unseen))
+    for k in map(int, np.flatnonzero(going)):
+        measured = measured_axis(bench, basis, recorded, k)
+        slack[k] = np.nan if measured is None else measured.slack(bench.dynamics, recorded.gains[k][None])[0]
+    faulted = np.isin(np.arange(bench.target.num_axes), list(faults))
+    if faulted.any():
+        with bench.spending(bench.target.together(faulted)):
+            bench.ground.recover(faulted)
+        bench.drop_faults("its frequency response was measured, and the fault cannot be reset")
+    return replace(recorded, slack=slack)
 
 
-def _unclear(bench: AutoBench, basis: Basis, gains: Integers, response: MeasuredLoop, going: Mask) -> Mask:
+def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) -> MeasuredAxis | None:
+    """Return the loops of an axis as they were measured, None if they were not."""
+    response = recorded.response
+    if response is None or recorded.unseen[k] or not np.isfinite(response.open_loop[:, k]).any():
+        return None
+    return MeasuredAxis(response, k, basis.identified.known(k)[0], judged_loops(bench.target))
+
+
+def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: MeasuredLoop, going: Mask) -> Mask:
     """Return the axes with too few coherent lines and enough time to measure longer, (num_axes,)."""
-    left = bench.affordable(LONGER * bench.response_time + bench.response_time + basis.look_back_time(bench))
+    left = bench.affordable(LONGER * bench.response_time + bench.response_time)
     unclear = np.zeros(bench.target.num_axes, bool)
     for k in map(int, np.flatnonzero(going & left)):
-        found = margins_with(basis, response, gains[k], k)["velocity"] if _seen(response, k) >= LEAST_LINES else None
-        unclear[k] = found is None or not math.isfinite(found.phase_deg)
+        unclear[k] = _seen(response, k) < LEAST_LINES
+        if not unclear[k]:
+            measured = MeasuredAxis(response, k, basis.identified.known(k)[0], ("velocity",))
+            unclear[k] = not math.isfinite(measured.margins(recorded.gains[k])["velocity"].phase_deg)
     return unclear
 
 
@@ -117,138 +130,9 @@ def _seen(response: MeasuredLoop, k: int) -> int:
     return round(float(response.refined(k)[2].mean()) * len(response.f))
 
 
-def _rule_instead(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, response: MeasuredLoop, why: str
-) -> RecordedGains:
-    """Take the baseline rule's gains, slowed as far as needed, for an axis whose own cannot be calmed; or reject it."""
-    slower = [faster(bench.target.device.gains, basis.reference[k], factor) for factor in SOFTER]
-    chosen = first_far_enough(sensitivity(bench.target, basis, response, gains, k) for gains in slower)
-    if chosen is None:
-        bench.journals[k].stop(f"{why}; {SENSITIVITY:g} is allowed")
-        return recorded
-    slowed = "" if SOFTER[chosen] == 1.0 else f", slowed to {100.0 * SOFTER[chosen]:.0f} %,"
-    bench.journals[k].note(f"the gains of the baseline rule{slowed} are kept: with those found by search {why}")
-    return recorded.with_gains(k, slower[chosen])
-
-
-def _others_instead(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, why: str) -> RecordedGains:
-    """Take other gains for an axis whose own cannot be calmed by less P: the best by its twins, or the rule's."""
-    assert recorded.response is not None, "it was measured"
-    gains = far_enough(bench, basis, recorded, k) if twins_tell(bench, basis, k) else None
-    if gains is None:
-        return _rule_instead(bench, basis, recorded, k, recorded.response, why)
-    bench.journals[k].note(
-        f"other gains were searched on the digital twins: with the first ones {why}; the margins with the new gains "
-        "are computed from that measurement"
-    )
-    return recorded.with_gains(k, gains)
-
-
-def not_beyond(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, gains: Integers, k: int, limit: float
-) -> Integers:
-    """Return gains of an axis with the P of its outer loops lowered until Ms, as measured, is at most this.
-
-    Where nothing was measured, or nothing is low enough, they are as they were.
-    """
-    response, known = recorded.response, bench.target.device.gains
-    if response is None or recorded.unseen[k]:
-        return gains
-    lowered = gains
-    for loop in judged_loops(bench.target):
-        softer = (known.scaled(lowered, factor, _p_columns(known, loop)) for factor in SOFTER)
-        near = (one for one in softer if margins_with(basis, response, one, k)[loop].ms <= limit)
-        if (found := next(near, None)) is None:
-            return gains
-        lowered = found
-    return lowered
-
-
-def _p_columns(known: GainSet, loop: str) -> list[int]:
-    """Return the P gains that are lowered where a loop is too near to instability."""
-    return [column for column in known.columns_of(*CALMED[loop]) if known.rows[column].part == "P"]
-
-
-def calm(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, response: MeasuredLoop) -> RecordedGains:
-    """Lower the gains of an axis one of whose loops comes too near to instability."""
-    seen = _seen(response, k)
-    if seen < LEAST_LINES:
-        why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
-        here = np.arange(bench.target.num_axes) == k
-        return _without_response(bench, recorded, here, "; ".join([why, *response.notes[k]]))
-    gains, known = recorded.gains[k], bench.target.device.gains
-    for loop in judged_loops(bench.target):
-        calmed = _p_columns(known, loop)
-        softer = [known.scaled(gains, factor, calmed) for factor in SOFTER]
-        peaks = [margins_with(basis, response, one, k)[loop].ms for one in softer]
-        if (chosen := first_far_enough(peaks)) is None:
-            why = f"the measured {loop} loop has a sensitivity peak Ms of {peaks[-1]:.1f}"
-            return _others_instead(bench, basis, replace(recorded, response=response), k, why)
-        if chosen > 0:
-            names = " and ".join(known.titles[column] for column in calmed)
-            bench.journals[k].note(
-                f"{names} lowered to {100.0 * SOFTER[chosen]:.0f} %: the measured {loop} loop was too near to "
-                f"instability (Ms {peaks[0]:.1f}); the margins with the lower gains are computed from that measurement"
-            )
-        gains = softer[chosen]
-    # The second best would be as near.
-    return recorded if np.array_equal(gains, recorded.gains[k]) else recorded.with_gains(k, gains)
-
-
-def _try_again(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, calmed: Mask, use_rule: bool = True
-) -> RecordedGains:
-    """Try gains that were changed, and record a move with them; without time for a trial, only the move.
-
-    What fails gives way to the baseline rule's, slowed as far as needed, which are tried in turn.
-    """
-    where = calmed & bench.affordable(TRIAL_TIME + MOVE_TIME + basis.look_back_time(bench))
-    bench.reserve(
-        calmed & ~where, "the lowered gains were tried by one move only: the drive time of the run was used up"
-    )
-    assert bench.ground is not None, "proving makes it"
-    if where.any():
-        with bench.spending(bench.target.together(where)):
-            proof = bench.ground.run(recorded.gains, where)
-        proven = np.where(where[:, None], recorded.gains, recorded.proven)
-        recorded = replace(recorded, proof=np.where(where, proof.cost, recorded.proof), proven=proven)
-        failed = where & ~proof.passed
-        again = failed & bench.affordable(TRIAL_TIME + MOVE_TIME) if use_rule else np.zeros_like(failed)
-        for k in map(int, np.flatnonzero(failed)):
-            why = f"the lowered gains failed their trial: {proof.reason[k]}"
-            if again[k]:
-                assert recorded.response is not None, "it was measured"
-                recorded = _rule_instead(bench, basis, recorded, k, recorded.response, why)
-            else:
-                bench.journals[k].stop(why)
-        if again.any():
-            recorded = _try_again(bench, basis, recorded, again & bench.going, use_rule=False)
-            calmed &= ~again
-    return show(bench, basis, recorded, calmed & bench.going)
-
-
-def _go_on_after_faults(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, faults: Mapping[int, str]
-) -> RecordedGains:
-    """Repeat the move with axes that went into fault during the measurement."""
-    where = np.isin(np.arange(bench.target.num_axes), list(faults))
-    if not where.any():
-        return recorded
-    for axis, causes in faults.items():
-        only = np.arange(bench.target.num_axes) == axis
-        why = f"the drive went into fault during the measurement ({causes})"
-        recorded = _without_response(bench, recorded, only, why)
-    assert bench.ground is not None, "proving makes it"
-    with bench.spending(bench.target.together(where)):
-        bench.ground.recover(where)
-    bench.drop_faults("its frequency response was measured, and the fault cannot be reset")
-    return show(bench, basis, recorded, where & bench.going)
-
-
-def _without_response(bench: AutoBench, recorded: RecordedGains, where: Mask, why: str) -> RecordedGains:
-    """Tell why there is no frequency response, and how the gains were verified instead."""
-    bench.reserve(where, f"margins not measured: {why}; the gains were verified {BY_TRIAL} instead")
-    return replace(recorded, unseen=recorded.unseen | where)
+def _without_response(recorded: RecordedGains, where: Mask, why: str) -> RecordedGains:
+    unseen = tuple(why if late else told for late, told in zip(where, recorded.unseen, strict=True))
+    return replace(recorded, unseen=unseen, slack=np.where(where, np.nan, recorded.slack))
 
 
 def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
@@ -259,17 +143,20 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
     verified = list(recorded.verified)
     for k in map(int, np.flatnonzero(bench.going)):
         journal, gains = bench.journals[k], recorded.gains[k]
-        if response is None or recorded.unseen[k]:
+        tell_overshoot(bench, journal, float(recorded.overshoot[k]))
+        measured = measured_axis(bench, basis, recorded, k)
+        if response is None or measured is None:
+            why = recorded.unseen[k] or "no response was measured"
+            journal.reserve(f"margins not measured: {why}; the gains were verified {BY_TRIAL} instead")
             at_least[k], bounds = _by_model(bench, basis, k, gains, loops)
             journal.reserve(bounds)
             continue
-        found = margins_with(basis, response, gains, k)
-        margins[k] = {loop: found[loop] for loop in loops}
+        margins[k] = measured.margins(gains)
         at_least[k] = {loop: response.at_least(loop, gains, k) for loop in loops}
         blank = [loop for loop in loops if _is_blank(margins[k][loop], at_least[k][loop])]
         for loop in loops:
             if loop not in blank:
-                tell_bounds(journal, loop, margins[k][loop], at_least[k][loop])
+                tell_bounds(journal, bench.dynamics, loop, margins[k][loop], at_least[k][loop])
         if blank:
             least, bounds = _by_model(bench, basis, k, gains, blank)
             at_least[k] |= least
@@ -279,12 +166,10 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
             )
         for note in [note for note in response.notes[k] if note not in journal.notes]:
             journal.note(note)
-        for loop in loops:
-            if margins[k][loop].ms > SOUGHT:
-                journal.reserve(
-                    f"the {loop} loop is near to instability: Ms {margins[k][loop].ms:.1f}, where {SOUGHT:g} or less "
-                    "was sought; lower its P, or move slower, if the load may change"
-                )
+        for text in short_of(bench.dynamics, margins[k]):
+            journal.reserve(text)
+        if (beyond := short_of(find_dynamics("stiff"), margins[k])) and not recorded.kept[k]:
+            journal.stop(f"its loops are too near to instability: {'; '.join(beyond)}")
         if bench.target.linked:
             journal.reserve(ALONE)
         how = "by"
@@ -295,6 +180,31 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
             + ", ".join(f"{loop} loop Ms {one.ms:.1f}" for loop, one in margins[k].items())
         )
     return Verdict(tuple(margins), tuple(at_least), tuple(verified))
+
+
+def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:
+    """Add a reservation if a step in csp overshoots by more than the dynamics allow; beyond stiff ones, reject."""
+    told = f"a step of the set-point by {STEP_SIZE} counts in csp overshoots by {100.0 * overshoot:.0f} %"
+    for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
+        if overshoot > dynamics.overshoot + OVERSHOOT_ERROR:
+            tell(f"{told}; {dynamics.name} dynamics allow {100.0 * dynamics.overshoot:.0f} %")
+
+
+def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
+    """Return which margins of loops are smaller than the dynamics ask for, in words; what was not measured is not."""
+    texts = []
+    for loop, one in found.items():
+        for name, value, asked, error, unit, digits in (
+            ("phase margin", one.phase_deg, dynamics.phase_deg, PHASE_ERROR, " degrees", 0),
+            ("gain margin", one.gain_db, dynamics.gain_db, GAIN_ERROR, " dB", 1),
+            ("sensitivity peak Ms", -one.ms, -dynamics.ms, dynamics.ms * (MS_ERROR - 1.0), "", 1),
+        ):
+            if value < asked - error:
+                texts.append(
+                    f"the {loop} loop has a {name} of {abs(value):.{digits}f}{unit}, and {dynamics.name} dynamics ask "
+                    f"for {abs(asked):g}"
+                )
+    return texts
 
 
 def _is_blank(found: Margins, least: AtLeast) -> bool:
@@ -328,14 +238,14 @@ def _in_words(least: AtLeast) -> str:
     return f"at least {least.phase_deg:.0f} degrees{gain}"
 
 
-def tell_bounds(journal: Journal, loop: str, found: Margins, least: AtLeast) -> None:
+def tell_bounds(journal: Journal, dynamics: Dynamics, loop: str, found: Margins, least: AtLeast) -> None:
     """Add notes, or reservations if they are small, of the lower bounds of margins that were not measured."""
-    for name, value, bound, unit in (
-        ("phase", found.phase_deg, least.phase_deg, "degrees"),
-        ("gain", found.gain_db, least.gain_db, "dB"),
+    for name, value, bound, unit, asked in (
+        ("phase", found.phase_deg, least.phase_deg, "degrees", dynamics.phase_deg),
+        ("gain", found.gain_db, least.gain_db, "dB", dynamics.gain_db),
     ):
         if not math.isfinite(value) and math.isfinite(bound):
-            tell = journal.reserve if bound < CLOSE[name] else journal.note
+            tell = journal.reserve if bound < asked else journal.note
             tell(
                 f"the {loop} loop's {name} margin was not measured; it is at least {bound:.0f} {unit} by the model "
                 "fitted to the response, with its 95 % intervals"

@@ -1,61 +1,108 @@
-"""Margins of both outer loops of an axis by its measured velocity loop, for any gains."""
+"""Loops of an axis with any gains, by its measured velocity loop: margins, and how far they keep the dynamics."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.loops.dynamics import OFF_NOMINAL
+from drive_env.loops.linear_model import controllers, velocity_filter_response, velocity_plant
 from drive_env.loops.margins import Margins, margins
+from drive_env.trials.score import VARIANTS
+from tuning.response.measured_loop import GOOD_MISFIT
 
 if TYPE_CHECKING:
-    from tuning.auto.stages import Basis
+    from drive_env.loops.dynamics import Dynamics
+    from drive_env.loops.linear_model import Plant
     from tuning.response.measured_loop import MeasuredLoop
     from tuning.target import Target
 
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
-# Greatest |1/(1+L)| that a loop may have, and what gains are lowered to where that can be: it leaves 19 degrees and
-# 3.5 dB at least, where 4 leaves 14 and 2.5. The baseline rule has up to 3; with 2.3 it was lowered on a mere inertia.
-SENSITIVITY, SOUGHT = 4.0, 3.0
-CALMED = {"velocity": ("velocity", "position"), "position": ("position",)}  # whose P is lowered for a loop
+AT_ONCE = 64  # sets of gains whose loops are computed at once
+FACTORS = tuple(sorted({variant.velocity_p for variant in VARIANTS} - {1.0}))  # of velocity P, that loops must bear
 
 
 def judged_loops(target: Target) -> tuple[str, ...]:
     """Return the loops whose margins a measured velocity loop gives; of linked axes only the velocity loop."""
-    return ("velocity",) if target.linked else tuple(CALMED)
+    return ("velocity",) if target.linked else ("velocity", "position")
 
 
-def margins_with(basis: Basis, response: MeasuredLoop, gains: Integers, k: int) -> dict[str, Margins]:
-    """Return the margins of both outer loops of an axis, by its measured velocity loop."""
-    f, velocity, position, trusted = response.loops(gains, k, plant=basis.identified.plants[k])
-    found = {"velocity": margins(f, velocity, trusted), "position": margins(f, position, trusted)}
-    # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
-    return {loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()}
-
-
-def sensitivity(target: Target, basis: Basis, response: MeasuredLoop, gains: Integers, k: int) -> float:
-    """Return Ms of the outer loops of an axis by its measured velocity loop, the greater."""
-    found = margins_with(basis, response, gains, k)
-    return max(found[loop].ms for loop in judged_loops(target))
-
-
-def first_far_enough(peaks: Iterable[float]) -> int | None:
-    """Return which of some gains to take by their Ms: the first within what is sought, else within what is allowed.
+class MeasuredAxis:
+    """The outer loops of an axis with any gains: what was measured, times what these change of the linear model.
 
     Args:
-        peaks: Ms of the gains, in the order in which they are preferred.
-
-    Returns:
-        Its number; None if none is allowed.
+        response: The measured velocity loop.
+        axis: Number of the axis.
+        plant: The identified axis, for other gains of the torque loop.
+        loops: Which are judged.
     """
-    allowed = None
-    for number, ms in enumerate(peaks):
-        if ms <= SOUGHT:
-            return number
-        if allowed is None and ms <= SENSITIVITY:
-            allowed = number
-    return allowed
+
+    def __init__(self, response: MeasuredLoop, axis: int, plant: Plant, loops: tuple[str, ...]) -> None:
+        fit = response.fits[axis]
+        self._device, self._loops = response.device, loops
+        self._plant = plant if fit is None or fit.reason else fit.plant
+        f, L, trusted = response.refined(axis)
+        # Between lines and beyond those that are coherent the fitted model stands, where it fits.
+        seen = np.isfinite(L) & (trusted | (fit is not None and not fit.reason and fit.misfit <= GOOD_MISFIT))
+        self._f, self._measured, self._trusted = f[seen], L[seen], trusted[seen]
+        self._gains = response.gains[axis]
+        self._z = np.exp(2j * math.pi * self._f / self._device.velocity_rate)
+        self._angle = velocity_filter_response(self._device, self._plant, self._f) * (
+            self._device.velocity_rate * (1.0 - 1.0 / self._z)
+        )
+
+    def open_loops(self, gains: Integers) -> dict[str, Complex]:
+        """Return the open loops with gains, raw, (sets, count): (sets, n) each, by loop."""
+        now = [controllers(self._device, row) for row in gains]
+        regulators = np.array([one.velocity(self._z) for one in now])
+        inner = np.array([velocity_plant(self._device, self._plant, row, self._f) for row in gains])
+        then = controllers(self._device, self._gains).velocity(self._z)
+        before = velocity_plant(self._device, self._plant, self._gains, self._f)
+        velocity = self._measured * regulators * inner / (then * before)
+        outer = np.array([one.position for one in now])[:, None]
+        return {"velocity": velocity, "position": outer * velocity / (1.0 + velocity) / self._angle}
+
+    def margins(self, gains: Integers) -> dict[str, Margins]:
+        """Return the margins of the judged loops with gains, (count,)."""
+        loops = self.open_loops(gains[None])
+        found = {loop: margins(self._f, loops[loop][0], self._trusted) for loop in self._loops}
+        # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
+        return {
+            loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()
+        }
+
+    def slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
+        """Return how far the judged loops keep the dynamics with gains, relative, (sets,); with other velocity P, too.
+
+        Args:
+            dynamics: What they must keep.
+            gains: Raw, (sets, count).
+        """
+        parts = [gains[first : first + AT_ONCE] for first in range(0, len(gains), AT_ONCE)]
+        return np.concatenate([self._slack(dynamics, part) for part in parts])
+
+    def _slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
+        known = self._device.gains
+        least = self._clearance(dynamics, gains) - 1.0
+        for factor in FACTORS:
+            other = known.with_velocity_p(gains, np.full(len(gains), factor))
+            least = np.minimum(least, self._clearance(dynamics, other) / OFF_NOMINAL - 1.0)
+        return np.asarray(least)
+
+    def _clearance(self, dynamics: Dynamics, gains: Integers) -> Floats:
+        """Return the least clearance of the judged loops, (sets,); below 0 where they would be unstable."""
+        before, now = self.open_loops(self._gains[None]), self.open_loops(gains)
+        least = np.full(len(gains), np.inf)
+        for loop in self._loops:
+            # With the gains of the measurement the loop was stable: others are if 1 + L turns round 0 as often.
+            turned = np.unwrap(np.angle((1.0 + now[loop]) / (1.0 + before[loop])), axis=1)
+            stable = np.abs(turned[:, -1] - turned[:, 0]) < math.pi
+            clearance = dynamics.clearance(now[loop])
+            least = np.minimum(least, np.where(stable, clearance, -np.minimum(clearance, 1.0)))
+        return least

@@ -1,8 +1,8 @@
-"""Automatic tuning: check, identify, search gains, try, refine, verify and store them; or roll back with the reason.
+"""Automatic tuning in five stages: identify, design, try, verify and correct, certify; or roll back with the reason.
 
 Everything acts through the Drives interface, on all axes of a target at the same time, inside a transaction
 (snapshot.py): the state before is in a file before anything is changed, and an axis that fails a check gets it back.
-Gains are searched on digital twins (twin.py), which costs no drive time; only the best few are tried on the drives.
+Gains are designed on digital twins (twin.py), which costs no drive time, and corrected by what the drives show.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.gains import check_linear_model
+from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
-from tuning.auto.choice import keep_the_better, try_rule, try_what_changed
-from tuning.auto.loop_margins import judge, measure
-from tuning.auto.moves import look_back, show, stand
-from tuning.auto.refinement import refine, to_refine
+from tuning.auto.correction import correct, design_axes
+from tuning.auto.identified import identify, prepare
+from tuning.auto.loop_margins import judge
+from tuning.auto.moves import look_back
 from tuning.auto.result import collect
-from tuning.auto.search import compute, identify, prepare
 from tuning.auto.settings import begin, commission, write
-from tuning.auto.stages import Basis, RecordedGains, TriedGains
-from tuning.auto.trials import prove
+from tuning.auto.stages import Basis, TriedGains
+from tuning.auto.trying import try_gains
 from tuning.identify.quick_identification import identify_briefly
 from tuning.lateness import told_lateness
 from tuning.outcome import Outcome
@@ -34,8 +34,8 @@ from tuning.snapshot import Transaction, can_store
 from tuning.target import timed
 
 if TYPE_CHECKING:
+    from tuning.auto.identified import Identify
     from tuning.auto.result import Result
-    from tuning.auto.search import Identify
     from tuning.target import Target
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
@@ -44,14 +44,14 @@ Find = Callable[
     [AutoBench, Basis, Progress], TriedGains
 ]  # finds gains for the axes that go on, and tries them on the drives
 
-BUDGET = 12.0  # s of drive time
+BUDGET = 18.0  # s of drive time
 
 
 def auto(
     target: Target,
     file: str | Path,
     *,
-    seed: int = 0,
+    dynamics: str | Dynamics = DEFAULT,
     keep: bool = True,
     progress: Progress | None = None,
     experiments: Identify = identify_briefly,
@@ -63,7 +63,7 @@ def auto(
     Args:
         target: The drives; they may have any gains, also none, and are off afterwards.
         file: File for the state before.
-        seed: Of the search on twins.
+        dynamics: What the loops must keep.
         keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
         progress: Called with the present step, and the share done.
         experiments: The identification experiments.
@@ -76,17 +76,17 @@ def auto(
         OSError: If a file cannot be written; the drives then have their state from before.
     """
     return prove_found(
-        target, file, on_twins, seed=seed, keep=keep, progress=progress, experiments=experiments, budget=budget,
+        target, file, on_twins, dynamics=dynamics, keep=keep, progress=progress, experiments=experiments, budget=budget,
         files=files,
     )  # fmt: skip
 
 
 def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> TriedGains:
-    """Search gains on digital twins, and try the best few on the drives."""
-    searching = "searching gains on digital twins"
-    candidates = compute(bench, basis, lambda share: say(searching, 0.3 + 0.4 * share))
-    say("trying gains on the drives", 0.7)
-    return prove(bench, basis, candidates)
+    """Design gains on digital twins, and try them on the drives."""
+    designing = "designing gains on digital twins"
+    gains, cost, _ = design_axes(bench, basis, bench.going, lambda share: say(designing, 0.3 + 0.35 * share))
+    say("trying gains on the drives", 0.68)
+    return try_gains(bench, basis, gains, cost)
 
 
 def prove_found(
@@ -94,7 +94,7 @@ def prove_found(
     file: str | Path,
     find: Find,
     *,
-    seed: int = 0,
+    dynamics: str | Dynamics = DEFAULT,
     keep: bool = True,
     progress: Progress | None = None,
     experiments: Identify = identify_briefly,
@@ -108,7 +108,7 @@ def prove_found(
         file: File for the state before.
         find: Finds gains, and tries them on the proving ground that it gives the bench. If it raises, the run ends and
             everything is rolled back.
-        seed: Of the run.
+        dynamics: What the loops must keep.
         keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
         progress: Called with the present step, and the share done.
         experiments: The identification experiments.
@@ -121,7 +121,7 @@ def prove_found(
     check_linear_model(target.device)
     say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
-        bench = AutoBench(watched, seed, clock, budget)
+        bench = AutoBench(watched, clock, budget, find_dynamics(dynamics))
         say("checking the drives", 0.0)
         begin(bench)
         say("identifying", 0.05)
@@ -129,18 +129,9 @@ def prove_found(
         fresh = commission(bench, identified)
         basis = prepare(bench, identified)
         tried = find(bench, basis, say) if bench.going.any() else TriedGains.only(bench.before)
-        say("recording a move", 0.8)
-        recorded = show(bench, basis, RecordedGains.of(tried))
-        say("measuring the frequency response", 0.85)
-        recorded = measure(bench, basis, recorded)
-        say("comparing with the gains before", 0.9)
+        recorded = correct(bench, basis, tried, target, say)
+        say("comparing with the gains before", 0.94)
         recorded = look_back(bench, basis, recorded)
-        recorded = stand(bench, basis, try_rule(bench, basis, recorded), target)
-        recorded = keep_the_better(bench, basis, recorded, target)
-        if to_refine(bench, recorded).any():
-            say("refining gains on the drives", 0.93)
-        recorded = refine(bench, basis, recorded, target)
-        recorded = try_what_changed(bench, recorded)
         verdict = judge(bench, basis, recorded)
         tell_of_lateness(bench)
         if not is_recorded(target.drives):
@@ -167,7 +158,7 @@ def tell_of_lateness(bench: AutoBench) -> None:
 def tune(target: Target, rng: np.random.Generator) -> Outcome:
     """Tune a target as a tuner of `drive-tune rank`."""
     with tempfile.TemporaryDirectory() as folder:
-        found = auto(target, Path(folder) / "before.toml", seed=int(rng.integers(2**31)), keep=False)
+        found = auto(target, Path(folder) / "before.toml", keep=False)
     return Outcome(
         np.array([axis.after for axis in found.axes], np.int64),
         found.drive_seconds,
@@ -175,4 +166,5 @@ def tune(target: Target, rng: np.random.Generator) -> Outcome:
         found.aborts,
         found.violations,
         tuple(axis.reason or "; ".join(axis.notes) for axis in found.axes),
+        found.accepted,
     )

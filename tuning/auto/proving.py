@@ -70,6 +70,8 @@ SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
 # edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
 # before, and what the current may swing (RMS about its mean, over the rated one), without the noise of its measurement.
 PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
+STEP_SIZE, STEPPING = 50, 200  # counts of a step of csp, and cycles that are looked at after it
+STEP_ANGLE = STEP_SIZE / 4096 * 2.0 * math.pi  # rad, of the finer encoders
 QUIETENING, NOISE_CYCLES = 50, 100  # with slow outer loops: until an axis is quiet, and that show the noise
 
 
@@ -292,6 +294,36 @@ class ProvingGround:
         self._direction = np.where(where, -self._direction, self._direction)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
         return Shown(t, demand, actual, current * self._ampere, where, reason, costs, swing, measured)
+
+    def step(self, gains: Integers, where: Mask) -> Floats:
+        """Return how far axes go beyond a step of their set-point in csp, there and back, over the step, (num_axes,).
+
+        The step is STEP_SIZE counts of an encoder of 4096, or of a coarser one of the motor: small enough for the loops
+        to stay linear, and large enough for friction and noise not to matter. Linked axes step together.
+        """
+        drives, where = self.target.drives, self.target.together(where)
+        self._fallback.begin()
+        self._begin(where)
+        self._hold_still(where)
+        write_gains(drives, gains, where)
+        size = np.rint(np.maximum(STEP_SIZE * self._count, STEP_ANGLE * self.move.increments)).astype(np.int64)
+        here = drives.read(cia402.POSITION_ACTUAL)
+        motion.select_mode(drives, "csp", where)
+        worst = np.zeros(self.target.num_axes)
+        try:
+            begin = drives.read(cia402.TARGET_POSITION)
+            for end, way in ((here + size, 1), (here, -1)):
+                rows = np.tile(np.where(where, wrapped(end), begin), (STEPPING, 1)).astype(np.int64)
+                seen = drives.record(
+                    [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD], STEPPING * CYCLE,
+                    play={cia402.TARGET_POSITION: rows},
+                )  # fmt: skip
+                beyond = (way * wrapped(seen[cia402.POSITION_ACTUAL] - end)).max(axis=0)
+                worst = np.maximum(worst, beyond / size)
+        finally:
+            motion.select_mode(drives, "pp", where)
+        self._begin_without_a_step(where)
+        return np.where(where, worst, np.nan)
 
     def noise(self, gains: Integers, where: Mask) -> Floats:
         """Return what the measurement of their current makes of the swing at rest of axes, over the rated one (RMS).

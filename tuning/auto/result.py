@@ -45,7 +45,7 @@ class AxisResult:
         verified: How the gains were verified, in words; "" where they were not.
         margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
         at_least: Lower bounds of margins that were not measured, likewise.
-        eased: How often its gains were lowered because it shook at rest.
+        slack: How far the measured loops keep the dynamics, relative; nan where they were not measured.
         is_kept: Whether the gains before were better and are kept.
     """
 
@@ -61,7 +61,7 @@ class AxisResult:
     verified: str = ""
     margins: Mapping[str, Margins] = field(default_factory=dict)
     at_least: Mapping[str, AtLeast] = field(default_factory=dict)
-    eased: int = 0
+    slack: float = np.nan
     is_kept: bool = False
 
     @property
@@ -115,7 +115,7 @@ def collect(
                 tuple(map(int, bench.before[k])), tuple(map(int, gains)), reason, tuple(journal.reservations),
                 tuple(journal.notes), identified.found[k], identified.plants[k], float(recorded.cost[k]),
                 float(recorded.proof[k]), verdict.verified[k], verdict.margins[k], verdict.at_least[k],
-                int(recorded.eased[k]), bool(recorded.kept[k]),
+                float(recorded.slack[k]), bool(recorded.kept[k]),
             )
         )  # fmt: skip
     ground, zero = bench.ground, np.zeros(bench.target.num_axes, np.int64)

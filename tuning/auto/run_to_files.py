@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drive_env.loops.dynamics import DEFAULT
+
 if TYPE_CHECKING:
     from tuning.auto.result import Result
     from tuning.stepper.result import StepperResult
@@ -16,14 +18,17 @@ BEFORE = "before.toml"
 Progress = Callable[[str, float], None]
 
 
-def auto_to_files(target: Target, folder: Path, progress: Progress, *, seed: int = 0, keep: bool = True) -> Result:
+def auto_to_files(
+    target: Target, folder: Path, progress: Progress, *, seed: int = 0, keep: bool = True, dynamics: str = DEFAULT
+) -> Result:
     """Tune axes with closed loops; before.toml, certificate.json and report.html are in the folder afterwards.
 
     Args:
         target: The drives, as `tuning.auto.one_button.auto` takes them.
         folder: New or empty.
         progress: Called with the present step and the share done.
-        seed: Of the run.
+        seed: Of the emulated machine, for the certificate.
+        dynamics: What the loops must keep.
         keep: Whether drives on a bus store the gains.
 
     Raises:
@@ -34,7 +39,7 @@ def auto_to_files(target: Target, folder: Path, progress: Progress, *, seed: int
     from tuning.certificate.certificate_files import certificate_files
 
     return auto(
-        target, folder / BEFORE, seed=seed, keep=keep, progress=progress,
+        target, folder / BEFORE, dynamics=dynamics, keep=keep, progress=progress,
         files=lambda result: certificate_files(certificate(target, result, seed), folder, target.inputs),
     )  # fmt: skip
 

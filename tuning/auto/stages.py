@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +63,14 @@ class Basis:
         identified: The axes.
         before: Raw gains of the drives before the run, (num_axes, count).
         reference: Those of the baseline rule, likewise.
-        fallbacks: What is tried when the twin's gains fail, (3, num_axes, count): the baseline rule's; those before, or
-            the soft rule's; and those that are slow enough for any load, with which what is stopped goes on.
+        calm: Those that are slow enough for any load, with which what is stopped goes on, likewise.
         unsafe: Why an axis must not be moved with the gains before, "" where it may.
     """
 
     identified: IdentifiedAxes
     before: Integers
     reference: Integers
-    fallbacks: Integers
+    calm: Integers
     unsafe: tuple[str, ...]
 
     def held(self) -> tuple[Floats, Floats]:
@@ -94,34 +93,17 @@ class Basis:
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """What the search on digital twins found.
-
-    Attributes:
-        gains: The best on all twins, raw, (num_axes, count).
-        others: The best for the axis exactly as identified, and for less friction, (2, num_axes, count).
-        cost: Robust cost of the best on all twins, (num_axes,); nan where nothing was searched.
-    """
-
-    gains: Integers
-    others: Integers
-    cost: Floats
-
-
-@dataclass(frozen=True)
 class TriedGains:
-    """What trials on the drives left of the gains that were found.
+    """What trials on the drives left of the gains that were designed.
 
     Attributes:
-        gains: The best, raw, (num_axes, count).
-        spare: The second best that passed a trial, likewise; zeros where none did.
-        proof: J by measured terms of the best, (num_axes,); nan where there is none.
+        gains: Raw, (num_axes, count).
+        proof: J by measured terms of their trial, (num_axes,); nan where there is none.
         verified: How they were verified, in words; "" where they were not.
-        cost: Robust cost on digital twins of what was found on these, (num_axes,); nan where nothing was.
+        cost: Robust cost on the digital twins, (num_axes,); nan where it is not known.
     """
 
     gains: Integers
-    spare: Integers
     proof: Floats
     verified: tuple[str, ...]
     cost: Floats
@@ -130,63 +112,35 @@ class TriedGains:
     def only(gains: Integers) -> TriedGains:
         """Return gains of which nothing is known, (num_axes, count)."""
         n = len(gains)
-        return TriedGains(gains, np.zeros_like(gains), np.full(n, np.nan), ("",) * n, np.full(n, np.nan))
-
-    def with_gains(self, axis: int, gains: Integers) -> Self:
-        """Return this with other gains of an axis, shape (count,), beside which nothing is second best."""
-        here = (np.arange(len(self.gains)) == axis)[:, None]
-        return replace(self, gains=np.where(here, gains, self.gains), spare=np.where(here, 0, self.spare))
-
-
-@dataclass(frozen=True)
-class RuleTried:
-    """What the baseline rule's gains have shown in the same trial and move as those found.
-
-    Attributes:
-        gains: The rule's, or lower ones where an axis did not pass with these, (num_axes, count).
-        lowered: Where that is so, (num_axes,).
-        where: Axes on which they were tried, (num_axes,).
-        passed: Axes on whose machines they passed, stood at rest and are not too near to instability, (num_axes,).
-        cost: J by measured terms of the trial, (num_axes,).
-    """
-
-    gains: Integers
-    lowered: Mask
-    where: Mask
-    passed: Mask
-    cost: Floats
-
-    def title(self, axis: int) -> str:
-        """Return what messages call the gains of an axis."""
-        return f"the gains of the baseline rule{', lowered,' if self.lowered[axis] else ''}"
+        return TriedGains(gains, np.full(n, np.nan), ("",) * n, np.full(n, np.nan))
 
 
 @dataclass(frozen=True)
 class RecordedGains(TriedGains):
-    """What moves and frequency responses showed of the gains, which were lowered where they had to be.
+    """What a move, a frequency response and a load step showed of the gains.
 
     Attributes:
-        shown: A recorded move with the gains, None if none was made.
-        eased: How often the gains of an axis were lowered because it shook at rest, (num_axes,).
+        shown: A recorded move, None if none was made.
+        failed: Of each axis, why its gains cannot stay: it failed the move, or does not come to rest; "" if they can.
+        swing: Of its current at rest without the noise of its measurement, over the rated one (RMS), (num_axes,).
         response: The velocity loop's, None if none was measured.
-        unseen: Axes without a usable frequency response, (num_axes,).
-        proven: The gains whose trial `proof` is of, (num_axes, count).
-        rule: What the baseline rule's gains have shown, None where they were not tried.
+        unseen: Of each axis, why it has no usable frequency response; "" where it has one.
+        slack: How far the measured loops keep the dynamics, relative, (num_axes,); nan where they were not measured.
+        overshoot: Of a step of the set-point in csp, over the step, (num_axes,); nan where none was made.
         earlier: A recorded move with the gains before, None if none was made.
-        kept: Axes that keep the gains before, which were better, (num_axes,).
-        won: Axes whose gains, found on twins, were better than the rule's on the drive and on the twins, (num_axes,).
-        loaded: Response to a load step, of emulated machines, by axis.
+        kept: Axes that keep the gains before, (num_axes,).
+        loaded: Response to a load step, of emulated machines.
     """
 
     shown: Shown | None
-    eased: Integers
+    failed: tuple[str, ...]
+    swing: Floats
     response: MeasuredLoop | None
-    unseen: Mask
-    proven: Integers
-    rule: RuleTried | None = None
+    unseen: tuple[str, ...]
+    slack: Floats
+    overshoot: Floats
+    kept: Mask
     earlier: Shown | None = None
-    kept: Mask = field(default_factory=lambda: np.zeros(0, bool))
-    won: Mask = field(default_factory=lambda: np.zeros(0, bool))
     loaded: Mapping[int, StepResponse] = field(default_factory=dict)
 
     @classmethod
@@ -194,15 +148,38 @@ class RecordedGains(TriedGains):
         """Return gains that were tried, and nothing recorded yet."""
         known = {one.name: getattr(tried, one.name) for one in fields(TriedGains)}
         n = len(tried.gains)
-        none = np.zeros(n, bool)
-        eased = np.zeros(n, np.int64)
         return cls(
-            **known, shown=None, eased=eased, response=None, unseen=none, proven=tried.gains, kept=none, won=none
-        )
+            **known, shown=None, failed=("",) * n, swing=np.zeros(n), response=None, unseen=("",) * n,
+            slack=np.full(n, np.nan), overshoot=np.full(n, np.nan), kept=np.zeros(n, bool),
+        )  # fmt: skip
 
     def with_move(self, shown: Shown) -> RecordedGains:
         """Return this with a later move of some axes in place of theirs."""
         return replace(self, shown=shown if self.shown is None else self.shown.replaced(shown))
+
+    def mixed(self, other: RecordedGains, where: Mask) -> RecordedGains:
+        """Return this with all that another one has of some axes, (num_axes,)."""
+        numbers = ("proof", "cost", "swing", "slack", "overshoot", "kept")
+        values: dict[str, Any] = {name: np.where(where, getattr(other, name), getattr(self, name)) for name in numbers}
+        for name in ("verified", "failed", "unseen"):
+            both = zip(where, getattr(self, name), getattr(other, name), strict=True)
+            values[name] = tuple(new if chosen else old for chosen, old, new in both)
+        shown, response = self.shown, self.response
+        if other.shown is not None:
+            moved = other.shown._replace(where=where & other.shown.where)
+            shown = moved if shown is None else shown.replaced(moved)
+        if other.response is not None:
+            response = other.response if response is None else response.replaced(other.response, where)
+        loaded = {k: one for k, one in self.loaded.items() if not where[k]}
+        loaded |= {k: one for k, one in other.loaded.items() if where[k]}
+        return replace(
+            self,
+            **values,
+            gains=np.where(where[:, None], other.gains, self.gains),
+            shown=shown,
+            response=response,
+            loaded=loaded,
+        )
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import integers_per_si, rule_gains
+from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
-from drive_env.trials.score import RobustScore
+from drive_env.trials.score import TRIPPED, RobustScore, robust_cost
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -122,10 +123,7 @@ WORLDS = (
     ),
     MachineVariant("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
-# An axis that shakes at rest is held by less of it than was found.
-SLIPPERY_WORLDS = tuple(world._replace(friction=0.02) for world in WORLDS)
-# What the current may swing in a move, likewise of the rated one, and the power by which more than that counts.
-MOST_SWING, SWINGING = 0.8 * OSCILLATION, 2.0
+MOST_SWING = 0.8 * OSCILLATION  # what the current may swing in a move, of the rated one
 FARTHEST = 0.6  # relative: an interval that says less than this says nothing
 
 
@@ -205,6 +203,7 @@ class Twins:
         num_threads: Threads that run them; the number of cores by default.
         worlds: Variants on which the gains are scored.
         repeats: Runs of each variant, with a noise of their own, whose scores are averaged.
+        dynamics: What the loops must keep.
     """
 
     def __init__(
@@ -217,8 +216,9 @@ class Twins:
         num_threads: int | None = None,
         worlds: Sequence[MachineVariant] = WORLDS,
         repeats: int = 1,
+        dynamics: str | Dynamics = DEFAULT,
     ) -> None:
-        self.sets = sets
+        self.sets, self.dynamics = sets, find_dynamics(dynamics)
         self.device = device
         self.num_axes = len(known)
         elastic = np.array([is_elastic(one.plant) for one in known])
@@ -227,25 +227,47 @@ class Twins:
             if mask.any():
                 axes = np.flatnonzero(mask)
                 chosen = [known[int(k)] for k in axes]
-                part = _Part(device, motor, load, axes, chosen, scaler[mask], sets, num_threads, worlds, repeats)
-                self._parts.append(part)
+                machines = len(chosen) * sets * len(worlds)
+                robust = RobustScore(
+                    device.name, load, motor, machines, num_threads=num_threads, repeats=repeats, dynamics=dynamics
+                )
+                self._parts.append(_Part(robust, device, motor, axes, chosen, scaler[mask], sets, worlds))
 
     def score(self, gains: Integers) -> Floats:
-        """Return the cost of gains, raw integers of shape (n, sets, count), over the variants, (n, sets).
+        """Return the robust cost of gains, raw integers of shape (n, any sets, count), over the worlds, (n, any sets).
 
-        The mean of the robust cost, with a penalty for gains that a trial would stop as oscillating.
+        The mean performance of all worlds counts, and the margins of the first; gains that a trial would stop as
+        oscillating keep no constraints.
         """
-        return self.cost_and_rest(gains)[0]
+        return robust_cost(*self.judge(gains))
 
-    def cost_and_rest(self, gains: Integers) -> tuple[Floats, Floats]:
-        """Return the cost of gains, as `score`, and how the current swings at rest on the worst variant, (n, sets).
+    def judge(self, gains: Integers) -> tuple[Floats, Floats]:
+        """Return the robust performance of gains over the worlds and how far they keep the constraints, as `score`."""
+        performance, slack = self._each(gains, lambda part, rows: part.judge(rows))
+        return performance, slack
 
-        That is about its mean (RMS), over the rated one.
+    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
+        """Return by how much loops keep the margins of the dynamics on the first world, relative, (n, any sets).
+
+        Args:
+            gains: Raw integers, (n, any sets, count).
+            nominal: Whether to look at the machines as they are alone, not at their variants.
         """
-        cost, rest = np.empty(gains.shape[:2]), np.empty(gains.shape[:2])
-        for part in self._parts:
-            cost[part.axes], rest[part.axes] = part.score(gains[part.axes])
-        return cost, rest
+        return np.asarray(self._each(gains, lambda part, rows: (part.slack(rows, nominal),))[0])
+
+    def _each(self, gains: Integers, function: Callable[[_Part, Integers], tuple[Floats, ...]]) -> Floats:
+        """Return what a function says of as many sets as run at once, and then of the next, (values, n, any sets)."""
+        found: Floats | None = None
+        for first in range(0, gains.shape[1], self.sets):
+            rows = gains[:, first : first + self.sets]
+            count = rows.shape[1]
+            whole = np.concatenate([rows, np.repeat(rows[:, -1:], self.sets - count, axis=1)], axis=1)
+            for part in self._parts:
+                values = np.array(function(part, whole[part.axes]))[:, :, :count]
+                found = np.empty((len(values), *gains.shape[:2])) if found is None else found
+                found[:, part.axes, first : first + count] = values
+        assert found is not None, "there are gains"
+        return found
 
     def close(self) -> None:
         """Close the emulated machines."""
@@ -264,21 +286,18 @@ class _Part:
 
     def __init__(
         self,
+        robust: RobustScore,
         device: Device,
         motor: Motor,
-        load: str,
         axes: NDArray[np.int64],
         known: Sequence[Known],
         scaler: Floats,
         sets: int,
-        num_threads: int | None,
         worlds: Sequence[MachineVariant],
-        repeats: int,
     ) -> None:
         self.axes = axes
         self._shape = (len(axes), sets, len(worlds))
-        machines = math.prod(self._shape)
-        self._robust = RobustScore(device.name, load, motor, machines, num_threads=num_threads, repeats=repeats)
+        self._robust = robust
         rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
         parameters = {
             name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
@@ -303,14 +322,22 @@ class _Part:
         """Return values per axis and world, (axes, worlds), for all machines, (machines,)."""
         return np.broadcast_to(values[:, None], self._shape).reshape(-1)
 
-    def score(self, gains: Integers) -> tuple[Floats, Floats]:
-        """Return the geometric mean of the costs over the variants, and the most swing at rest; (axes, sets) each."""
+    def judge(self, gains: Integers) -> tuple[Floats, Floats]:
+        """Return performance and slack over the worlds, (axes, sets) each."""
         every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
         found = self._robust.score(every)
+        worth = np.exp(np.log(found.performance).reshape(self._shape).mean(axis=2))
+        slack = found.slack.reshape(self._shape)[:, :, 0]
         # A drive on which that swings would be stopped: a trial sees the move and the probe.
-        beyond = np.maximum(found.swing.max(axis=1) / MOST_SWING, 1.0)
-        costs = np.exp(np.log(found.robust_cost * beyond**SWINGING).reshape(self._shape).mean(axis=2))
-        return np.asarray(costs), found.rest.max(axis=1).reshape(self._shape).max(axis=2)
+        swing = found.swing.max(axis=1).reshape(self._shape).max(axis=2)
+        slack = np.minimum(slack, 1.0 - np.minimum(swing / MOST_SWING, 1.0 - TRIPPED))
+        return np.asarray(worth), slack
+
+    def slack(self, gains: Integers, nominal: bool) -> Floats:
+        """Return the slack of the loops on the first world, (axes, sets)."""
+        every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
+        first = np.arange(math.prod(self._shape)) % self._shape[2] == 0
+        return self._robust.loop_slack(every, first, nominal).reshape(self._shape[:2])
 
     def close(self) -> None:
         self._robust.close()
@@ -324,85 +351,3 @@ def least_gains(device: Device) -> Integers:
         per_second = integers_per_si(device, 1.0)["velocity", "I"]  # which no supply changes
         least[integral] = max(round(per_second / LONGEST_INTEGRATION), 1)
     return least
-
-
-class Optimum(NamedTuple):
-    """The result of the search on twins, of every axis, the best first.
-
-    gains: (n, found, count) raw integers. cost: their robust cost on the twin, (n, found). start: that of the best
-    gains that it started from, (n,).
-    """
-
-    gains: Integers
-    cost: Floats
-    start: Floats
-
-
-def search(
-    twins: Twins,
-    starts: Integers,
-    rng: np.random.Generator,
-    *,
-    generations: int = 24,
-    keep: int = 12,
-    free: Sequence[str] | None = None,
-    width: float = 1.0,
-    score: Callable[[Integers], Floats] | None = None,
-) -> Optimum:
-    """Return the gains of least robust cost on twins, found by an evolution strategy in the logarithms of the gains.
-
-    Every axis has a search of its own; they share nothing but the call. The draws for an axis depend on the generator
-    and on the number of axes.
-
-    Args:
-        twins: The twins.
-        starts: Gains to begin with, shape (n, starts, count), at most as many as the twins score at once.
-        rng: For drawing.
-        generations: How often a generation of `twins.sets` sets is drawn and scored.
-        keep: Sets that are returned.
-        free: Names of the gains that are searched, all by default; the others stay those of the best start.
-        width: First standard deviation of a gain's logarithm.
-        score: Gives the cost of gains, (n, sets), in place of the twins.
-    """
-    known = twins.device.gains
-    columns = known.columns(known.names if free is None else free)
-    n, sets, d = twins.num_axes, twins.sets, len(columns)
-    least = least_gains(twins.device)[columns]
-    highest, score = known.highest[columns], score or twins.score
-    reach = np.array([math.log(top) for top in highest])
-    first = starts[:, np.arange(sets) % starts.shape[1]]
-    cost = score(first)
-    at = np.arange(n)
-    best = cost.argmin(axis=1)
-    base = first[at, best]
-    start = cost[at, best]
-    order = cost.argsort(axis=1, kind="stable")
-    pool_cost = np.take_along_axis(cost, order, axis=1)
-    pool_gains = np.take_along_axis(first, order[:, :, None], axis=1)
-    mean = np.log(np.maximum(base[:, columns], 1).astype(float))
-    covariance = np.tile(np.eye(d) * width**2, (n, 1, 1))
-    parents = max(sets // 4, 2)
-    weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
-    weights /= weights.sum()
-    for _ in range(generations):
-        root = np.linalg.cholesky(covariance)
-        drawn = mean[:, None] + np.einsum("nij,nlj->nli", root, rng.standard_normal((n, sets, d)))
-        drawn[:, 0] = mean
-        # The best so far is drawn again, so that a mean which lost it finds back.
-        drawn[:, 1] = np.log(np.maximum(pool_gains[:, 0, columns], 1).astype(float))
-        gains = np.repeat(base[:, None], sets, axis=1)
-        gains[:, :, columns] = np.clip(np.rint(np.exp(np.clip(drawn, 0.0, reach))), least, highest)
-        cost = score(gains)
-        order = cost.argsort(axis=1)[:, :parents]
-        chosen = np.take_along_axis(drawn, order[:, :, None], axis=1)
-        step = chosen - mean[:, None]
-        spread = np.einsum("l,nli,nlj->nij", weights, step, step)
-        # Steps from the old mean, so that the ellipse stretches in the direction in which the mean moves.
-        covariance = 0.55 * covariance + 0.45 * spread + 1e-5 * np.eye(d)
-        mean = np.einsum("l,nli->ni", weights, chosen)
-        pool_gains = np.concatenate([pool_gains, gains], axis=1)
-        pool_cost = np.concatenate([pool_cost, cost], axis=1)
-        order = pool_cost.argsort(axis=1, kind="stable")[:, :keep]
-        pool_cost = np.take_along_axis(pool_cost, order, axis=1)
-        pool_gains = np.take_along_axis(pool_gains, order[:, :, None], axis=1)
-    return Optimum(pool_gains, pool_cost, start)

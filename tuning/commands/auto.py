@@ -11,6 +11,7 @@ import typer
 from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
+    DynamicsOption,
     Json,
     TargetOptions,
     errors_as_exit_codes,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 @takes(TargetOptions)
 def auto(
     drive: TargetOptions,
+    dynamics: DynamicsOption = "standard",
     store: Annotated[
         bool,
         typer.Option("--store/--no-store", help="Drives on a bus store the gains, so that they survive a power cycle."),
@@ -37,7 +39,7 @@ def auto(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Tune a drive: identify, search gains, try, verify and store them; an axis that fails a check is rolled back.
+    """Tune a drive: identify, design gains, try, verify and store them; an axis that fails a check is rolled back.
 
     Of an open-loop stepper it sets the phase currents, the StallGuard threshold and CoolStep, and writes
     stepper-certificate.json in place of certificate.json and report.html.
@@ -47,10 +49,12 @@ def auto(
     report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
+        from drive_env.loops.dynamics import find_dynamics
         from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files
         from tuning.runs import provenance
         from tuning.way_back import way_back
 
+        find_dynamics(dynamics)  # before anything is done
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
         file = folder / BEFORE if drive.bus else None
@@ -62,7 +66,9 @@ def auto(
                 _report_stepper(target, result, folder, json)
             else:
                 with progress_bar("tuning") as show:
-                    result = auto_to_files(target, folder, lambda what, share: show(share), seed=drive.seed, keep=store)
+                    result = auto_to_files(
+                        target, folder, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=dynamics
+                    )
                 _report(target, result, folder, json)
         if not result.accepted.all():
             raise typer.Exit(REFUSED)

@@ -49,6 +49,14 @@ LoadName = Annotated[
     str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF file.")
 ]
 ForeignEds = Annotated[Path | None, typer.Option("--eds", hidden=True)]  # as drive-env has it; refused with the remedy
+DynamicsOption = Annotated[
+    str,
+    typer.Option(
+        "--dynamics",
+        help="What the outer loops must keep: soft (60 degrees, 12 dB, Ms 1.5), standard (45, 8, 2.0), stiff (35, 6, "
+        "2.5), or phase margin/gain margin/Ms as 50/10/1.8.",
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
 Bus = Annotated[

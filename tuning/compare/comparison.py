@@ -1,8 +1,8 @@
-"""Tuners compared on the same machines: the robust cost of their gains, and the drive time and moves they took.
+"""Tuners compared on the same machines: what their gains are worth, and the drive time and moves they took.
 
 Every tuner gets every machine as it comes from the box, under an audit that counts time, moves and violations. Gains
-are scored in the emulator by the robust cost (drive_env/trials/score.py), relative to that of the baseline rule which
-knows the true inertia; a tuner never sees the score.
+are judged in the emulator (drive_env/trials/score.py): their robust performance over that of the machine's constrained
+oracle (oracle.py), whether they keep the constraints, and the true margins; a tuner never sees any of it.
 """
 
 from __future__ import annotations
@@ -19,18 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.devices import find_device
-from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import rule_gains
-from drive_env.trials.positioning import highest_ramp, longer_way, plan_move
-from drive_env.trials.score import RobustScore
 from mechanics.untrusted import parse_json
-from tuning.compare.rule_check import rule_passes
+from tuning.compare.oracle import Oracle, find_oracles
 from tuning.compare.suite import SuiteMachine, groups, open_group
 from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
+from tuning.compare.yardstick import Yardstick
 from tuning.drive_audit import KINDS, DriveAudit
-from tuning.identify.moved_inertia import moved_inertia
 from tuning.outcome import Outcome, Tuner
 from tuning.runs.inputs import as_given, taken_options
 from tuning.runs.shard_log import ShardLog
@@ -45,29 +40,35 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
-# Runs of every machine and variant, each with a noise of its own, whose scores are averaged: with one run, the same
-# gains get a score that differs by 10 % on some machines, and the rule's count as worse than themselves on one of 13.
-REPEATS = 16
-WORSE = 1.05  # times the baseline rule's robust cost: from here on a tuning counts as worse
+NEAR_PHASE, NEAR_GAIN = 5.0, 1.0  # degrees and dB by which margins may be missed and still be near
 
 
 @dataclass(frozen=True)
 class MachineRow:
     """The result of a tuner on a machine.
 
-    robust_cost, relative: The robust cost, and over that of the baseline rule. rule: That of the baseline rule.
-    drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it included.
-    moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
+    robust_cost, performance: Of its gains, with and without constraints. oracle: The oracle's performance, relative:
+    over it. slack: How far the gains keep the constraints, below 0 where one is broken. phase_deg, gain_db, ms: True
+    margins of the worst outer loop; 0, 0 and 100 of an unstable machine. All four are None without a linear model.
+    near: Whether phase and gain margin are within 5 degrees and 1 dB of those demanded. accepted: Whether the tuner
+    vouches for them. drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it
+    included. moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
     violations: Of all kinds. gains: Raw gains of the machine's first axis, by the names that its device has for them.
     note: What the tuner says, or why it failed; then the gains are those that it left behind.
-    rule_passes: Whether the baseline rule's gains themselves pass the checks of auto on this machine (rule_check.py).
     """
 
     tuner: str
     machine: str
     robust_cost: float
+    performance: float
+    oracle: float
     relative: float
-    rule: float
+    slack: float | None
+    phase_deg: float | None
+    gain_db: float | None
+    ms: float | None
+    near: bool
+    accepted: bool
     drive_seconds: float
     moves: int
     aborts: int
@@ -76,38 +77,47 @@ class MachineRow:
     failed: bool
     gains: Mapping[str, int]
     note: str
-    rule_passes: bool = True
+
+    @property
+    def kept(self) -> bool:
+        """Whether the gains keep all constraints."""
+        return self.slack is None or self.slack >= 0.0
 
 
 @dataclass(frozen=True)
 class TunerRow:
     """The result of a tuner over all machines.
 
-    median, p95: Of the robust cost over the baseline rule's. worse: Share of machines that are more than 5 % worse.
+    median, p95: Of the robust performance over the oracle's. kept: Share of machines whose gains keep all constraints.
+    near: Share whose true phase and gain margins are within 5 degrees and 1 dB of those demanded. phase_deg, phase_p5,
+    gain_db, ms, ms_p95: Margins of a machine's worst outer loop, phase: median and 5th percentile, gain: median, Ms:
+    median and 95th percentile; None where no drive has a linear model. accepted: Share that the tuner vouches for.
     drive_seconds, moves: Median of a machine. aborts, violations: Of all machines together. failed: Machines on which
-    it gave up with an error. rule_passes: Machines on which the baseline rule's own gains pass the checks of auto, with
-    median, p95 and share worse on these alone; None where there are none.
+    it gave up with an error.
     """
 
     tuner: str
     machines: int
     median: float
     p95: float
-    worse: float
+    kept: float
+    near: float
+    phase_deg: float | None
+    phase_p5: float | None
+    gain_db: float | None
+    ms: float | None
+    ms_p95: float | None
+    accepted: float
     drive_seconds: float
     moves: float
     aborts: int
     violations: int
     failed: int
-    rule_passes: int = 0
-    median_there: float | None = None
-    p95_there: float | None = None
-    worse_there: float | None = None
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows of every tuner and machine, and what each tuner is worth, the best median first."""
+    """Rows of every tuner and machine, and what each tuner is worth: the first keeps most, then by median."""
 
     rows: tuple[MachineRow, ...]
     tuners: tuple[TunerRow, ...]
@@ -127,6 +137,7 @@ def compare(
     progress: Progress = lambda what, share: None,
     pool: Pool | None = None,
     trials: int | None = None,
+    oracles: Mapping[str, Oracle] | None = None,
 ) -> Comparison:
     """Have every tuner tune every machine.
 
@@ -139,7 +150,9 @@ def compare(
         progress: Called with what is under way and the share that is done.
         pool: Where else it runs, which changes no digit; there the tuners are found by their names and `trials`.
         trials: As `find_tuner` takes it.
+        oracles: Of the machines, by name; found by default.
     """
+    best = find_oracles(machines, num_threads) if oracles is None else oracles
     tasks = [(indices, name) for indices in groups(machines) for name in tuners]
     done = {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
     left = [k for k in range(len(tasks)) if k not in done]
@@ -149,9 +162,9 @@ def compare(
         progress(f"{tasks[k][1]} on {machine.load}, {machine.motor}", len(done) / len(tasks))
 
     if pool is None:
-        fresh = _here(machines, tuners, tasks, left, seed, num_threads, say)
+        fresh = _here(machines, tuners, tasks, left, best, seed, num_threads, say)
     else:
-        fresh = _elsewhere(machines, tasks, left, seed, trials, pool, say)
+        fresh = _elsewhere(machines, tasks, left, best, seed, trials, pool, say)
     for k, rows in fresh:
         done[k] = rows
         if log is not None:
@@ -178,7 +191,7 @@ def _compared(
         return None
     ordered = tuple(found[name, i] for name in tuners for i in common)
     summaries = [_summary(name, [row for row in ordered if row.tuner == name]) for name in tuners]
-    return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
+    return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (-row.kept, row.median, row.tuner))))
 
 
 class _GroupTask(NamedTuple):
@@ -186,6 +199,7 @@ class _GroupTask(NamedTuple):
 
     group: list[SuiteMachine]
     tuner: str
+    oracles: list[Oracle]
     trials: int | None
     seed: int
 
@@ -194,7 +208,7 @@ def _run(task: _GroupTask) -> str:
     """Return what a tuner makes of the machines of a group, as text."""
     with closing(Yardstick(task.group, 1)) as yardstick:
         tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials))
-        return _text_of(_rows(task.tuner, task.group, tuned, yardstick))
+        return _text_of(_rows(task.tuner, task.group, tuned, yardstick, task.oracles))
 
 
 def _here(
@@ -202,6 +216,7 @@ def _here(
     tuners: Mapping[str, Tuner],
     tasks: Sequence[tuple[Sequence[int], str]],
     left: Sequence[int],
+    oracles: Mapping[str, Oracle],
     seed: int,
     num_threads: int | None,
     say: Callable[[int], None],
@@ -218,23 +233,29 @@ def _here(
                 open_now.callback(yardstick.close)
             name = tasks[k][1]
             say(k)
-            yield k, _rows(name, group, bench.tune(name, tuners[name]), yardstick)
+            best = [oracles[machine.name] for machine in group]
+            yield k, _rows(name, group, bench.tune(name, tuners[name]), yardstick, best)
 
 
 def _elsewhere(
     machines: Sequence[SuiteMachine],
     tasks: Sequence[tuple[Sequence[int], str]],
     left: Sequence[int],
+    oracles: Mapping[str, Oracle],
     seed: int,
     trials: int | None,
     pool: Pool,
     say: Callable[[int], None],
 ) -> Iterator[tuple[int, list[MachineRow]]]:
     """Give the number and the rows of each task as it comes back."""
+    found = [oracles[machine.name] for machine in machines]
     machines = [
         replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor})) for one in machines
     ]
-    items = [_GroupTask([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
+    items = [
+        _GroupTask([machines[i] for i in where], name, [found[i] for i in where], trials, seed)
+        for where, name in (tasks[k] for k in left)
+    ]
     for place, text in pool.unordered(_run, items, fits=_is_of):
         say(left[place])
         yield left[place], _rows_of(text)
@@ -252,53 +273,6 @@ def _text_of(rows: Sequence[MachineRow]) -> str:
 
 def _rows_of(text: str) -> list[MachineRow]:
     return [MachineRow(**row) for row in parse_json(text)]
-
-
-class Yardstick:
-    """The robust cost of a group of machines, and that of the baseline rule with their true inertia."""
-
-    def __init__(self, group: Sequence[SuiteMachine], num_threads: int | None) -> None:
-        device, load, motor, friction = group[0].kind
-        self._score = RobustScore(
-            device, load, motor, len(group), num_threads=num_threads, friction=friction,
-            repeats=REPEATS,
-        )  # fmt: skip
-        with open_group(group, num_threads) as target:
-            drives = target.drives
-            inertia = _true_inertia(target)
-            reach = longer_way(target.low, target.high)
-            supply = target.supply.reshape(len(group), -1)[:, 0]
-            self._score.set_machines(machine_of(drives).parameters, supply)
-            self._score.set_moves(
-                plan_move(target.motor, inertia, drives.read(Role.POSITION_SCALE), reach, highest_ramp(target.device))
-            )
-            rule = np.concatenate(
-                [
-                    rule_gains(target.device, target.motor, J, supply=float(volts))
-                    for J, volts in zip(inertia, target.supply, strict=True)
-                ]
-            )
-            # On the machines themselves, fresh from the box; the score has its own.
-            self.rule_passes = rule_passes(target, rule, inertia)
-        self.rule = self._score.set_reference(rule).robust_cost
-
-    def score(self, gains: Integers) -> Floats:
-        """Return the robust cost of every machine, (num_machines,)."""
-        return self._score.score(gains).robust_cost
-
-    def close(self) -> None:
-        """Give the machines back."""
-        self._score.close()
-
-
-def _true_inertia(target: Target) -> Floats:
-    """Return the total inertia as a perfect identification finds it: over the true K_t, times the data sheet's.
-
-    The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
-    """
-    moved = np.concatenate([moved_inertia(group.load) for group in machine_of(target.drives).drives.inside.groups])
-    share = machine_of(target.drives).parameters["motor.psi_m"] / target.motor.psi_m
-    return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))
 
 
 class _Tuned(NamedTuple):
@@ -345,23 +319,37 @@ class _Bench:
         return tuner.propose(target, found, before, seconds), audit
 
 
-def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
+def _rows(
+    name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Yardstick, oracles: Sequence[Oracle]
+) -> list[MachineRow]:
     """Return what a tuner made of every machine of a group."""
-    robust_cost, outcome, audit = yardstick.score(tuned.gains), tuned.outcome, tuned.audit
+    scores, worst = yardstick.score(tuned.gains), yardstick.margins(tuned.gains)
+    outcome, audit, asked = tuned.outcome, tuned.audit, yardstick.dynamics
     per_machine = len(tuned.gains) // len(group)
     names = find_device(group[0].device).gains.names
+    vouched = None if outcome is None else outcome.accepted
+    accepted = np.full(len(tuned.gains), outcome is not None) if vouched is None else vouched
     rows = []
     for k, machine in enumerate(group):
         axes = slice(k * per_machine, (k + 1) * per_machine)
         counts = audit.violations[:, axes].sum(axis=1)
         notes = [tuned.failure] if outcome is None else [note for note in outcome.notes[axes] if note]
+        phase, gain, ms = (float(value[k]) if np.isfinite(value[k]) else None for value in worst)
         rows.append(
             MachineRow(
                 tuner=name,
                 machine=machine.name,
-                robust_cost=float(robust_cost[k]),
-                relative=float(robust_cost[k] / yardstick.rule[k]),
-                rule=float(yardstick.rule[k]),
+                robust_cost=float(scores.robust_cost[k]),
+                performance=float(scores.performance[k]),
+                oracle=oracles[k].performance,
+                relative=float(scores.performance[k]) / oracles[k].performance,
+                slack=float(scores.slack[k]) if np.isfinite(scores.slack[k]) else None,
+                phase_deg=phase,
+                gain_db=gain,
+                ms=ms,
+                near=(phase is None or phase >= asked.phase_deg - NEAR_PHASE)
+                and (gain is None or gain >= asked.gain_db - NEAR_GAIN),
+                accepted=bool(accepted[axes].all()),
                 drive_seconds=round(float(audit.seconds[axes].max()), 3),
                 moves=int(audit.moves[axes].sum()),
                 aborts=0 if outcome is None else int(outcome.aborts[axes].sum()),
@@ -370,7 +358,6 @@ def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Ya
                 failed=outcome is None,
                 gains=dict(zip(names, map(int, tuned.gains[axes.start]), strict=True)),
                 note=" | ".join(notes).replace("\n", " "),
-                rule_passes=bool(yardstick.rule_passes[k]),
             )
         )
     return rows
@@ -388,22 +375,27 @@ def _checked_gains(outcome: Any, target: Target) -> Integers:
 
 
 def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
-    relative = np.array([row.relative for row in rows])
-    there = np.array([row.relative for row in rows if row.rule_passes])
-    figures: tuple[float | None, ...] = (None,) * 3
-    if there.size:
-        figures = float(np.median(there)), float(np.percentile(there, 95)), float(np.mean(there > WORSE))
+    def percentile(name: str, share: float) -> float | None:
+        known = [value for row in rows if (value := getattr(row, name)) is not None]
+        return float(np.percentile(known, share)) if known else None
+
+    relative = [row.relative for row in rows]
     return TunerRow(
-        name,
-        len(rows),
-        float(np.median(relative)),
-        float(np.percentile(relative, 95)),
-        float(np.mean(relative > WORSE)),
-        float(np.median([row.drive_seconds for row in rows])),
-        float(np.median([row.moves for row in rows])),
-        sum(row.aborts for row in rows),
-        sum(row.violations for row in rows),
-        sum(row.failed for row in rows),
-        len(there),
-        *figures,
+        tuner=name,
+        machines=len(rows),
+        median=float(np.median(relative)),
+        p95=float(np.percentile(relative, 95)),
+        kept=float(np.mean([row.kept for row in rows])),
+        near=float(np.mean([row.near for row in rows])),
+        phase_deg=percentile("phase_deg", 50),
+        phase_p5=percentile("phase_deg", 5),
+        gain_db=percentile("gain_db", 50),
+        ms=percentile("ms", 50),
+        ms_p95=percentile("ms", 95),
+        accepted=float(np.mean([row.accepted for row in rows])),
+        drive_seconds=float(np.median([row.drive_seconds for row in rows])),
+        moves=float(np.median([row.moves for row in rows])),
+        aborts=sum(row.aborts for row in rows),
+        violations=sum(row.violations for row in rows),
+        failed=sum(row.failed for row in rows),
     )

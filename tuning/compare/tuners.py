@@ -181,7 +181,7 @@ _OWN = (
     TunerKind("baseline", "the baseline rule, with the inertia measured in two moves", lambda: _baseline),
 )
 _AFTER = (
-    TunerKind("auto", "drive-tune auto: identify, search on twins, try, verify", _auto),
+    TunerKind("auto", "drive-tune auto: identify, design on twins, try, verify, correct", _auto),
     TunerKind("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
     TunerKind("grid", "the baseline rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
     TunerKind("tpe", "20 trials by tree-structured Parzen estimators",

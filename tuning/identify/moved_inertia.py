@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.drives.interface import machine_of
 from mechanics.shaft import way
 
 if TYPE_CHECKING:
     from mechanics.packed import PackedLoad
+    from tuning.target import Target
 
 LEAST_SHARE = 0.2  # of the inertia of an axis that turns alone: what others take off it is taken for no more than that
 
@@ -28,3 +30,13 @@ def moved_inertia(load: PackedLoad) -> NDArray[np.float64]:
     at_axes = np.einsum("ad,cde,be->cab", turning, load.mass_matrix(), turning)
     alone = np.einsum("caa->ca", at_axes)
     return np.asarray(np.maximum(at_axes.sum(axis=2), LEAST_SHARE * alone))
+
+
+def true_inertia(target: Target) -> NDArray[np.float64]:
+    """Return the inertia of emulated axes as a perfect identification finds it: over the true K_t, times the nominal.
+
+    The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
+    """
+    moved = np.concatenate([moved_inertia(group.load) for group in machine_of(target.drives).drives.inside.groups])
+    share = machine_of(target.drives).parameters["motor.psi_m"] / target.motor.psi_m
+    return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))

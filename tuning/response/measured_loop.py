@@ -173,6 +173,20 @@ class MeasuredLoop:
             found.append((180.0 if math.isnan(one.phase_deg) else one.phase_deg, one.gain_db))
         return AtLeast(*(float(value) for value in np.percentile(found, SURE, axis=0, method="lower")))
 
+    def replaced(self, other: MeasuredLoop, where: Mask) -> MeasuredLoop:
+        """Return this with another measurement of some axes, (axes,), in place of theirs."""
+        return replace(
+            self,
+            open_loop=np.where(where, other.open_loop, self.open_loop),
+            coherence=np.where(where, other.coherence, self.coherence),
+            gains=np.where(where[:, None], other.gains, self.gains),
+            fits=tuple(b if m else a for a, b, m in zip(self.fits, other.fits, where, strict=True)),
+            peak_speed=np.where(where, other.peak_speed, self.peak_speed),
+            peak_current=np.where(where, other.peak_current, self.peak_current),
+            drive_time=self.drive_time + other.drive_time,
+            notes=tuple(b if m else a for a, b, m in zip(self.notes, other.notes, where, strict=True)),
+        )
+
     def estimates(self, axis: int = 0) -> dict[str, Estimate]:
         """Return inertia, velocity_filter, loop_delay, anti_resonance, resonance and damping of an axis.
 
@@ -193,15 +207,5 @@ def merged(results: Sequence[MeasuredLoop]) -> MeasuredLoop:
     """Return measurements of different axes as one; each axis was in one of them."""
     whole = results[0]
     for other in results[1:]:
-        mine = np.asarray(np.isfinite(other.open_loop).any(axis=0))
-        whole = replace(
-            whole,
-            open_loop=np.where(mine, other.open_loop, whole.open_loop),
-            coherence=np.where(mine, other.coherence, whole.coherence),
-            fits=tuple(b if m else a for a, b, m in zip(whole.fits, other.fits, mine, strict=True)),
-            peak_speed=np.where(mine, other.peak_speed, whole.peak_speed),
-            peak_current=np.where(mine, other.peak_current, whole.peak_current),
-            drive_time=whole.drive_time + other.drive_time,
-            notes=tuple(a + b for a, b in zip(whole.notes, other.notes, strict=True)),
-        )
+        whole = whole.replaced(other, np.asarray(np.isfinite(other.open_loop).any(axis=0)))
     return whole

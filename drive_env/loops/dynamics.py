@@ -1,0 +1,159 @@
+"""Dynamics: the margins that outer loops must keep, by name or as numbers, and how far loops are from breaking them.
+
+The three margins of an open loop are one region around -1 that it must not enter: |L| = 1 within the phase margin,
+real L within the gain margin to either side, and the circle of radius 1/Ms. Its *clearance* is how much larger the
+region could be: 1 where a margin is just kept, 0 at -1, and below 0 where the closed loop is unstable. It changes
+continuously with the gains, which a phase margin does not where a resonance begins to cross over.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.loops.sampled import STILL, closed_loops, open_loops, step_overshoot, window
+from mechanics.untrusted import read_toml
+
+if TYPE_CHECKING:
+    from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+DEFAULT = "standard"
+# What is demanded of a machine that is not as it was tuned (inertia x 0.5 and x 2, stiffness x 0.8, velocity P x 1.5
+# and x 0.67): a region smaller by this factor. Of 45 degrees, 8 dB and Ms 2 it leaves 18 degrees, 3.2 dB and Ms 5.
+OFF_NOMINAL = 0.4
+LOWEST, HIGHEST, POINTS = (
+    1.0,
+    0.49,
+    240,
+)  # frequencies looked at: from [Hz], up to of the velocity loop's rate, how many
+NEAR = np.linspace(-3.0, 3.0, 9)  # around a resonance of the closed loops, in its half width
+UNSTABLE = 100.0  # 1/s: a motion that grows so fast has a clearance of -1
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What loops must keep.
+
+    Attributes:
+        name: "soft", "standard", "stiff", or the numbers.
+        phase_deg: Phase margin [degrees].
+        gain_db: Gain margin, up and down [dB].
+        ms: Greatest sensitivity |1 / (1 + L)|.
+        overshoot: Of a step of the set-point in csp, over the step.
+    """
+
+    name: str
+    phase_deg: float
+    gain_db: float
+    ms: float
+    overshoot: float
+
+    def clearance(self, open_loop: Complex) -> Floats:
+        """Return how much larger the region around -1 could be, of stable loops.
+
+        Args:
+            open_loop: L at increasing frequencies, near enough to each other to see every resonance, (..., n).
+        """
+        L = open_loop
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain = 20.0 / math.log(10.0) * np.log(np.abs(L)) / self.gain_db
+            phase = np.degrees(np.angle(-L)) / self.phase_deg
+        # Between the ends of both margins the circle lies farther out, but for slivers along |L| = 1 and the real axis:
+        # this closes the region.
+        corner = (np.sqrt(np.abs(phase)) + np.sqrt(np.abs(gain))) ** 2
+        least = np.minimum(corner, self.ms * np.abs(1.0 + L)).min(axis=-1)
+        turned = np.abs(np.diff(phase)) < 180.0 / self.phase_deg  # else it wraps at 0 degrees
+        for value, other, where in ((gain, phase, True), (phase, gain, turned)):
+            first, second = value[..., :-1], value[..., 1:]
+            crosses = (first * second <= 0.0) & (first != second) & where
+            share = first / np.where(crosses, first - second, 1.0)
+            # The other one there; a phase that wraps within the step is nearly 180 degrees.
+            there = np.abs(other[..., :-1] + share * np.diff(other))
+            there = np.where(crosses & (turned | (value is phase)), there, np.inf)
+            least = np.minimum(least, there.min(axis=-1))
+        return np.asarray(least)
+
+    def slack(self, nominal: Floats, variants: Floats, overshoot: Floats) -> Floats:
+        """Return how far machines are from breaking a constraint, relative: 0 where one is just kept, (machines,).
+
+        Args:
+            nominal: Clearance of the loops as they are, (machines,).
+            variants: With inertia, stiffness and velocity P as they may become, (machines, variants).
+            overshoot: Of a csp step, over the step, (machines,).
+        """
+        # Just before a machine becomes unstable its step overshoots by nearly all of it.
+        least = np.minimum(nominal - 1.0, 1.0 - np.minimum(overshoot, 1.0) / self.overshoot)
+        return np.asarray(np.minimum(least, (variants / OFF_NOMINAL - 1.0).min(axis=-1, initial=np.inf)))
+
+
+@cache
+def known_dynamics() -> dict[str, Dynamics]:
+    """Return the dynamics by name, in the order of their table."""
+    table = read_toml(Path(__file__).with_suffix(".toml"))
+    return {name: Dynamics(name, **{key: float(value) for key, value in row.items()}) for name, row in table.items()}
+
+
+def find_dynamics(text: str | Dynamics) -> Dynamics:
+    """Return dynamics by name, or by numbers: "45/8/2.0" is a phase margin in degrees, a gain margin in dB and Ms.
+
+    What a csp step may overshoot follows Ms then, along the named ones.
+
+    Raises:
+        ValueError: For another name, or numbers that no loop can keep.
+    """
+    if isinstance(text, Dynamics):
+        return text
+    known = known_dynamics()
+    if text in known:
+        return known[text]
+    asked = f"dynamics {text!r}: give {', '.join(known)}, or phase margin/gain margin/Ms as 45/8/2.0"
+    try:
+        phase, gain, ms = (float(part) for part in text.split("/"))
+    except ValueError:
+        raise ValueError(asked) from None
+    if not (0.0 < phase < 90.0 and 0.0 < gain < 40.0 and 1.0 < ms < 10.0):
+        raise ValueError(f"{asked}; a phase margin lies between 0 and 90 degrees, a gain margin between 0 and 40 dB, "
+                         "and Ms between 1 and 10")  # fmt: skip
+    rows = sorted(known.values(), key=lambda one: one.ms)
+    overshoot = float(np.interp(ms, [one.ms for one in rows], [one.overshoot for one in rows]))
+    return Dynamics(text, phase, gain, ms, overshoot)
+
+
+def loop_clearance(
+    dynamics: Dynamics, rates: LoopRates, machines: LinearMachines, gains: CascadeGains
+) -> tuple[Floats, Floats]:
+    """Return the clearance of machines' outer loops, the least of all, and how far csp steps overshoot.
+
+    Args:
+        dynamics: What they must keep.
+        rates: Of the drive.
+        machines: The machines.
+        gains: Theirs.
+
+    Returns:
+        Clearance, -1 to 0 where a machine is unstable, and the largest overshoot over the step; (machines,) each.
+    """
+    one = window(rates, machines, gains)
+    closed = closed_loops(rates, machines, gains, one)
+    poles = np.linalg.eigvals(closed.A)
+    growth = np.log(np.maximum(np.abs(poles).max(axis=-1), 1e-300))
+    highest = HIGHEST * rates.velocity_rate
+    base = np.broadcast_to(np.geomspace(LOWEST, highest, POINTS), (len(poles), POINTS))
+    turn = np.abs(np.angle(poles)) * rates.velocity_rate / (2.0 * math.pi)
+    width = np.abs(np.log(np.maximum(np.abs(poles), 1e-3))) * rates.velocity_rate / (2.0 * math.pi)
+    near = (turn[..., None] + width[..., None] * NEAR).reshape(len(poles), -1)
+    f = np.sort(np.concatenate([base, np.clip(near, LOWEST, highest)], axis=1), axis=1)
+    loops = open_loops(rates, machines, gains, f, one)
+    least = np.minimum(dynamics.clearance(loops.velocity), dynamics.clearance(loops.position)).min(axis=-1)
+    unstable = np.clip(-growth * rates.velocity_rate / UNSTABLE, -1.0, 0.0)
+    found = np.where(growth > STILL, unstable, least)
+    return np.nan_to_num(found, nan=-1.0), step_overshoot(rates, closed).max(axis=-1)

@@ -1,0 +1,303 @@
+"""The drive corrects the design: what falls short gets other gains, twice at most, never the same ones again."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from auto_stages import basis, recorded
+
+from drive_env.devices import find_device
+from drive_env.gains import cascade_columns, rule_gains, write_gains
+from drive_env.loops.dynamics import find_dynamics
+from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, step_overshoot, window
+from drive_env.loops.true_plant import true_machines, true_plant
+from drive_env.safety.envelope import SafetyError
+from tuning.auto import correction
+from tuning.auto.bench import Journal
+from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocity_p, _short, correct
+from tuning.auto.identified import calm_gains
+from tuning.auto.proving import RESTLESS, Proof, ProvingGround
+from tuning.auto.stages import TriedGains
+from tuning.target import emulated
+
+DEVICE, STANDARD = find_device("tmcm1636"), find_dynamics("standard")
+VELOCITY_P, POSITION_P = cascade_columns(DEVICE)[2], cascade_columns(DEVICE)[4]
+FIRST = [4000, 1500, 1000, 1000, 800]
+
+
+def gains_of(velocity_p):
+    return [*FIRST[:2], velocity_p, *FIRST[3:]]
+
+
+class Ground:
+    """Drives on which gains pass their trial unless `fails` says otherwise."""
+
+    def __init__(self, fails):
+        self.fails, self.tried = fails, []
+
+    def run(self, gains, where):
+        self.tried.append(gains[:, VELOCITY_P].tolist())
+        n = len(gains)
+        reason = tuple("it shook" if self.fails(p) else "" for p in gains[:, VELOCITY_P])
+        none = np.zeros(n)
+        return Proof(np.ones(n), none > 0, none > 0, reason, none, none, none)
+
+
+def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=None, overshoot=None, axes=1,
+              seconds=99, measured=True, time_waits=True):  # fmt: skip
+    """Return what correction leaves of gains with a velocity P of 1000, the drives, and what was verified.
+
+    Args:
+        monkeypatch: The fixture.
+        wanted: Velocity P that the designs after the first one have, (designs, axes).
+        slack, failed: What is measured, by velocity P.
+        overshoot: Of the step, by the gains.
+        fails: Whether a trial fails, likewise.
+        axes: Of one machine.
+        seconds: Drive time that is left.
+        measured: Whether there is a frequency response.
+        time_waits: Whether twins may be asked meanwhile.
+    """
+    designs, verified = list(wanted), []
+
+    def design_axes(bench, basis, where, say=None, recorded=None, dynamics=None, most=None):
+        assert recorded is not None and time_waits
+        bench.most.append(most.tolist())
+        gains = np.array([gains_of(p) for p in np.broadcast_to(designs.pop(0), axes)])
+        return gains, np.ones(axes), np.ones(axes)
+
+    def verify(bench, recorded, where):
+        verified.append(recorded.gains[:, VELOCITY_P].tolist())
+        texts = [failed(p) if failed else "" for p in recorded.gains[:, VELOCITY_P]]
+        swing = 2.0 * RESTLESS * np.array([bool(text) for text in texts])
+        return vary(recorded, failed=tuple(texts), swing=swing)
+
+    def measure(bench, basis, recorded, where):
+        return vary(recorded, slack=np.array([slack(p) if slack else 0.5 for p in recorded.gains[:, VELOCITY_P]]))
+
+    def step(bench, recorded, where):
+        every = [overshoot(row) if overshoot else 0.1 for row in recorded.gains]
+        return vary(recorded, overshoot=np.array(every))
+
+    monkeypatch.setattr(correction, "design_axes", design_axes)
+    monkeypatch.setattr(correction, "show", verify)
+    monkeypatch.setattr(correction, "step", step)
+    monkeypatch.setattr(correction, "measure", measure)
+    monkeypatch.setattr(correction, "load", lambda bench, basis, recorded, target, where: recorded)
+    axis = SimpleNamespace(slack=lambda dynamics, gains: np.array([slack(p) for p in gains[:, VELOCITY_P]]))
+    monkeypatch.setattr(correction, "measured_axis", lambda *given: axis if measured else None)
+    bench = bench_of(axes, Ground(fails), seconds, time_waits)
+    tried = TriedGains(np.array([FIRST] * axes), np.ones(axes), ("by a move",) * axes, np.ones(axes))
+    found = correct(bench, basis(tried.gains), tried, bench.target, lambda what, share: None)
+    return found, bench, verified
+
+
+def vary(recorded, **known):
+    return type(recorded)(**(vars(recorded) | known))
+
+
+class Bench(SimpleNamespace):
+    """What `correct` needs of a bench, of one machine."""
+
+    @property
+    def going(self):
+        return self.whole_machines(np.array([not journal.reason for journal in self.journals]))
+
+    def whole_machines(self, where):
+        return np.full(len(where), np.all(where))
+
+    def affordable(self, seconds):
+        return np.full(len(self.journals), seconds <= self.left)
+
+    def note(self, where, text):
+        for k in np.flatnonzero(where):
+            self.journals[k].note(text)
+
+    def spending(self, where):
+        from contextlib import nullcontext
+
+        return nullcontext()
+
+
+def bench_of(axes=1, ground=None, seconds=99, time_waits=True):
+    target = SimpleNamespace(
+        device=DEVICE, num_axes=axes, axes_per_machine=axes, drives=SimpleNamespace(time_waits=time_waits),
+        together=lambda where: where,
+    )  # fmt: skip
+    return Bench(
+        target=target, journals=[Journal() for _ in range(axes)], ground=ground, dynamics=STANDARD, response_time=2.3,
+        left=seconds, most=[],
+    )  # fmt: skip
+
+
+# --- what is corrected ------------------------------------------------------------------------------------------------
+def test_gains_that_keep_everything_stay_and_are_verified_once(monkeypatch):
+    found, bench, verified = corrected(monkeypatch, [800], slack=lambda p: 0.1)
+    assert found.gains.tolist() == [FIRST] and verified == [[1000]] and not bench.ground.tried
+    assert not bench.journals[0].notes and not bench.journals[0].reason
+
+
+def test_loops_that_break_the_constraints_as_measured_get_other_gains(monkeypatch):
+    found, bench, verified = corrected(monkeypatch, [800, 800], slack=lambda p: 0.9 - p / 1000.0)
+    assert found.gains[0, VELOCITY_P] == 800 and verified == [[1000], [800]] and bench.ground.tried == [[800]]
+    (note,) = bench.journals[0].notes
+    assert note == (
+        "gains designed again from what was measured: its measured loops keep 90 % of the margins asked for"
+    )
+    assert found.slack == pytest.approx([0.1])
+
+
+@pytest.mark.parametrize(("what", "text"), [
+    ({"failed": lambda p: "it does not come to rest" if p > 900 else ""}, "it does not come to rest"),
+    ({"overshoot": lambda row: 0.1 + 0.2 * (row[VELOCITY_P] > 900)},
+     "a step of its set-point in csp overshoots by 30 %"),
+])  # fmt: skip
+def test_what_a_move_or_a_step_shows_is_corrected_too(what, text, monkeypatch):
+    found, bench, _ = corrected(monkeypatch, [800, 800], slack=lambda p: 0.5, **what)
+    assert found.gains[0, VELOCITY_P] == 800 and not bench.journals[0].reason
+    assert bench.journals[0].notes == [f"gains designed again from what was measured: {text}"]
+
+
+def test_there_are_two_corrections_at_most(monkeypatch):
+    found, bench, verified = corrected(monkeypatch, [900, 800, 700, 600], slack=lambda p: -p / 2000.0)
+    assert verified == [[1000], [900], [800]] and len(bench.ground.tried) == CORRECTIONS == 2
+    assert found.gains[0, VELOCITY_P] == 800, "the last ones were the best"
+
+
+def test_the_same_gains_are_not_tried_twice(monkeypatch):
+    found, bench, verified = corrected(monkeypatch, [900, 1000, 900], slack=lambda p: -p / 2000.0)
+    assert bench.ground.tried == [[900]] and verified == [[1000], [900]]
+    assert found.gains[0, VELOCITY_P] == 900
+
+
+def test_corrected_gains_that_are_worse_on_the_drive_are_not_kept(monkeypatch):
+    """The twins were wrong: less velocity P is farther from what is asked for."""
+    found, bench, verified = corrected(monkeypatch, [900, 800], slack=lambda p: p / 1000.0 - 1.1)
+    assert verified == [[1000], [900], [800]] and found.gains.tolist() == [FIRST]
+    assert found.slack == pytest.approx([-0.1]) and not bench.journals[0].reason, "the verdict on it is the margins'"
+
+
+def test_corrected_gains_that_fail_their_trial_leave_those_before(monkeypatch):
+    found, bench, verified = corrected(monkeypatch, [800, 700], slack=lambda p: -0.1, fails=lambda p: p < 1000)
+    assert found.gains.tolist() == [FIRST] and verified == [[1000]]
+    assert bench.journals[0].notes == ["corrected gains failed their trial: it shook"]
+
+
+def test_a_correction_that_does_not_rest_bounds_the_next_one_although_it_is_not_kept(monkeypatch):
+    """Else the same design would be made again, and the axis stay with what falls short."""
+    found, bench, verified = corrected(
+        monkeypatch,
+        [1200, 500],
+        slack=lambda p: -0.4 if p == 1000 else 0.2,
+        failed=lambda p: "it swung" if p > 1100 else "",
+    )
+    assert verified == [[1000], [1200], [500]] and found.gains[0, VELOCITY_P] == 500
+    assert bench.most == [[np.inf], [600.0]]
+
+
+def test_an_axis_that_no_correction_helps_is_rejected_with_its_reason(monkeypatch):
+    _, bench, verified = corrected(monkeypatch, [900, 800], failed=lambda p: "it does not come to rest: it swung")
+    assert bench.journals[0].reason == "it does not come to rest: it swung"
+    assert len(verified) == 1 + CORRECTIONS
+
+
+def test_without_drive_time_nothing_is_corrected_and_what_fails_is_rejected(monkeypatch):
+    _, bench, verified = corrected(monkeypatch, [900, 800], failed=lambda p: "it swung", seconds=1.0)
+    assert verified == [[1000]] and bench.journals[0].reason == "it swung"
+
+
+def test_an_envelope_that_stops_the_trial_of_corrected_gains_leaves_those_before(monkeypatch):
+    def run(self, gains, where):
+        raise SafetyError("axis 0 oscillates")
+
+    monkeypatch.setattr(Ground, "run", run)
+    found, bench, _ = corrected(monkeypatch, [800], slack=lambda p: -0.1)
+    assert found.gains.tolist() == [FIRST]
+    assert bench.journals[0].notes == ["the envelope stopped the trial of corrected gains: axis 0 oscillates"]
+
+
+def test_axes_of_one_machine_are_corrected_and_kept_together(monkeypatch):
+    """The second one needs other gains; the first goes along, and the machine is judged by its worst axis."""
+    short = {1000: -0.1, 950: 0.2, 800: 0.3}
+    found, _, verified = corrected(monkeypatch, [(950, 800)] * 2, axes=2, slack=lambda p: short[p])
+    assert verified == [[1000, 1000], [950, 800]] and found.gains[:, VELOCITY_P].tolist() == [950, 800]
+    found, _, verified = corrected(monkeypatch, [(1000, 800)] * 2, axes=2, slack=lambda p: short[p])
+    assert verified == [[1000, 1000], [1000, 800]] and found.gains.tolist() == [FIRST] * 2, "no better by its worst"
+    fails_one = corrected(monkeypatch, [(900, 800)] * 2, axes=2, slack=lambda p: -0.1, fails=lambda p: p == 800)
+    assert fails_one[0].gains.tolist() == [FIRST] * 2, "of a machine all of its axes, or none"
+
+
+# --- by what ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("known", "text"), [
+    ({}, ""),
+    ({"failed": ("it swung",)}, "it swung"),
+    ({"slack": np.array([-0.25])}, "its measured loops keep 75 % of the margins asked for"),
+    ({"slack": np.array([-3.0])}, "its measured loops keep 0 % of the margins asked for"),
+    ({"slack": np.array([np.nan])}, ""),  # not measured
+    ({"overshoot": np.array([0.21])}, "a step of its set-point in csp overshoots by 21 %"),
+    ({"overshoot": np.array([0.19])}, ""),
+])  # fmt: skip
+def test_what_gains_fall_short_of_is_told_in_words(known, text):
+    assert _short(bench_of(), recorded([FIRST], **known), 0) == text
+
+
+@pytest.mark.parametrize(("swing", "share"), [(0.0, np.inf), (RESTLESS, np.inf), (1.05 * RESTLESS, 0.85),
+                                              (1.5 * RESTLESS, 0.6), (9.0 * RESTLESS, 0.5)])  # fmt: skip
+def test_what_does_not_rest_gets_less_velocity_p_by_as_much_as_it_swings(swing, share):
+    assert _most_velocity_p(DEVICE, recorded([FIRST], swing=np.array([swing])), 0) == pytest.approx(1000.0 * share)
+
+
+def test_a_step_that_overshoots_without_a_measured_loop_lowers_position_p(monkeypatch):
+    """Nothing says how far the twin is from the axis: its own design is not believed."""
+    far = {"overshoot": lambda row: 0.3 if row[POSITION_P] > 500 else 0.1, "measured": False}
+    found, bench, _ = corrected(monkeypatch, [800] * 4, **far)
+    assert bench.ground.tried[0] == [1000], "velocity P stays"
+    assert found.gains[0, POSITION_P] == FIRST[POSITION_P] // 2
+
+
+def test_where_time_does_not_wait_gains_are_lowered_as_far_as_the_measured_loops_ask_and_no_twin_is_run(monkeypatch):
+    found, _, verified = corrected(monkeypatch, [], slack=lambda p: 0.75 - p / 1000.0, time_waits=False)
+    assert found.gains[0, VELOCITY_P] == 700 and verified == [[1000], [700]]
+
+
+def test_lowered_gains_are_the_liveliest_that_keep_the_dynamics_by_the_measured_loop(monkeypatch):
+    axis = SimpleNamespace(slack=lambda dynamics, gains: 0.5 - gains[:, POSITION_P] / 800.0)
+    monkeypatch.setattr(correction, "measured_axis", lambda *given: axis)
+    found = _lowered(bench_of(), basis([FIRST]), recorded([FIRST]), 0, np.inf)
+    assert found.tolist() == [*FIRST[:4], 320], "0.4 of position P, and all of the rest"
+    found = _lowered(bench_of(), basis([FIRST]), recorded([FIRST]), 0, 500.0)
+    assert found[VELOCITY_P] == 400 and found[POSITION_P] == 320, "0.5 of velocity P at most: 0.4 is the next below"
+    assert LOWERED.min() > 0.0
+
+
+# --- a step in csp ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("position", [0.5, 1.0, 2.0, 3.0])
+def test_a_step_on_the_drive_overshoots_as_the_linear_machine_does(position):
+    everyone = np.ones(1, bool)
+    with emulated(load="inertia", num_threads=1) as target:
+        plant = true_plant(target.drives)
+        gains = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)
+        gains[0, POSITION_P] = round(position * gains[0, POSITION_P])
+        safe = np.stack([calm_gains(target, plant)])
+        ground = ProvingGround(target, [plant], (target.low, target.high), safe, safe)
+        found = ground.step(gains, everyone)
+        machines, rates = true_machines(target.drives), LoopRates.of(DEVICE)
+        one = CascadeGains.of(DEVICE, gains[None])
+        expected = step_overshoot(rates, closed_loops(rates, machines, one, window(rates, machines, one)))[0]
+        assert found == pytest.approx(expected, abs=0.04)
+        assert target.drives.read(0x6061).tolist() == [1], "and it is back in pp"
+
+
+def test_a_step_is_made_by_axes_that_are_chosen_and_ends_where_it_began():
+    with emulated(load="inertia", num_machines=2, num_threads=1) as target:
+        plant = true_plant(target.drives)
+        rule = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)
+        safe = np.repeat(rule, 2, axis=0)
+        ground = ProvingGround(target, [plant] * 2, (target.low, target.high), safe, safe)
+        write_gains(target.drives, safe)
+        began = target.drives.read(0x6064)
+        found = ground.step(safe, np.array([True, False]))
+        assert np.isfinite(found).tolist() == [True, False]
+        assert np.abs(target.drives.read(0x6064) - began).max() <= 3 * 65536 // target.motor.encoder_counts

@@ -1,0 +1,145 @@
+"""Design of gains on digital twins: the same whenever it is made, and the best of what keeps the constraints."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drive_env.devices import find_device
+from drive_env.gains import cascade_columns
+from drive_env.loops.true_plant import true_plant
+from drive_env.motors import find_motor
+from tuning.auto import design as module
+from tuning.auto.design import _of_each, design
+from tuning.auto.twin import WORLDS, FrictionGuess, Known, Spread, Twins, least_gains
+from tuning.target import emulated
+
+DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
+TORQUE_P, _, VELOCITY_P, VELOCITY_I, POSITION_P = cascade_columns(DEVICE)
+
+
+def known(load):
+    """Return an axis as a good identification has it, and 2058h."""
+    with emulated(load=load, num_threads=1) as target:
+        plant = true_plant(target.drives)
+    return Known(plant, FrictionGuess(0.1, 1e-4), math.inf, Spread(0.03, 0.03, 0.03, 0.1)), np.array([65536.0])
+
+
+def both_twins(load):
+    """Return twins for the many and for the few, and the plant."""
+    one, scaler = known(load)
+    coarse = Twins(DEVICE, MOTOR, [one], scaler, 32, worlds=WORLDS[:1], num_threads=1)
+    return coarse, Twins(DEVICE, MOTOR, [one], scaler, 32, repeats=2, num_threads=1), one.plant
+
+
+@pytest.fixture(scope="module", params=["inertia", "belt"])
+def designed(request):
+    """Twins of a load, its plant, and the design on them."""
+    coarse, fine, plant = both_twins(request.param)
+    with coarse, fine:
+        yield coarse, fine, plant, design(coarse, fine, [plant])
+
+
+@pytest.mark.slow
+def test_a_design_is_the_same_whenever_it_is_made(designed):
+    coarse, fine, plant, found = designed
+    again = design(coarse, fine, [plant])
+    np.testing.assert_array_equal(found.gains, again.gains)
+    np.testing.assert_array_equal(found.cost, again.cost)
+
+
+@pytest.mark.slow
+def test_it_keeps_the_constraints_on_its_twin_and_says_what_it_costs_there(designed):
+    coarse, fine, _, found = designed
+    assert found.slack[0, 0] > 0.0 and coarse.slack(found.gains)[0, 0] == found.slack[0, 0]
+    assert np.all(np.diff(found.cost[0]) >= 0.0)
+    np.testing.assert_allclose(fine.score(found.gains), found.cost, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_no_random_search_finds_much_better_gains(designed):
+    """300 sets all over the ranges that an engineer would look at, on the same twins."""
+    _, fine, _, found = designed
+    rng, best = np.random.default_rng(7), found.gains[0, 0]
+    factors = np.exp(rng.uniform(np.log(0.3), np.log(3.0), (300, DEVICE.gains.count)))
+    rows = np.maximum(np.rint(best * factors), least_gains(DEVICE)).astype(np.int64)
+    rows[:, TORQUE_P] = np.minimum(rows[:, TORQUE_P], found.gains[0, :, TORQUE_P].max())
+    searched = fine.score(rows[None])[0]
+    assert found.cost[0, 0] < 1.3 * searched.min()
+    assert found.cost[0, 0] < 0.3 * np.median(searched), "most of them keep no constraints"
+
+
+@pytest.mark.slow
+def test_velocity_p_stays_below_what_the_drive_has_shown_to_be_too_much(designed):
+    coarse, fine, plant, found = designed
+    most = np.floor(0.6 * found.gains[:, 0, VELOCITY_P])
+    less = design(coarse, fine, [plant], most_velocity_p=most)
+    assert np.all(less.gains[..., VELOCITY_P] <= most)
+    assert less.slack[0, 0] > 0.0 and less.cost[0, 0] >= 0.99 * found.cost[0, 0]
+
+
+# --- on a judge whose truth is known ----------------------------------------------------------------------------------
+class Judge:
+    """The faster the better, but for a bound of velocity P and of position P over velocity I."""
+
+    device, num_axes = DEVICE, 1
+
+    def __init__(self, most=900.0):
+        self.most, self.asked = most, 0
+
+    def slack(self, gains, *, nominal=False):
+        ratio = gains[..., POSITION_P] / gains[..., VELOCITY_I]
+        return np.minimum(1.0 - gains[..., VELOCITY_P] / self.most, 1.0 - ratio / 0.6)
+
+    def score(self, gains):
+        self.asked += gains.shape[1]
+        worth = 1e6 / (gains[..., VELOCITY_P] * gains[..., VELOCITY_I] * gains[..., POSITION_P]) ** 0.5
+        return np.where(self.slack(gains) > 0.0, worth, 1e3 - self.slack(gains))
+
+
+def test_it_comes_to_the_border_of_the_constraints_and_not_across():
+    plant = known("inertia")[0].plant
+    coarse, fine = Judge(), Judge()
+    found = design(coarse, fine, [plant])
+    assert 0.0 < found.slack[0, 0] < 0.1
+    assert 0.9 * 900 < found.gains[0, 0, VELOCITY_P] < 900
+    assert coarse.asked <= 20 * module.EACH and fine.asked <= module.FINALISTS + len(module.STEPS) * module.PROMISING
+
+
+def test_where_no_gains_keep_the_constraints_the_nearest_are_found_and_that_is_said():
+    found = design(Judge(most=0.5), Judge(most=0.5), [known("inertia")[0].plant])
+    assert found.slack[0, 0] < 0.0
+    assert found.gains[0, 0, VELOCITY_P] == found.gains[0, :, VELOCITY_P].min() < 100
+
+
+def test_of_every_bandwidth_the_most_promising_that_keep_the_constraints_are_looked_at(monkeypatch):
+    monkeypatch.setattr(module, "BANDWIDTHS", np.array([1.0, 2.0]))
+    slack = np.array([[0.1, 0.2, -0.1, 0.3, -0.3, -0.1, -0.2, -0.4]])
+    promise = np.array([[3.0, 2.0, 1.0, 4.0, 1.0, 2.0, 3.0, 4.0]])
+    assert _of_each(slack, promise, 2).tolist() == [[1, 0, 5, 6]], "of the second one those that come nearest"
+
+
+def test_what_say_raises_ends_a_design():
+    def stop(share):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        design(Judge(), Judge(), [known("inertia")[0].plant], stop)
+
+
+def test_the_design_is_made_for_the_worst_of_measurement_and_twin():
+    """What a measured loop refuses is refused, whatever the twin says of it."""
+    from tuning.auto.correction import _Corrected
+
+    twins = Judge()
+    twins.dynamics = None
+    twins.judge = lambda gains: (np.ones(gains.shape[:2]), twins.slack(gains))
+    measured = SimpleNamespace(slack=lambda dynamics, gains: 1.0 - gains[:, VELOCITY_P] / 400.0)
+    both = _Corrected(twins, [measured])
+    rows = np.full((1, 3, DEVICE.gains.count), 100)
+    rows[0, :, POSITION_P], rows[0, :, VELOCITY_P] = 10, (300, 500, 1000)
+    assert both.slack(rows)[0] == pytest.approx([0.25, -0.25, -1.5])
+    assert (both.score(rows)[0] < 30.0).tolist() == [True, False, False]

@@ -1,0 +1,39 @@
+"""A gear with play: a response within the play is no identification of the axis."""
+
+from __future__ import annotations
+
+import pytest
+
+from drive_env.loops.true_plant import true_plant
+from tuning.auto.stages import IdentifiedAxes
+from tuning.identify.quick_identification import identify_briefly
+from tuning.target import emulated
+
+LOOSE = {
+    "motor.R_s": 0.2996, "motor.L_d": 0.0002285, "motor.L_q": 0.0002122, "motor.psi_m": 0.002528,
+    "motor.inertia": 1.914e-05, "motor.cogging_torque": 0.00397, "motor.coulomb": 0.002084, "motor.viscous": 1.953e-05,
+    "stage.adc_noise": 0.03061, "stage.velocity_filter": 313.6, "load.inertia": 0.05085, "load.stiffness": 5411.0,
+    "load.damping": 0.2619, "load.backlash": 0.004, "load.efficiency": 0.8892, "load.coulomb": 0.1326,
+    "load.breakaway": 0.1284, "load.viscous": 0.03574,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_response_within_the_play_of_a_gear_is_no_identification_of_the_axis():
+    """It gives half of the inertia; the two moves, which drive through the play, 0.9.
+
+    Where in its play a gear stands decides whether the shaking leaves it: of these plays one is not left.
+    """
+    doubted = 0
+    for play in (0.004, 0.005, 0.006, 0.007):
+        loose = LOOSE | {"load.backlash": play}
+        with emulated(load="geared_joint", motor="ec_45_flat", parameters=loose, num_threads=1) as target:
+            (found,) = identify_briefly(target)
+            true = true_plant(target.drives).inertia
+        assert found.value("inertia") == pytest.approx(true, rel=0.25), play
+        if found.doubt:
+            doubted += 1
+            assert "it was measured within the play of a gear" in found.doubt
+            assert IdentifiedAxes((found,), (None,)).doubtful == (True,)
+            assert not found.estimates["velocity_filter"].is_known
+    assert doubted

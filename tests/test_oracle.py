@@ -1,0 +1,74 @@
+"""The constrained oracle: it keeps the constraints, nothing near is better, and a row that is stale is noticed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tuning.compare import oracle as module
+from tuning.compare.oracle import KEPT, digest, find_oracles, read_oracles, search_oracle, write_oracles
+from tuning.compare.suite import load_suite
+from tuning.compare.yardstick import Yardstick
+
+MACHINES = {machine.name: machine for machine in load_suite(seed=0)}
+RIGID, ELASTIC = MACHINES["inertia-qbl4208-0"], MACHINES["two_mass-qbl4208-0"]
+
+
+@pytest.mark.parametrize("machine", [RIGID, pytest.param(ELASTIC, marks=pytest.mark.slow)], ids=["rigid", "elastic"])
+def test_nothing_near_the_oracle_keeps_the_constraints_and_is_better(machine):
+    best = search_oracle(machine)
+    rng = np.random.default_rng(5)
+    near = np.exp(rng.normal(0.0, 0.1, (48, *best.gains.shape)))
+    near[..., 1] = 1.0  # torque I follows the winding
+    near[..., 0] = np.minimum(near[..., 0], 1.0)  # and P may not go beyond its phase margin
+    yardstick = Yardstick([machine], None, copies=len(near))
+    scores = yardstick.score(np.rint(best.gains * near).astype(np.int64).reshape(-1, best.gains.shape[1]))
+    yardstick.close()
+    assert best.slack > 0.0
+    assert scores.performance[scores.slack > 0.0].min() > 0.97 * best.performance
+
+
+@pytest.mark.slow
+def test_another_seed_ends_as_well():
+    first, second = (search_oracle(RIGID, seed=seed).performance for seed in (0, 1))
+    assert first == pytest.approx(second, rel=0.03)
+
+
+def test_what_is_kept_are_gains_and_their_figures_are_scored_anew(monkeypatch):
+    monkeypatch.setattr(module, "search_oracle", None)  # which is not needed
+    kept, found = read_oracles()[digest(RIGID)], find_oracles([RIGID])[RIGID.name]
+    assert found.gains.tolist() == kept.gains.tolist()
+    assert found.performance == pytest.approx(kept.performance, rel=1e-3)
+
+
+@pytest.mark.parametrize("stale", ["machine", "performance", "slack"])
+def test_a_row_that_no_longer_holds_is_searched_anew(stale, monkeypatch, tmp_path):
+    true, shares = read_oracles()[digest(RIGID)], []
+    monkeypatch.setattr(module, "search_oracle", lambda machine, num_threads: "searched")
+    machine, row = RIGID, true
+    if stale == "machine":
+        machine = replace(RIGID, supply=RIGID.supply + 1.0)
+    elif stale == "performance":
+        row = true._replace(performance=1.1 * true.performance)
+    else:
+        row = true._replace(gains=true.gains * np.array([1, 1, 1, 1, 3]))
+    file = tmp_path / "oracles.csv"
+    write_oracles(file, [RIGID], {RIGID.name: row})
+    assert find_oracles([machine], progress=shares.append, kept=file) == {machine.name: "searched"}
+    assert shares == [0.0, 1.0]
+
+
+def test_every_axis_is_kept_in_the_file(tmp_path):
+    gains = np.arange(1, 11).reshape(2, 5)
+    write_oracles(tmp_path / "file.csv", [RIGID], {RIGID.name: module.Oracle(gains, 1.5, 0.05)})
+    (found,) = read_oracles(tmp_path / "file.csv").values()
+    assert found.gains.tolist() == gains.tolist() and found[1:] == (1.5, 0.05)
+
+
+def test_the_machines_of_one_axis_that_ship_have_a_row():
+    rows = read_oracles(KEPT)
+    assert [
+        name for name, one in MACHINES.items() if digest(one) not in rows and one.load not in ("gantry", "robot")
+    ] == []

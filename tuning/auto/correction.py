@@ -1,0 +1,305 @@
+"""The drive corrects the design: gains are verified, and designed again from what was measured, at most twice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.roles import Role
+from drive_env.gains import cascade_columns
+from drive_env.loops.dynamics import find_dynamics
+from drive_env.safety.envelope import SafetyError
+from drive_env.trials.score import TRIP, robust_cost
+from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
+from tuning.auto.design import Designed, design
+from tuning.auto.loop_margins import MEASURED, measure, measured_axis
+from tuning.auto.moves import load, show, step
+from tuning.auto.proving import RESTLESS
+from tuning.auto.stages import RecordedGains
+from tuning.auto.twin import WORLDS, Known, Twins, known_of
+from tuning.response.measured_loop import GOOD_MISFIT
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.loops.dynamics import Dynamics
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.measured_margins import MeasuredAxis
+    from tuning.auto.stages import Basis, TriedGains
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CORRECTIONS = 2
+UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
+SETS, RUNS = 32, 2  # of gains at once on the twins, and runs of each on all worlds
+WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
+# Velocity P passes the encoder's noise and counts on to the current: what it is lowered to where an axis does not rest.
+CALMER, LEAST_CALMER, MOST_CALMER = 0.9, 0.5, 0.85
+YIELDING = 0.5  # what position P is lowered to where a step overshoots and no loop was measured
+# Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
+LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
+                    for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
+
+
+def design_axes(
+    bench: AutoBench,
+    basis: Basis,
+    where: Mask,
+    say: Callable[[float], None] = lambda share: None,
+    recorded: RecordedGains | None = None,
+    dynamics: Dynamics | None = None,
+    most: Floats | None = None,
+) -> tuple[Integers, Floats, Floats]:
+    """Return the best gains of axes by their twins, (num_axes, count), and the robust cost of these and of the present.
+
+    Args:
+        bench: The drives.
+        basis: What was identified.
+        where: Axes, (num_axes,); the others have gains of 1.
+        say: Called with the share done.
+        recorded: The present gains, and what was measured with them; nothing by default.
+        dynamics: What the loops must keep; those of the run by default.
+        most: The greatest velocity P with which an axis may rest, raw, (num_axes,); infinite by default.
+    """
+    target, axes = bench.target, np.flatnonzero(where).tolist()
+    gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
+    if not axes:
+        return gains, cost, present
+    known = [_known(bench, basis, recorded, k) for k in axes]
+    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
+    measured = [None if recorded is None else measured_axis(bench, basis, recorded, k) for k in axes]
+    most = np.full(target.num_axes, np.inf) if most is None else most
+
+    def twins(**more: object) -> _Corrected:
+        made = Twins(target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics, **more)  # type: ignore[arg-type]
+        return _Corrected(made, measured)
+
+    coarse, fine = twins(worlds=WORLDS[:1]), twins(repeats=RUNS)
+    try:
+        found: Designed = design(coarse, fine, [one.plant for one in known], say, most[axes])
+        if recorded is not None:
+            present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
+    finally:
+        coarse.close()
+        fine.close()
+    gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
+    return gains, cost, present
+
+
+class _Corrected(NamedTuple):
+    """Twins, and the loops as they were measured, where they were: what keeps the constraints keeps both."""
+
+    twins: Twins
+    measured: Sequence[MeasuredAxis | None]
+
+    @property
+    def device(self) -> Device:
+        """The drive."""
+        return self.twins.device
+
+    @property
+    def num_axes(self) -> int:
+        """How many axes there are."""
+        return self.twins.num_axes
+
+    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
+        """Return how far gains keep the constraints of the loops, (n, sets)."""
+        return np.minimum(self.twins.slack(gains, nominal=nominal), self._measured_slack(gains))
+
+    def score(self, gains: Integers) -> Floats:
+        """Return the robust cost of gains, (n, sets)."""
+        performance, slack = self.twins.judge(gains)
+        return robust_cost(performance, np.minimum(slack, self._measured_slack(gains)))
+
+    def _measured_slack(self, gains: Integers) -> Floats:
+        slack = np.full(gains.shape[:2], np.inf)
+        for k, one in enumerate(self.measured):
+            if one is not None:
+                slack[k] = one.slack(self.twins.dynamics, gains[k])
+        return slack
+
+    def close(self) -> None:
+        """Close the emulated machines."""
+        self.twins.close()
+
+
+def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
+    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured."""
+    plant, found = basis.identified.known(k)
+    reach = float(basis.trial_reach(bench)[k])
+    if np.isfinite(found.together):
+        plant = replace(plant, inertia=found.together)  # what all axes move, each its share
+    if recorded is None or recorded.response is None or recorded.unseen[k]:
+        return known_of(plant, found, reach)
+    fit = recorded.response.fits[k]
+    if fit is None or fit.reason or fit.misfit > GOOD_MISFIT:
+        return known_of(plant, found, reach)
+    fitted = replace(fit.plant, R=plant.R, L=plant.L, supply=plant.supply)
+    known = {name: one for name, one in fit.estimates.items() if one.is_known and name in found.estimates}
+    return known_of(fitted, replace(found, estimates={**found.estimates, **known}), reach)
+
+
+def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:
+    """Return the greatest velocity P of an axis, less than the present where it does not rest; else infinite."""
+    if recorded is None or recorded.swing[k] <= RESTLESS:
+        return np.inf
+    factor = np.clip(CALMER * RESTLESS / recorded.swing[k], LEAST_CALMER, MOST_CALMER)
+    return float(max(np.floor(factor * recorded.gains[k, cascade_columns(device)[2]]), 1.0))
+
+
+def correct(
+    bench: AutoBench, basis: Basis, tried: TriedGains, target: Target, say: Callable[[str, float], None]
+) -> RecordedGains:
+    """Verify gains by a move, a frequency response and a load step, and correct the design by what these show.
+
+    Args:
+        bench: The drives.
+        basis: What was identified.
+        tried: The gains.
+        target: The drives, whose time is not counted.
+        say: Called with the present step and the share done.
+
+    Returns:
+        The best of what was verified; an axis whose gains cannot stay is out of the run.
+    """
+    recorded, changed = RecordedGains.of(tried), bench.going
+    best: RecordedGains | None = None
+    tried_before: list[Integers] = []
+    most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest, kept or not
+    for number in range(CORRECTIONS + 1):
+        say("verifying gains on the drives", 0.72 + 0.08 * number)
+        recorded = step(bench, show(bench, recorded, changed), changed)
+        recorded = measure(bench, basis, recorded, changed)
+        recorded = load(bench, basis, recorded, target, changed)
+        shown = [_most_velocity_p(bench.target.device, recorded, k) for k in range(len(most))]
+        most = np.where(changed, np.minimum(most, shown), most)
+        if best is not None:
+            # What is no better than what it was to correct goes.
+            recorded = recorded.mixed(
+                best, changed & bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
+            )
+        best = recorded
+        if number == CORRECTIONS:
+            break
+        say("correcting the design", 0.76 + 0.08 * number)
+        gains, why = _corrected(bench, basis, recorded, most)
+        tried_before.append(recorded.gains)
+        for k in map(int, np.flatnonzero(bench.going)):
+            if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
+                gains[k] = recorded.gains[k]
+        changed = bench.whole_machines((gains != recorded.gains).any(axis=1) | _others(bench, gains, recorded))
+        changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
+        if not changed.any():
+            break
+        tried_before.append(gains.copy())
+        recorded, changed = _try(bench, recorded, gains, changed, why)
+        if not changed.any():
+            break
+    final = recorded if best is None else best
+    for k in map(int, np.flatnonzero(bench.going)):
+        if final.failed[k]:
+            bench.journals[k].stop(final.failed[k])
+    return final
+
+
+def _others(bench: AutoBench, gains: Integers, recorded: RecordedGains) -> Mask:
+    """Return all axes of machines some of whose axes get other gains, (num_axes,)."""
+    per_machine = bench.target.axes_per_machine
+    differs = (gains != recorded.gains).any(axis=1).reshape(-1, per_machine).any(axis=1)
+    return np.asarray(np.repeat(differs, per_machine)) & bench.going
+
+
+def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
+    """Return what gains are worth as they were verified, that of a machine's worst axis, (num_axes,)."""
+    failed = np.array([bool(why) for why in recorded.failed])
+    # What was not measured is worth less than what is known to keep the dynamics.
+    slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
+    slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot, 1.0) / bench.dynamics.overshoot)
+    cost = np.where(failed, 2.0 * TRIP + recorded.swing, robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack))
+    per_machine = bench.target.axes_per_machine
+    return np.asarray(np.repeat(cost.reshape(-1, per_machine).max(axis=1), per_machine))
+
+
+def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Floats) -> tuple[Integers, list[str]]:
+    """Return corrected gains, (num_axes, count), and why; the present ones of axes that need no correction."""
+    known, why = bench.target.device.gains, [""] * bench.target.num_axes
+    gains = recorded.gains.copy()
+    if not bench.target.drives.time_waits:
+        # Twins take longer than an enabled axis may be left alone.
+        for k in map(int, np.flatnonzero(bench.going)):
+            why[k] = _short(bench, recorded, k)
+            if why[k]:
+                gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
+        return gains, why
+    blind = bench.going & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
+    designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
+    if blind.any():
+        soft, *more = design_axes(bench, basis, blind, recorded=recorded, dynamics=find_dynamics("soft"), most=most)
+        designed = np.where(blind[:, None], soft, designed)
+        cost, present = (np.where(blind, one, all_) for one, all_ in zip(more, (cost, present), strict=True))
+    for k in map(int, np.flatnonzero(bench.going)):
+        why[k] = _short(bench, recorded, k) or (UNSEEN if blind[k] else "")
+        if not why[k] and cost[k] < WORTH * present[k]:
+            why[k] = f"its twins, as measured, have a robust cost of {cost[k]:.2f} for {present[k]:.2f}"
+        if blind[k] and recorded.overshoot[k] > bench.dynamics.overshoot:
+            # Nothing but the step tells how far the twin is from the axis: position P gives way first.
+            gains[k] = known.scaled(gains[k], YIELDING, [cascade_columns(bench.target.device)[4]])
+        elif why[k]:
+            gains[k] = designed[k]
+    return known.clipped(gains), why
+
+
+def _short(bench: AutoBench, recorded: RecordedGains, k: int) -> str:
+    """Return what an axis's gains fall short of, "" if of nothing."""
+    if recorded.failed[k]:
+        return recorded.failed[k]
+    if recorded.slack[k] < 0.0:
+        return f"its measured loops keep {100.0 * (1.0 + max(recorded.slack[k], -1.0)):.0f} % of the margins asked for"
+    if recorded.overshoot[k] > bench.dynamics.overshoot:
+        return f"a step of its set-point in csp overshoots by {100.0 * recorded.overshoot[k]:.0f} %"
+    return ""
+
+
+def _lowered(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, most: float) -> Integers:
+    """Return lowered outer gains of an axis: the liveliest whose measured loops keep the dynamics."""
+    device, measured = bench.target.device, measured_axis(bench, basis, recorded, k)
+    _, _, velocity_p, velocity_i, position_p = cascade_columns(device)
+    rows = np.tile(recorded.gains[k].astype(float), (len(LOWERED), 1))
+    rows[:, [velocity_p, velocity_i, position_p]] *= LOWERED
+    every = np.maximum(np.rint(rows), 1).astype(np.int64)
+    every = every[every[:, velocity_p] <= most]
+    if not len(every):
+        every = np.maximum(np.rint(rows[-1:]), 1).astype(np.int64)
+    slack = np.zeros(len(every)) if measured is None else measured.slack(bench.dynamics, every)
+    lively = (every[:, velocity_p] * every[:, velocity_i]) ** 0.4 * every[:, position_p] ** 0.8
+    return np.asarray(every[int(np.where(slack > 0.0, lively, slack - 1e9).argmax())])
+
+
+def _try(
+    bench: AutoBench, recorded: RecordedGains, gains: Integers, where: Mask, why: Sequence[str]
+) -> tuple[RecordedGains, Mask]:
+    """Try corrected gains; return what is known with those that passed, and which axes have them."""
+    assert bench.ground is not None, "trying makes it"
+    try:
+        with bench.spending(bench.target.together(where)):
+            proof = bench.ground.run(gains, where)
+    except SafetyError as error:
+        bench.note(where, f"the envelope stopped the trial of corrected gains: {error}")
+        return recorded, np.zeros_like(where)
+    for k in map(int, np.flatnonzero(where & ~proof.passed)):
+        bench.journals[k].note(f"corrected gains failed their trial: {proof.reason[k]}")
+    passed = bench.whole_machines(proof.passed & where)
+    for k in map(int, np.flatnonzero(passed)):
+        bench.journals[k].note(f"gains designed again from what was measured: {why[k] or 'as its other axes were'}")
+    unknown = np.full(len(where), np.nan)
+    fresh = replace(
+        recorded, gains=gains, proof=proof.cost, cost=unknown, failed=("",) * len(where), swing=np.zeros(len(where)),
+        slack=unknown, overshoot=unknown,
+    )  # fmt: skip
+    return recorded.mixed(fresh, passed), passed

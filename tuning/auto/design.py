@@ -1,0 +1,168 @@
+"""Design of an axis's gains: the best performance among the gains that keep the constraints, by its digital twin.
+
+Nothing is drawn: the gains of the current loop come from the winding and its lags, those of the outer loops from a grid
+in the units of the axis (bandwidth over lags, integration time and position gain over bandwidth). Margins of the whole
+grid are computed on the twin as a linear machine; the performance of the promising few is measured on the twin as an
+emulated machine, with friction, noise and counts; and what is best there is looked around.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_constants
+from tuning.auto.twin import least_gains
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from drive_env.devices import Device
+    from drive_env.loops.linear_model import Plant
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
+# bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.
+BANDWIDTHS = np.geomspace(0.01, 1.2, 20)
+INTEGRATIONS = (1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
+POSITIONS = (0.08, 0.12, 0.18, 0.25, 0.33, 0.42, 0.55, 0.75, 1.0)
+TORQUES = (1.0, 0.6, 0.36)
+# The current loop: its crossover times its own lag, one and a half periods; 60 degrees of phase margin.
+CURRENT_CROSSOVER, CURRENT_LAG = 0.52, 1.5
+EACH_NOMINAL, EACH = 24, 6  # of every bandwidth: whose variants are looked at, and that are tried on the twin
+FINALISTS = 12  # that are tried on all worlds
+STEPS = (1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
+PROMISING = 32  # of those, that are tried
+
+
+class Judge(Protocol):
+    """Judges sets of gains of n axes."""
+
+    @property
+    def device(self) -> Device:
+        """The drive."""
+
+    @property
+    def num_axes(self) -> int:
+        """N."""
+
+    def score(self, gains: Integers) -> Floats:
+        """Return the robust cost of raw gains, (n, sets, count): (n, sets)."""
+
+    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
+        """Return how far they keep the constraints of the loops, likewise; `nominal` of the axes as they are alone."""
+
+
+class Designed(NamedTuple):
+    """What a design found, of every axis, the best first.
+
+    gains: Raw, (n, found, count). cost: Robust cost on the twins, (n, found). slack: How far the constraints are kept,
+    relative, likewise; below 0 where no gains keep them.
+    """
+
+    gains: Integers
+    cost: Floats
+    slack: Floats
+
+
+def design(
+    coarse: Judge,
+    fine: Judge,
+    plants: Sequence[Plant],
+    say: Callable[[float], None] = lambda share: None,
+    most_velocity_p: Floats | None = None,
+) -> Designed:
+    """Return the best gains of axes.
+
+    Args:
+        coarse: Judges the axes as identified, with one run of each set.
+        fine: The same axes on all worlds, with several.
+        plants: The axes, as many as these have.
+        say: Called with the share done; what it raises ends the design.
+        most_velocity_p: The greatest velocity P, raw, (n,); infinite by default.
+    """
+    device, n = coarse.device, coarse.num_axes
+    most = np.full(n, np.inf) if most_velocity_p is None else most_velocity_p
+    column = cascade_columns(device)[2]
+    pool = np.array([_grid(device, plant) for plant in plants])
+    torque_p = pool[..., cascade_columns(device)[0]].max(axis=1)
+    pool[..., column] = np.minimum(pool[..., column], most[:, None])
+    # The best by promise of each bandwidth: first of what keeps the margins as it is, then with its variants.
+    for each, nominal in ((EACH_NOMINAL, True), (EACH, False)):
+        rows = _of_each(coarse.slack(pool, nominal=nominal), _promise(device, pool), each)
+        pool = np.take_along_axis(pool, rows[:, :, None], axis=1)
+        say(0.2)
+    cost = coarse.score(pool)
+    say(0.4)
+    best = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
+    pool = np.take_along_axis(pool, best[:, :, None], axis=1)
+    cost = fine.score(pool)
+    for number, step in enumerate(STEPS):
+        say(0.5 + 0.5 * number / len(STEPS))
+        at = cost.argmin(axis=1)
+        near = np.array([_around(device, pool[k, at[k]], step, int(torque_p[k])) for k in range(n)])
+        near[..., column] = np.minimum(near[..., column], most[:, None])
+        slack = coarse.slack(near)
+        promising = np.argsort(np.where(slack > 0.0, _promise(device, near), 1e9 - slack), axis=1, kind="stable")
+        near = np.take_along_axis(near, promising[:, :PROMISING, None], axis=1)
+        pool, cost = np.concatenate([pool, near], axis=1), np.concatenate([cost, fine.score(near)], axis=1)
+    order = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
+    pool = np.take_along_axis(pool, order[:, :, None], axis=1)
+    return Designed(pool, np.take_along_axis(cost, order, axis=1), coarse.slack(pool))
+
+
+def _grid(device: Device, plant: Plant) -> Integers:
+    """Return the gains of the grid for an axis, raw, (sets, count); bandwidths change slowest."""
+    per_si = integers_per_si(device, plant.supply)
+    lag = CURRENT_LAG / device.current_rate
+    small = float(small_time_constants(device, plant.velocity_filter)) + plant.delay - 1.0 / device.velocity_rate
+    rows = []
+    for bandwidth, torque, integration, position in product(BANDWIDTHS, TORQUES, INTEGRATIONS, POSITIONS):
+        w = bandwidth / small
+        values: dict[Part, float] = {
+            ("current", "P"): torque * CURRENT_CROSSOVER / lag * plant.L,
+            ("current", "I"): plant.R / plant.L,
+            ("velocity", "P"): plant.inertia / plant.torque_constant * w,
+            ("velocity", "I"): w / integration,
+            ("position", "P"): position * w,
+        }
+        rows.append([values[row.loop, row.part] * per_si[row.loop, row.part] for row in device.gains.rows])
+    return _whole(device, np.array(rows))
+
+
+def _whole(device: Device, rows: Floats) -> Integers:
+    return np.clip(np.rint(rows), least_gains(device), device.gains.highest).astype(np.int64)
+
+
+def _promise(device: Device, gains: Integers) -> Floats:
+    """Return what J of gains would be but for noise and resonances, up to a factor, (n, sets): less is better."""
+    _, _, velocity_p, velocity_i, position_p = (gains[..., k].astype(float) for k in cascade_columns(device))
+    return np.asarray(position_p**-0.8 * (velocity_p * velocity_i) ** -0.4)
+
+
+def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:
+    """Return the most promising of every bandwidth that keep the constraints, (n, bandwidths * each).
+
+    Where they are fewer, those that come nearest to keeping them.
+    """
+    n, sets = slack.shape
+    group = (n, len(BANDWIDTHS), sets // len(BANDWIDTHS))
+    order = np.argsort(np.where(slack > 0.0, promise, 1e9 - slack).reshape(group), axis=2, kind="stable")[:, :, :each]
+    first = group[2] * np.arange(group[1])[:, None]
+    return np.asarray((order + first).reshape(n, -1))
+
+
+def _around(device: Device, gains: Integers, step: float, most_torque_p: int) -> Integers:
+    """Return gains around some, (sets, count): all outer gains and torque P up and down by a factor."""
+    torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
+    factors = np.array(list(product((1.0 / step, 1.0, step), repeat=4)))
+    rows = np.tile(gains.astype(float), (len(factors), 1))
+    rows[:, [torque_p, velocity_p, velocity_i, position_p]] *= factors
+    rows[:, torque_p] = np.minimum(rows[:, torque_p], most_torque_p)
+    return _whole(device, rows)

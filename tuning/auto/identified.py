@@ -1,0 +1,86 @@
+"""The axes as identified, and what their design begins with: models, calm gains, whether gains before are safe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import bandwidth_gains, rule_gains
+from drive_env.loops.linear_model import Plant
+from drive_env.master.errors import BusError
+from drive_env.safety.envelope import SafetyError, swinging_allowed
+from tuning.auto.checks import unsafe_gains, wrong_wiring
+from tuning.auto.stages import Basis, IdentifiedAxes
+from tuning.identify.estimate import TITLES
+from tuning.identify.working_state import cautious_bandwidth
+from tuning.target import Target
+
+if TYPE_CHECKING:
+    from tuning.auto.bench import AutoBench
+    from tuning.identify.estimate import Identification
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Identify = Callable[[Target, NDArray[np.bool_]], "list[Identification]"]  # of the axes where the mask is true
+
+# The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
+CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
+
+
+def identify(bench: AutoBench, experiments: Identify) -> IdentifiedAxes:
+    """Check the wiring and identify; take out axes that cannot be tuned."""
+    target, going = bench.target, bench.going
+    found: list[Identification | None] = [None] * target.num_axes
+    plants: list[Plant | None] = [None] * target.num_axes
+    if not going.any():
+        return IdentifiedAxes(tuple(found), tuple(plants))
+    try:
+        with bench.spending(going), swinging_allowed(target.drives):
+            every = experiments(target, going)
+    except (SafetyError, RuntimeError, TimeoutError) as error:
+        if isinstance(error, BusError):
+            raise
+        bench.stop(bench.going, f"identification was stopped: {error}")
+        return IdentifiedAxes(tuple(found), tuple(plants))
+    for k in map(int, np.flatnonzero(going)):
+        journal, found[k] = bench.journals[k], every[k]
+        journal.stop(wrong_wiring(target, every[k]))
+        if not journal.reason:
+            try:
+                plants[k] = Plant.from_identification(target.device, target.motor, float(target.supply[k]), every[k])
+            except ValueError as error:
+                journal.stop(str(error))
+        unknown: dict[str, list[str]] = {}
+        for name, estimate in every[k].estimates.items():
+            if estimate.reason and name not in ("inertia",):
+                unknown.setdefault(estimate.reason, []).append(TITLES[name])
+        for reason, titles in unknown.items():
+            journal.note(f"{', '.join(titles)} not identified: {reason}")
+    return IdentifiedAxes(tuple(found), tuple(plants))
+
+
+def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
+    """Return the reference gains, calm gains, and whether the gains before are safe."""
+    target = bench.target
+    reference = np.ones_like(bench.before)
+    calm, unsafe = reference.copy(), ["not checked"] * target.num_axes
+    for axis in map(int, np.flatnonzero(bench.going)):
+        (plant, found), before = identified.known(axis), bench.before[axis]
+        inertia = found.together if math.isfinite(found.together) else plant.inertia
+        reference[axis] = rule_gains(target.device, target.motor, inertia, supply=plant.supply)[0]
+        unsafe[axis] = unsafe_gains(target.device, plant, before)
+        calm[axis] = calm_gains(target, plant)
+    return Basis(identified, bench.before, reference, calm, tuple(unsafe))
+
+
+def calm_gains(target: Target, plant: Plant) -> Integers:
+    """Return gains stable with the rotor alone, too: within backlash, and above a resonance, it has no load."""
+    velocity_hz = cautious_bandwidth(target.motor, plant.inertia) * ROTOR_SHARE
+    return bandwidth_gains(
+        target.device, target.motor, plant.inertia, current_hz=CALM_CURRENT_HZ, velocity_hz=velocity_hz,
+        position_hz=POSITION_SHARE * velocity_hz, supply=plant.supply,
+    )  # fmt: skip

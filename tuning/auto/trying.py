@@ -1,0 +1,100 @@
+"""Trials of designed gains on the drives: where they fail, of lower ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.roles import Role
+from drive_env.gains import write_gains
+from tuning.auto.bench import TRIAL_TIME
+from tuning.auto.proving import ProvingGround
+from tuning.auto.stages import TriedGains
+
+if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.stages import Basis
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
+SLOWER = 0.6  # what gains that fail their trial are lowered to
+WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole of it
+
+
+def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> TriedGains:
+    """Try designed gains on the drives; where they fail, lower ones, and at last those that any load bears.
+
+    Args:
+        bench: The drives.
+        basis: What is known of them.
+        gains: As designed, (num_axes, count).
+        cost: Their robust cost on the digital twins, (num_axes,).
+    """
+    ground, n = proving_ground(bench, basis), bench.target.num_axes
+    watch_following(bench, bench.going)
+    bench.stop(bench.going & ground.too_short(), "the travel is too short for a trial move")
+    known = bench.target.device.gains
+    # Position P is the first to give way: on an axis of more inertia than was found its loop would be the faster one.
+    slower = known.scaled(faster(known, gains, SLOWER), SLOWER, known.columns_of("position"))
+    best, proof, last = basis.calm.copy(), np.full(n, np.nan), [""] * n
+    attempts = (
+        ("the designed gains", gains),
+        (f"these lowered to {100.0 * SLOWER:.0f} %", slower),
+        ("gains that are slow enough for any load", basis.calm),
+    )
+    for words, tried in attempts:
+        _recover_from_faults(bench, ground)
+        open_ = bench.going & np.isnan(proof) & bench.affordable(TRIAL_TIME + ground.way_back())
+        if not open_.any():
+            break
+        write_gains(bench.target.drives, best, bench.going & ~open_)
+        with bench.spending(bench.target.together(open_)):
+            found = ground.run(np.where(open_[:, None], tried, best), open_)
+        passed = bench.whole_machines(found.passed | ~open_) & open_
+        best = np.where(passed[:, None], tried, best)
+        proof = np.where(passed, found.cost, proof)
+        for k in map(int, np.flatnonzero(open_ & ~passed)):
+            last[k] = found.reason[k] or "another axis of its machine did not pass"
+            if tried is not basis.calm:
+                bench.journals[k].note(f"{words} failed their trial: {last[k]}")
+    for k in map(int, np.flatnonzero(bench.going & np.isnan(proof))):
+        why = last[k] or "there was no drive time left to try them"
+        bench.journals[k].stop(f"no gains passed the trial; the last ones: {why}")
+    verified = tuple(BY_TRIAL if going else "" for going in bench.going)
+    return TriedGains(best, proof, verified, np.where((best == gains).all(axis=1), cost, np.nan))
+
+
+def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
+    """Set and return where gains are tried, from where the axes are now."""
+    plants = basis.identified.plants
+    bench.ground = ProvingGround(bench.target, plants, bench.room(), basis.calm, basis.reference, basis.held())
+    return bench.ground
+
+
+def _recover_from_faults(bench: AutoBench, ground: ProvingGround) -> None:
+    """Reset faults that have come since a trial; an axis that stays in one takes no further part."""
+    faulted = np.isin(np.arange(bench.target.num_axes), list(bench.faults()))
+    if faulted.any():
+        with bench.spending(bench.target.together(faulted)):
+            ground.recover(faulted)
+        bench.drop_faults("gains were tried, and the fault cannot be reset")
+
+
+def watch_following(bench: AutoBench, where: Mask) -> None:
+    """Set a following error limit that no normal trial reaches."""
+    assert bench.ground is not None, "proving makes it"
+    drives = bench.target.drives
+    window = WINDOW * np.abs(bench.ground.move.distance) + drives.read(Role.POSITION_SCALE)
+    drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
+
+
+def faster(known: GainSet, gains: Integers, factor: float) -> Integers:
+    """Return gains of shape (..., count) with those of the outer loops times a factor."""
+    return known.scaled(gains, factor, known.columns_of("velocity", "position"))

@@ -1,0 +1,201 @@
+"""The constrained oracle of emulated machines: the best gains that keep the constraints, by search on their truth.
+
+No tuner can know them. They are searched on the true machine by its true robust cost: random sets of gains over all
+bandwidths, then differential evolution (Storn and Price, doi:10.1023/A:1008202821328, with the steps towards the best
+of JADE, doi:10.1109/TEVC.2009.2014613). All axes of a machine get their gains together. The current loop is not
+searched beyond the crossover that leaves it 60 degrees, since the constraints are those of the outer loops.
+
+The gains of the suites' machines are kept in oracles.csv; what they are worth is scored anew whenever they are used, so
+that a row that no longer fits its machine or the score is noticed, and searched anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import has_linear_model, integers_per_si
+from drive_env.whole_file import write_table
+from mechanics.untrusted import read_rows
+from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG
+from tuning.compare.suite import SuiteMachine, groups
+from tuning.compare.yardstick import Yardstick
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+KEPT = Path(__file__).with_name("oracles.csv")
+HEAD = ("device", "machine", "digest", "gains", "performance", "slack")
+STALE = 0.05  # relative: a kept performance that is off by more than this is one of another score
+POPULATION, REPEATED = 48, 2  # sets of gains, and runs of each with a noise of its own
+DRAWS = 2304  # random sets of a machine of one axis; fewer with more axes
+GENERATIONS = {1: 45, 2: 45}  # by axes
+MANY_AXES = 12  # generations of a machine of more axes, each of which takes seconds
+BANDS = 16  # of bandwidth, each of which has its best draws in the first population
+# Draws over the baseline rule's gains, natural logarithms: of all outer gains together, and of each gain on its own.
+TOGETHER, EACH = (-2.5, 2.2), (-1.2, 1.2)
+FINALISTS = 8  # of the last population, scored with all repeats
+SPREAD = 0.01  # relative cost within the better half of the population at which it has converged
+
+
+class Oracle(NamedTuple):
+    """The best gains of a machine, raw, (axes, count), their robust performance, and their slack."""
+
+    gains: Integers
+    performance: float
+    slack: float
+
+
+def find_oracles(
+    machines: Sequence[SuiteMachine],
+    num_threads: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+    kept: Path | None = KEPT,
+) -> dict[str, Oracle]:
+    """Return the oracles of machines by name: those that are kept and still true, and those that are searched.
+
+    Args:
+        machines: Of a suite, or of your own.
+        num_threads: As `EmulatedDrives` takes it.
+        progress: Called with the share that is done.
+        kept: The file of those that are kept; None searches all.
+    """
+    rows = {} if kept is None else read_oracles(kept)
+    found: dict[str, Oracle] = {}
+    known = [machine for machine in machines if digest(machine) in rows]
+    for indices in groups(known):
+        group = [known[k] for k in indices]
+        gains = np.concatenate([rows[digest(machine)].gains for machine in group])
+        with closing(Yardstick(group, num_threads)) as yardstick:
+            scores = yardstick.score(gains)
+        for k, machine in enumerate(group):
+            row, now = rows[digest(machine)], float(scores.performance[k])
+            if scores.slack[k] > 0.0 and abs(now / row.performance - 1.0) < STALE:
+                found[machine.name] = row._replace(performance=now, slack=float(scores.slack[k]))
+    left = [machine for machine in machines if machine.name not in found]
+    for number, machine in enumerate(left):
+        progress(number / len(left))
+        found[machine.name] = search_oracle(machine, num_threads)
+    progress(1.0)
+    return found
+
+
+def search_oracle(machine: SuiteMachine, num_threads: int | None = None, seed: int = 0) -> Oracle:
+    """Return the oracle of a machine; the seed draws what is tried."""
+    rng = np.random.default_rng(seed)
+    with closing(Yardstick([machine], num_threads, REPEATED, POPULATION)) as yardstick:
+        last = _evolved(yardstick, _Box.of(yardstick), rng)
+    with closing(Yardstick([machine], num_threads, copies=FINALISTS)) as yardstick:
+        scores = yardstick.score(last[:FINALISTS].reshape(-1, last.shape[-1]))
+    best = int(scores.robust_cost.argmin())
+    return Oracle(last[best], float(scores.performance[best]), float(scores.slack[best]))
+
+
+class _Box(NamedTuple):
+    """Where gains are searched: logarithms of raw gains, (axes, count). outer: Columns beyond the current loop."""
+
+    rule: Floats
+    least: Floats
+    most: Floats
+    outer: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, yardstick: Yardstick) -> _Box:
+        """Return that of a machine."""
+        device, axes = yardstick.device, yardstick.axes
+        rule = np.log(np.maximum(yardstick.rule_gains[:axes], 1).astype(float))
+        least, most = np.zeros_like(rule), np.log(np.broadcast_to(device.gains.highest, rule.shape).astype(float))
+        if has_linear_model(device):
+            L, R = (float(yardstick.parameters[name][0]) for name in ("motor.L_q", "motor.R_s"))
+            for axis in range(axes):
+                per_si = integers_per_si(device, float(yardstick.supply[axis]))
+                p, i = device.gains.column("current", "P"), device.gains.column("current", "I")
+                most[axis, p] = rule[axis, p] = np.log(
+                    CURRENT_CROSSOVER * device.current_rate / CURRENT_LAG * L * per_si["current", "P"]
+                )
+                # Zeros at the winding's pole.
+                least[axis, i] = most[axis, i] = rule[axis, i] = np.log(max(R / L * per_si["current", "I"], 1.0))
+        outer = np.array([row.loop != "current" for row in device.gains.rows])
+        return cls(rule, least, most, outer)
+
+    def whole(self, x: Floats) -> Integers:
+        """Return raw gains of points, (points, axes, count)."""
+        return np.rint(np.exp(np.clip(x, self.least, self.most))).astype(np.int64)
+
+
+def _evolved(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Integers:
+    """Return the last population, the best first, (sets, axes, count)."""
+
+    def cost(x: Floats) -> Floats:
+        gains = box.whole(x)
+        return yardstick.score(gains.reshape(-1, gains.shape[-1])).robust_cost
+
+    x = _first(yardstick, box, rng)
+    worth = cost(x)
+    n, axes = len(x), yardstick.axes
+    for _ in range(GENERATIONS.get(axes, MANY_AXES)):
+        order = np.argsort(worth, kind="stable")
+        if worth[order[n // 2]] < (1.0 + SPREAD) * worth[order[0]]:
+            break
+        best = x[order[rng.integers(0, n // 8, n)]]
+        first, second = x[rng.integers(0, n, n)], x[rng.integers(0, n, n)]
+        F = rng.uniform(0.4, 0.9, (n, 1, 1))
+        # Every other time one axis alone: what suits an axis may not suit another.
+        alone = np.arange(axes) == rng.integers(0, axes, (n, 1))
+        crossed = (rng.random((n, 1)) < 0.5) | alone
+        new = np.where(crossed[..., None], x + F * (best - x) + F * (first - second), x)
+        new = np.clip(new, box.least, box.most)
+        found = cost(new)
+        better = found < worth
+        x, worth = np.where(better[:, None, None], new, x), np.where(better, found, worth)
+    return box.whole(x[np.argsort(worth, kind="stable")])
+
+
+def _first(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Floats:
+    """Return the first population: of draws of all bandwidths those that promise most and keep the constraints."""
+    rounds = max(DRAWS // (POPULATION * yardstick.axes), 4)
+    shape = (rounds * POPULATION, *box.rule.shape)
+    together = rng.uniform(*TOGETHER, (shape[0], 1, 1)) * box.outer
+    # All axes of a machine at the same place in their own scales.
+    x = np.clip(box.rule + together + rng.uniform(*EACH, (shape[0], 1, shape[2])), box.least, box.most)
+    gains = box.whole(x)
+    slack = np.concatenate([yardstick.loop_slack(part.reshape(-1, shape[2])) for part in np.split(gains, rounds)])
+    promise = -(x * box.outer).sum(axis=(1, 2))
+    band = np.digitize(together.max(axis=(1, 2)) + together.min(axis=(1, 2)), np.linspace(*TOGETHER, BANDS + 1)[1:-1])
+    order = np.lexsort((np.where(slack > 0.0, promise, 1e9 - slack), band))
+    place = np.concatenate([np.arange(np.count_nonzero(band == k)) for k in range(BANDS)])  # within its band
+    chosen = order[np.argsort(place, kind="stable")[:POPULATION]]
+    return np.asarray(x[chosen])
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+def digest(machine: SuiteMachine) -> str:
+    """Return what tells a machine from all others, its name among it."""
+    return hashlib.sha256(repr(machine).encode()).hexdigest()[:16]
+
+
+def read_oracles(path: Path = KEPT) -> dict[str, Oracle]:
+    """Return the oracles that a file keeps, by the digest of their machine."""
+    found = {}
+    for _, _, key, gains, performance, slack in islice(read_rows(path), 1, None):
+        axes = np.array([axis.split() for axis in gains.split("|")], np.int64)
+        found[key] = Oracle(axes, float(performance), float(slack))
+    return found
+
+
+def write_oracles(path: Path, machines: Iterable[SuiteMachine], oracles: dict[str, Oracle]) -> None:
+    """Write the oracles of machines: the gains of an axis in the order of the drive's set, axes parted by |."""
+    rows = []
+    for machine in machines:
+        found = oracles[machine.name]
+        gains = " | ".join(" ".join(map(str, axis)) for axis in found.gains)
+        figures = f"{found.performance:.4g}", f"{found.slack:.4g}"
+        rows.append((machine.device, machine.name, digest(machine), gains, *figures))
+    write_table(path, [HEAD, *rows], "\n")
