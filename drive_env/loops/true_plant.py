@@ -28,11 +28,11 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
     """Return the plant of an emulated axis, with its first resonance.
 
     Raises:
-        ValueError: For drives on a bus, whose truth nobody knows, and for a machine with several axes.
+        ValueError: For drives on a bus, whose true parameters are unknown, and for a machine with several axes.
     """
     if drives.machine is None:
         raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
-    emulated = drives.machine.drives  # whoever observes them
+    emulated = drives.machine.drives  # without the observers around them
     if emulated.load.num_axes != 1:
         raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
     true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
@@ -85,7 +85,7 @@ def true_machines(drives: Drives) -> LinearMachines:
     """Return emulated machines with all that they move, each with all its axes.
 
     Raises:
-        ValueError: For drives on a bus, whose truth nobody knows.
+        ValueError: For drives on a bus, whose true parameters are unknown.
     """
     if drives.machine is None:
         raise ValueError("the true parameters of a machine on a bus are unknown; identify it")

@@ -216,7 +216,7 @@ def _others(bench: AutoBench, gains: Integers, recorded: RecordedGains) -> Mask:
 
 
 def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
-    """Return what gains are worth as they were verified, that of a machine's worst axis, (num_axes,)."""
+    """Return the cost of verified gains by J and margins, of each machine its worst axis, (num_axes,)."""
     failed = np.array([bool(why) for why in recorded.failed])
     # What was not measured is worth less than what is known to keep the dynamics.
     slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
@@ -256,7 +256,7 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
 
 
 def _short(bench: AutoBench, recorded: RecordedGains, k: int) -> str:
-    """Return what an axis's gains fall short of, "" if of nothing."""
+    """Return which requirement the gains of an axis miss; "" if they meet all."""
     if recorded.failed[k]:
         return recorded.failed[k]
     if recorded.slack[k] < 0.0:

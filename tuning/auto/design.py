@@ -141,7 +141,7 @@ def _whole(device: Device, rows: Floats) -> Integers:
 
 
 def _promise(device: Device, gains: Integers) -> Floats:
-    """Return what J of gains would be but for noise and resonances, up to a factor, (n, sets): less is better."""
+    """Return J of gains without noise and resonances, up to a constant factor, (n, sets): less is better."""
     _, _, velocity_p, velocity_i, position_p = (gains[..., k].astype(float) for k in cascade_columns(device))
     return np.asarray(position_p**-0.8 * (velocity_p * velocity_i) ** -0.4)
 

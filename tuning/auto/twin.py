@@ -256,7 +256,7 @@ class Twins:
         return np.asarray(self._each(gains, lambda part, rows: (part.slack(rows, nominal),))[0])
 
     def _each(self, gains: Integers, function: Callable[[_Part, Integers], tuple[Floats, ...]]) -> Floats:
-        """Return what a function says of as many sets as run at once, and then of the next, (values, n, any sets)."""
+        """Apply a function to as many sets of gains at a time as run at once; return (values, n, any sets)."""
         found: Floats | None = None
         for first in range(0, gains.shape[1], self.sets):
             rows = gains[:, first : first + self.sets]

@@ -177,7 +177,7 @@ def _first(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Floats:
 
 # --- the file ---------------------------------------------------------------------------------------------------------
 def digest(machine: SuiteMachine) -> str:
-    """Return what tells a machine from all others, its name among it."""
+    """Return a hash of the name and all parameters of a machine."""
     return hashlib.sha256(repr(machine).encode()).hexdigest()[:16]
 
 
