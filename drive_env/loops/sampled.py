@@ -23,6 +23,7 @@ Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
+RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
 _TERMS = 14  # of Taylor's series of exp(X), |X| <= 1/2: 2e-17 are left
 
 
@@ -53,6 +54,53 @@ class LinearMachines(NamedTuple):
     speed: Floats
     supply: Floats
     velocity_filter: Floats
+
+
+class Windings(NamedTuple):
+    """What moves the rotors of machines, (machines, axes) each: as `LinearMachines` has supply and velocity filter.
+
+    R, L: Of a phase, in the torque-making axis [ohm], [H]. emf: Voltage per speed [V*s/rad].
+    torque: Per current [N*m/A].
+    """
+
+    R: Floats
+    L: Floats
+    emf: Floats
+    torque: Floats
+    supply: Floats
+    velocity_filter: Floats
+
+
+def linear_machines(windings: Windings, M: Floats, D: Floats, K: Floats, rotors: Floats) -> LinearMachines:
+    """Return machines by what they move: M q'' + D q' + K q = torque.
+
+    Args:
+        windings: Of their motors.
+        M: Inertia, (machines, joints, joints).
+        D: Damping, likewise.
+        K: Stiffness, likewise.
+        rotors: What each rotor turns by joint, (axes, joints).
+    """
+    (count, joints), axes = M.shape[:2], len(rotors)
+    # What springs hold are the twists along the eigenvectors of K; what turns freely is no state of an angle.
+    squares, twists = np.linalg.eigh(K)
+    elastic = squares.max(axis=0) > RIGID * max(float(squares.max()), 1e-300)
+    squares, twists = squares[:, elastic], twists[:, :, elastic]
+    springs, size = int(elastic.sum()), axes + joints + int(elastic.sum())
+    A, B = np.zeros((count, size, size)), np.zeros((count, size, axes))
+    one, speeds, held_ = np.arange(axes), slice(axes, axes + joints), slice(axes + joints, size)
+    A[:, one, one] = -windings.R / windings.L
+    A[:, :axes, speeds] = -(windings.emf / windings.L)[:, :, None] * rotors
+    A[:, speeds, :axes] = np.linalg.solve(M, windings.torque[:, None, :] * rotors.T)
+    A[:, speeds, speeds] = -np.linalg.solve(M, D)
+    if springs:
+        A[:, speeds, held_] = -np.linalg.solve(M, twists * squares[:, None, :])
+        A[:, held_, speeds] = np.swapaxes(twists, 1, 2)
+    B[:, one, one] = 1.0 / windings.L
+    current, speed = np.zeros((count, axes, size)), np.zeros((count, axes, size))
+    current[:, one, one] = 1.0
+    speed[:, :, speeds] = rotors
+    return LinearMachines(A, B, current, speed, windings.supply, windings.velocity_filter)
 
 
 class CascadeGains(NamedTuple):

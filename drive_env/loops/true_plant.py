@@ -13,15 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.loops.linear_model import Plant
-from drive_env.loops.sampled import LinearMachines
+from drive_env.loops.sampled import RIGID, LinearMachines, Windings, linear_machines
 from mechanics.packed import PackedLoad
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
 
 Floats = NDArray[np.float64]
-
-RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
 
 
 def true_plant(drives: Drives, axis: int = 0) -> Plant:
@@ -99,31 +97,12 @@ def true_machines(drives: Drives) -> LinearMachines:
     }
     parts = [linear_load(group.load) for group in emulated.inside.groups]
     M, D, K = (np.concatenate([getattr(part, name) for part in parts]) for name in ("M", "D", "K"))
-    rotors = parts[0].rotors
     emf = motor.n_p * true["motor.psi_m"]
-    torque = (1.0 if motor.kind == "dc" else 1.5) * emf
-    count, joints = M.shape[:2]
-    # What springs hold are the twists along the eigenvectors of K; what turns freely is no state of an angle.
-    squares, twists = np.linalg.eigh(K)
-    elastic = squares.max(axis=0) > RIGID * max(float(squares.max()), 1e-300)
-    squares, twists = squares[:, elastic], twists[:, :, elastic]
-    springs, size = int(elastic.sum()), axes + joints + int(elastic.sum())
-    A, B = np.zeros((count, size, size)), np.zeros((count, size, axes))
-    one, speeds, held = np.arange(axes), slice(axes, axes + joints), slice(axes + joints, size)
-    L = true["motor.L_q"]
-    A[:, one, one] = -true["motor.R_s"] / L
-    A[:, :axes, speeds] = -(emf / L)[:, :, None] * rotors
-    A[:, speeds, :axes] = np.linalg.solve(M, torque[:, None, :] * rotors.T)
-    A[:, speeds, speeds] = -np.linalg.solve(M, D)
-    if springs:
-        A[:, speeds, held] = -np.linalg.solve(M, twists * squares[:, None, :])
-        A[:, held, speeds] = np.swapaxes(twists, 1, 2)
-    B[:, one, one] = 1.0 / L
-    current, speed = np.zeros((count, axes, size)), np.zeros((count, axes, size))
-    current[:, one, one] = 1.0
-    speed[:, :, speeds] = rotors
-    supply = np.asarray(drives.machine.supply, float).reshape(count, axes)
-    return LinearMachines(A, B, current, speed, supply, true["stage.velocity_filter"])
+    windings = Windings(
+        true["motor.R_s"], true["motor.L_q"], emf, (1.0 if motor.kind == "dc" else 1.5) * emf,
+        np.asarray(drives.machine.supply, float).reshape(len(M), axes), true["stage.velocity_filter"],
+    )  # fmt: skip
+    return linear_machines(windings, M, D, K, parts[0].rotors)
 
 
 def _first_resonance(found: LinearLoad, copy: int, name: str) -> tuple[float, float, tuple[float, float, float] | None]:

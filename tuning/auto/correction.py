@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +16,18 @@ from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
-from tuning.auto.design import Designed, design
+from tuning.auto.design import Judge, design
 from tuning.auto.loop_margins import MEASURED, measure, measured_axis
+from tuning.auto.loop_model import fitted_plant, loop_models
 from tuning.auto.moves import load, show, step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.stages import RecordedGains
 from tuning.auto.twin import WORLDS, Known, Twins, known_of
-from tuning.response.measured_loop import GOOD_MISFIT
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.dynamics import Dynamics
     from tuning.auto.bench import AutoBench
-    from tuning.auto.measured_margins import MeasuredAxis
     from tuning.auto.stages import Basis, TriedGains
     from tuning.target import Target
 
@@ -73,76 +73,33 @@ def design_axes(
         return gains, cost, present
     known = [_known(bench, basis, recorded, k) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
-    measured = [None if recorded is None else measured_axis(bench, basis, recorded, k) for k in axes]
+    # The response of a linked axis was measured without the other one; what both say is in their model.
+    measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
+    models = [(model, np.searchsorted(axes, of)) for model, of in loop_models(target, basis, recorded, where)]
     most = np.full(target.num_axes, np.inf) if most is None else most
 
-    def twins(**more: object) -> _Corrected:
-        made = Twins(target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics, **more)  # type: ignore[arg-type]
-        return _Corrected(made, measured)
+    def judge(**more: Any) -> Judge:
+        twins = Twins(target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics, **more)
+        return Judge(twins, models, measured)
 
-    coarse, fine = twins(worlds=WORLDS[:1]), twins(repeats=RUNS)
-    try:
-        found: Designed = design(coarse, fine, [one.plant for one in known], say, most[axes])
+    with judge(worlds=WORLDS[:1]) as coarse, judge(repeats=RUNS) as fine:
+        found = design(coarse, fine, [one.plant for one in known], say, most[axes])
         if recorded is not None:
             present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
-    finally:
-        coarse.close()
-        fine.close()
     gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
     return gains, cost, present
-
-
-class _Corrected(NamedTuple):
-    """Twins, and the loops as they were measured, where they were: what keeps the constraints keeps both."""
-
-    twins: Twins
-    measured: Sequence[MeasuredAxis | None]
-
-    @property
-    def device(self) -> Device:
-        """The drive."""
-        return self.twins.device
-
-    @property
-    def num_axes(self) -> int:
-        """How many axes there are."""
-        return self.twins.num_axes
-
-    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
-        """Return how far gains keep the constraints of the loops, (n, sets)."""
-        return np.minimum(self.twins.slack(gains, nominal=nominal), self._measured_slack(gains))
-
-    def score(self, gains: Integers) -> Floats:
-        """Return the robust cost of gains, (n, sets)."""
-        performance, slack = self.twins.judge(gains)
-        return robust_cost(performance, np.minimum(slack, self._measured_slack(gains)))
-
-    def _measured_slack(self, gains: Integers) -> Floats:
-        slack = np.full(gains.shape[:2], np.inf)
-        for k, one in enumerate(self.measured):
-            if one is not None:
-                slack[k] = one.slack(self.twins.dynamics, gains[k])
-        return slack
-
-    def close(self) -> None:
-        """Close the emulated machines."""
-        self.twins.close()
 
 
 def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
     """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured."""
     plant, found = basis.identified.known(k)
     reach = float(basis.trial_reach(bench)[k])
-    if np.isfinite(found.together):
-        plant = replace(plant, inertia=found.together)  # what all axes move, each its share
-    if recorded is None or recorded.response is None or recorded.unseen[k]:
-        return known_of(plant, found, reach)
-    fit = recorded.response.fits[k]
-    if fit is None or fit.reason or fit.misfit > GOOD_MISFIT:
-        return known_of(plant, found, reach)
-    fitted = replace(fit.plant, R=plant.R, L=plant.L, supply=plant.supply)
-    known = {name: one for name, one in fit.estimates.items() if one.is_known and name in found.estimates}
-    return known_of(fitted, replace(found, estimates={**found.estimates, **known}), reach)
+    if bench.target.linked:
+        # The ends of one part move it together, each its share, and then nothing twists.
+        rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
+        return known_of(rigid, found, reach)
+    plant, found = fitted_plant(basis, recorded, k)
+    return known_of(plant, found, reach)
 
 
 def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:

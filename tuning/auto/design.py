@@ -8,21 +8,23 @@ emulated machine, with friction, noise and counts; and what is best there is loo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_constants
+from drive_env.trials.score import robust_cost
 from tuning.auto.twin import least_gains
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
+    from tuning.auto.loop_model import LinkedAxis, LoopModel
+    from tuning.auto.measured_margins import MeasuredAxis
+    from tuning.auto.twin import Twins
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -41,22 +43,57 @@ STEPS = (1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain 
 PROMISING = 32  # of those, that are tried
 
 
-class Judge(Protocol):
-    """Judges sets of gains of n axes."""
+class Judge(NamedTuple):
+    """Judges sets of gains of n axes: on their twins, by their linear models, and by their loops as measured.
 
-    @property
-    def device(self) -> Device:
-        """The drive."""
+    A machine whose axes are coupled is one: all its axes get the worst of each other's cost, and the same slack.
 
-    @property
-    def num_axes(self) -> int:
-        """N."""
+    Attributes:
+        twins: What they cost.
+        models: Of each machine its linear model, and which of the n axes it has, (axes,).
+        measured: The loops of each axis as they were measured, None where they were not.
+    """
+
+    twins: Twins
+    models: Sequence[tuple[LoopModel, Integers]]
+    measured: Sequence[MeasuredAxis | LinkedAxis | None]
+
+    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
+        """Return how far they keep the constraints of the loops, relative; `nominal` of the axes as they are alone."""
+        slack = self._measured_slack(gains)
+        for model, axes in self.models:
+            of_machine = model.slack(self.twins.dynamics, np.moveaxis(gains[axes], 0, 1), nominal=nominal)
+            slack[axes] = np.minimum(of_machine, slack[axes].min(axis=0))
+        return slack
 
     def score(self, gains: Integers) -> Floats:
         """Return the robust cost of raw gains, (n, sets, count): (n, sets)."""
+        performance, slack = self.twins.judge(gains)
+        return self.of_machines(robust_cost(performance, np.minimum(slack, self.slack(gains))), np.max)
 
-    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
-        """Return how far they keep the constraints of the loops, likewise; `nominal` of the axes as they are alone."""
+    def of_machines(self, values: Floats, reduce: Callable[..., Floats]) -> Floats:
+        """Return values of axes, (n, sets), with what their machine makes of them."""
+        whole = values.copy()
+        for _, axes in self.models:
+            whole[axes] = reduce(values[axes], axis=0)
+        return whole
+
+    def _measured_slack(self, gains: Integers) -> Floats:
+        slack = np.full(gains.shape[:2], np.inf)
+        for k, one in enumerate(self.measured):
+            if one is not None:
+                slack[k] = one.slack(self.twins.dynamics, gains[k])
+        return slack
+
+    def close(self) -> None:
+        """Close the emulated machines."""
+        self.twins.close()
+
+    def __enter__(self) -> Judge:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class Designed(NamedTuple):
@@ -87,7 +124,11 @@ def design(
         say: Called with the share done; what it raises ends the design.
         most_velocity_p: The greatest velocity P, raw, (n,); infinite by default.
     """
-    device, n = coarse.device, coarse.num_axes
+    device, n = coarse.twins.device, coarse.twins.num_axes
+
+    def promise(gains: Integers) -> Floats:
+        return coarse.of_machines(_promise(device, gains), np.mean)
+
     most = np.full(n, np.inf) if most_velocity_p is None else most_velocity_p
     column = cascade_columns(device)[2]
     pool = np.array([_grid(device, plant) for plant in plants])
@@ -95,7 +136,7 @@ def design(
     pool[..., column] = np.minimum(pool[..., column], most[:, None])
     # The best by promise of each bandwidth: first of what keeps the margins as it is, then with its variants.
     for each, nominal in ((EACH_NOMINAL, True), (EACH, False)):
-        rows = _of_each(coarse.slack(pool, nominal=nominal), _promise(device, pool), each)
+        rows = _of_each(coarse.slack(pool, nominal=nominal), promise(pool), each)
         pool = np.take_along_axis(pool, rows[:, :, None], axis=1)
         say(0.2)
     cost = coarse.score(pool)
@@ -109,7 +150,7 @@ def design(
         near = np.array([_around(device, pool[k, at[k]], step, int(torque_p[k])) for k in range(n)])
         near[..., column] = np.minimum(near[..., column], most[:, None])
         slack = coarse.slack(near)
-        promising = np.argsort(np.where(slack > 0.0, _promise(device, near), 1e9 - slack), axis=1, kind="stable")
+        promising = np.argsort(np.where(slack > 0.0, promise(near), 1e9 - slack), axis=1, kind="stable")
         near = np.take_along_axis(near, promising[:, :PROMISING, None], axis=1)
         pool, cost = np.concatenate([pool, near], axis=1), np.concatenate([cost, fine.score(near)], axis=1)
     order = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
@@ -141,9 +182,9 @@ def _whole(device: Device, rows: Floats) -> Integers:
 
 
 def _promise(device: Device, gains: Integers) -> Floats:
-    """Return J of gains without noise and resonances, up to a constant factor, (n, sets): less is better."""
-    _, _, velocity_p, velocity_i, position_p = (gains[..., k].astype(float) for k in cascade_columns(device))
-    return np.asarray(position_p**-0.8 * (velocity_p * velocity_i) ** -0.4)
+    """Return ln J of gains without noise and resonances, up to a constant, (n, sets): less is better."""
+    _, _, velocity_p, velocity_i, position_p = (np.log(gains[..., k]) for k in cascade_columns(device))
+    return np.asarray(-0.8 * position_p - 0.4 * (velocity_p + velocity_i))
 
 
 def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:

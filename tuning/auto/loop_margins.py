@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
-from drive_env.loops.dynamics import find_dynamics
+from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.measured_margins import MeasuredAxis, judged_loops
+from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models
+from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.proving import STEP_SIZE
 from tuning.auto.stages import Verdict
 from tuning.auto.trying import BY_TRIAL, watch_following
-from tuning.response.measured_loop import merged
+from tuning.response.measured_loop import GOOD_MISFIT, merged
 from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
@@ -39,17 +40,23 @@ PHASE_ERROR, GAIN_ERROR, MS_ERROR, OVERSHOOT_ERROR = 2.0, 0.5, 1.05, 0.02
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
 LONGER = 2  # times as long it is shaken where too little was seen
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
-ALONE = (
-    "the response was measured with this axis alone moving what all axes of its machine share, and the others "
-    "switched off: with all of them active the loop's gain is higher, and the gain margin lower, by the others' "
-    "share; the position loop was not measured"
+BOTH = (
+    "margins are those of both ends together, computed from the part that fits the frequency responses of each end "
+    "with the other one off"
 )
+NO_PART = "no part with one spring fits the frequency responses of both ends"
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
 def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Measure the velocity loop's response of axes with their gains, and how far their loops keep the dynamics."""
     going = where & bench.going & np.array([not why for why in recorded.failed])
+    if bench.target.linked:
+        slack = recorded.slack.copy()
+        for k in map(int, np.flatnonzero(going)):
+            one = measured_axis(bench, basis, recorded, k)
+            slack[k] = np.nan if one is None else one.slack(bench.dynamics, recorded.gains[k][None])[0]
+        return replace(recorded, slack=slack)
     late = going & ~bench.affordable(bench.response_time)
     recorded = _without_response(recorded, late, "the drive time of the run was used up")
     going = bench.whole_machines(going & ~late)
@@ -105,12 +112,24 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     return replace(recorded, slack=slack)
 
 
-def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) -> MeasuredAxis | None:
-    """Return the loops of an axis as they were measured, None if they were not."""
-    response = recorded.response
+def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) -> MeasuredAxis | LinkedAxis | None:
+    """Return the loops of an axis as they were measured, None if they were not.
+
+    Those of linked axes are known by the responses that identified them, each with the other one off: with gains that
+    are fit for both, one alone may swing.
+    """
+    response, target = recorded.response, bench.target
+    if target.linked:
+        whole = np.arange(target.num_axes) // target.axes_per_machine == k // target.axes_per_machine
+        axes = np.flatnonzero(whole)
+        fits = [None if (found := basis.identified.found[j]) is None else found.fit for j in axes]
+        if any(fit is None or fit.reason or fit.misfit > GOOD_MISFIT for fit in fits):
+            return None
+        models = loop_models(target, basis, recorded, whole)
+        return LinkedAxis(models[0][0], k - int(axes[0]), recorded.gains[axes]) if len(models) == 1 else None
     if response is None or recorded.unseen[k] or not np.isfinite(response.open_loop[:, k]).any():
         return None
-    return MeasuredAxis(response, k, basis.identified.known(k)[0], judged_loops(bench.target))
+    return MeasuredAxis(response, k, basis.identified.known(k)[0])
 
 
 def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: MeasuredLoop, going: Mask) -> Mask:
@@ -120,7 +139,7 @@ def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: 
     for k in map(int, np.flatnonzero(going & left)):
         unclear[k] = _seen(response, k) < LEAST_LINES
         if not unclear[k]:
-            measured = MeasuredAxis(response, k, basis.identified.known(k)[0], ("velocity",))
+            measured = MeasuredAxis(response, k, basis.identified.known(k)[0])
             unclear[k] = not math.isfinite(measured.margins(recorded.gains[k])["velocity"].phase_deg)
     return unclear
 
@@ -137,49 +156,74 @@ def _without_response(recorded: RecordedGains, where: Mask, why: str) -> Recorde
 
 def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
     """Return what the final gains are worth: their margins as measured, or a lower bound."""
-    response, loops, n = recorded.response, judged_loops(bench.target), bench.target.num_axes
+    response, n = recorded.response, bench.target.num_axes
     margins: list[dict[str, Margins]] = [{} for _ in range(n)]
+    for model, axes in loop_models(bench.target, basis, recorded, bench.going):
+        for k in map(int, axes):
+            known = measured_axis(bench, basis, recorded, k) is not None
+            _tell_variants(bench, bench.journals[k], model, recorded.gains[axes], known)
     at_least: list[dict[str, AtLeast]] = [{} for _ in range(n)]
     verified = list(recorded.verified)
     for k in map(int, np.flatnonzero(bench.going)):
         journal, gains = bench.journals[k], recorded.gains[k]
         tell_overshoot(bench, journal, float(recorded.overshoot[k]))
         measured = measured_axis(bench, basis, recorded, k)
-        if response is None or measured is None:
-            why = recorded.unseen[k] or "no response was measured"
+        if measured is None:
+            why = recorded.unseen[k] or (NO_PART if bench.target.linked else "no response was measured")
             journal.reserve(f"margins not measured: {why}; the gains were verified {BY_TRIAL} instead")
-            at_least[k], bounds = _by_model(bench, basis, k, gains, loops)
+            at_least[k], bounds = _by_model(bench, basis, k, gains, LOOPS)
             journal.reserve(bounds)
             continue
         margins[k] = measured.margins(gains)
-        at_least[k] = {loop: response.at_least(loop, gains, k) for loop in loops}
-        blank = [loop for loop in loops if _is_blank(margins[k][loop], at_least[k][loop])]
-        for loop in loops:
-            if loop not in blank:
-                tell_bounds(journal, bench.dynamics, loop, margins[k][loop], at_least[k][loop])
-        if blank:
-            least, bounds = _by_model(bench, basis, k, gains, blank)
-            at_least[k] |= least
-            journal.reserve(
-                f"not all margins of the {' and the '.join(blank)} loop were measured: too few frequencies are "
-                f"coherent, and the response fits no model; {bounds}"
-            )
-        for note in [note for note in response.notes[k] if note not in journal.notes]:
-            journal.note(note)
+        how = "by"
+        if response is None:
+            journal.note(BOTH)
+        else:
+            at_least[k] = _told_bounds(bench, basis, journal, k, gains, response, margins[k])
+            for note in [note for note in response.notes[k] if note not in journal.notes]:
+                journal.note(note)
+            if not np.array_equal(gains, response.gains[k]):
+                how = "by margins computed for these gains from"
         for text in short_of(bench.dynamics, margins[k]):
             journal.reserve(text)
         if (beyond := short_of(find_dynamics("stiff"), margins[k])) and not recorded.kept[k]:
             journal.stop(f"its loops are too near to instability: {'; '.join(beyond)}")
-        if bench.target.linked:
-            journal.reserve(ALONE)
-        how = "by"
-        if not np.array_equal(gains, response.gains[k]):
-            how = "by margins computed for these gains from"
         verified[k] = (
             f"{verified[k] or BY_TRIAL}; and {how} the measured frequency response of the velocity loop: "
             + ", ".join(f"{loop} loop Ms {one.ms:.1f}" for loop, one in margins[k].items())
         )
     return Verdict(tuple(margins), tuple(at_least), tuple(verified))
+
+
+def _tell_variants(bench: AutoBench, journal: Journal, model: LoopModel, gains: Integers, was_measured: bool) -> None:
+    """Add a reservation where a machine as it may become keeps too little; reject it beyond stiff dynamics if known."""
+    for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
+        name, kept = min(model.kept(dynamics, gains).items(), key=lambda one: one[1])
+        if kept < OFF_NOMINAL * (1.0 - MEASURED) and (was_measured or dynamics is bench.dynamics):
+            tell(
+                f"with {name} its model keeps {100.0 * kept:.0f} % of the margins of {dynamics.name} dynamics; "
+                f"{100.0 * OFF_NOMINAL:.0f} % are asked for"
+            )
+
+
+def _told_bounds(
+    bench: AutoBench, basis: Basis, journal: Journal, k: int, gains: Integers, response: MeasuredLoop,
+    found: Mapping[str, Margins],
+) -> dict[str, AtLeast]:  # fmt: skip
+    """Return lower bounds of an axis's margins; tell of those that stand for one that was not measured."""
+    least = {loop: response.at_least(loop, gains, k) for loop in LOOPS}
+    blank = [loop for loop in LOOPS if _is_blank(found[loop], least[loop])]
+    for loop in LOOPS:
+        if loop not in blank:
+            tell_bounds(journal, bench.dynamics, loop, found[loop], least[loop])
+    if blank:
+        more, bounds = _by_model(bench, basis, k, gains, blank)
+        least |= more
+        journal.reserve(
+            f"not all margins of the {' and the '.join(blank)} loop were measured: too few frequencies are coherent, "
+            f"and the response fits no model; {bounds}"
+        )
+    return least
 
 
 def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:

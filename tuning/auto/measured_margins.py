@@ -18,19 +18,14 @@ if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from tuning.response.measured_loop import MeasuredLoop
-    from tuning.target import Target
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once
+LOOPS = "velocity", "position"  # that are judged
 FACTORS = tuple(sorted({variant.velocity_p for variant in VARIANTS} - {1.0}))  # of velocity P, that loops must bear
-
-
-def judged_loops(target: Target) -> tuple[str, ...]:
-    """Return the loops whose margins a measured velocity loop gives; of linked axes only the velocity loop."""
-    return ("velocity",) if target.linked else ("velocity", "position")
 
 
 class MeasuredAxis:
@@ -40,12 +35,11 @@ class MeasuredAxis:
         response: The measured velocity loop.
         axis: Number of the axis.
         plant: The identified axis, for other gains of the torque loop.
-        loops: Which are judged.
     """
 
-    def __init__(self, response: MeasuredLoop, axis: int, plant: Plant, loops: tuple[str, ...]) -> None:
+    def __init__(self, response: MeasuredLoop, axis: int, plant: Plant) -> None:
         fit = response.fits[axis]
-        self._device, self._loops = response.device, loops
+        self._device = response.device
         self._plant = plant if fit is None or fit.reason else fit.plant
         f, L, trusted = response.refined(axis)
         # Between lines and beyond those that are coherent the fitted model stands, where it fits.
@@ -71,7 +65,7 @@ class MeasuredAxis:
     def margins(self, gains: Integers) -> dict[str, Margins]:
         """Return the margins of the judged loops with gains, (count,)."""
         loops = self.open_loops(gains[None])
-        found = {loop: margins(self._f, loops[loop][0], self._trusted) for loop in self._loops}
+        found = {loop: margins(self._f, loops[loop][0], self._trusted) for loop in LOOPS}
         # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
         return {
             loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()
@@ -99,7 +93,7 @@ class MeasuredAxis:
         """Return the least clearance of the judged loops, (sets,); below 0 where they would be unstable."""
         before, now = self.open_loops(self._gains[None]), self.open_loops(gains)
         least = np.full(len(gains), np.inf)
-        for loop in self._loops:
+        for loop in LOOPS:
             # With the gains of the measurement the loop was stable: others are if 1 + L turns round 0 as often.
             turned = np.unwrap(np.angle((1.0 + now[loop]) / (1.0 + before[loop])), axis=1)
             stable = np.abs(turned[:, -1] - turned[:, 0]) < math.pi

@@ -9,7 +9,7 @@ cost cannot be measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
 from drive_env.trials.score import TRIPPED, RobustScore, robust_cost
+from tuning.auto.loop_model import corner
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -141,12 +142,12 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
     total = plant.inertia * _factor(world.inertia, spread.inertia)
     anti_resonance = plant.anti_resonance * _factor(world.anti_resonance, spread.anti_resonance)
     resonance = max(plant.resonance * _factor(world.resonance, spread.resonance), LEAST_RATIO * anti_resonance)
-    corner = _corner(device, plant) * _factor(world.filter, spread.filter)
+    filtered = corner(device, plant) * _factor(world.filter, spread.filter)
     values = {
         "motor.R_s": plant.R,
         "motor.L_d": plant.L,
         "motor.L_q": plant.L,
-        "stage.velocity_filter": float(np.clip(corner, SLOWEST_FILTER, 0.4 * device.velocity_rate)),
+        "stage.velocity_filter": float(np.clip(filtered, SLOWEST_FILTER, 0.4 * device.velocity_rate)),
         "motor.cogging_torque": motor.cogging_torque * world.cogging,
         "stage.adc_noise": device.stage["adc_noise"].default if world.adc_noise is None else world.adc_noise,
         "stage.supply_resistance": device.stage["supply_resistance"].default
@@ -172,18 +173,6 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
     values["motor.viscous"] = min(viscous, motor.viscous)
     values["load.viscous"] = viscous - values["motor.viscous"]
     return values
-
-
-def _corner(device: Device, plant: Plant) -> float:
-    """Return the corner of the velocity filter [Hz] that delays as much as filter and delay of an axis together.
-
-    An emulated drive has no delay besides its own; low frequencies hardly distinguish the two lags.
-    """
-    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING
-
-    lag = VELOCITY_FILTER_DAMPING / math.pi
-    more = plant.delay - 1.0 / device.velocity_rate
-    return lag / max(lag / plant.velocity_filter + more, 1e-6)
 
 
 def _factor(way: float, spread: float) -> float:
@@ -243,31 +232,14 @@ class Twins:
 
     def judge(self, gains: Integers) -> tuple[Floats, Floats]:
         """Return the robust performance of gains over the worlds and how far they keep the constraints, as `score`."""
-        performance, slack = self._each(gains, lambda part, rows: part.judge(rows))
-        return performance, slack
-
-    def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
-        """Return by how much loops keep the margins of the dynamics on the first world, relative, (n, any sets).
-
-        Args:
-            gains: Raw integers, (n, any sets, count).
-            nominal: Whether to look at the machines as they are alone, not at their variants.
-        """
-        return np.asarray(self._each(gains, lambda part, rows: (part.slack(rows, nominal),))[0])
-
-    def _each(self, gains: Integers, function: Callable[[_Part, Integers], tuple[Floats, ...]]) -> Floats:
-        """Apply a function to as many sets of gains at a time as run at once; return (values, n, any sets)."""
-        found: Floats | None = None
+        found = np.empty((2, *gains.shape[:2]))
         for first in range(0, gains.shape[1], self.sets):
             rows = gains[:, first : first + self.sets]
             count = rows.shape[1]
             whole = np.concatenate([rows, np.repeat(rows[:, -1:], self.sets - count, axis=1)], axis=1)
             for part in self._parts:
-                values = np.array(function(part, whole[part.axes]))[:, :, :count]
-                found = np.empty((len(values), *gains.shape[:2])) if found is None else found
-                found[:, part.axes, first : first + count] = values
-        assert found is not None, "there are gains"
-        return found
+                found[:, part.axes, first : first + count] = np.array(part.judge(whole[part.axes]))[:, :, :count]
+        return found[0], found[1]
 
     def close(self) -> None:
         """Close the emulated machines."""
@@ -332,12 +304,6 @@ class _Part:
         swing = found.swing.max(axis=1).reshape(self._shape).max(axis=2)
         slack = np.minimum(slack, 1.0 - np.minimum(swing / MOST_SWING, 1.0 - TRIPPED))
         return np.asarray(worth), slack
-
-    def slack(self, gains: Integers, nominal: bool) -> Floats:
-        """Return the slack of the loops on the first world, (axes, sets)."""
-        every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
-        first = np.arange(math.prod(self._shape)) % self._shape[2] == 0
-        return self._robust.loop_slack(every, first, nominal).reshape(self._shape[:2])
 
     def close(self) -> None:
         self._robust.close()

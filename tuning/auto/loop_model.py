@@ -1,0 +1,262 @@
+"""Identified machines as linear ones, as they are and as they may become: margins of their outer loops with any gains.
+
+An axis of its own is a rotor with a disc, rigid or on one spring. The two ends of one part, as of a gantry, are two
+rotors on one mass that turns out of square on a spring: the response of each, with the other one off, says how much of
+the mass moves with it (its anti-resonance holds the end itself, its resonance neither), and together they say it all.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.loops.dynamics import loop_clearance
+from drive_env.loops.margins import margins
+from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, Windings, linear_machines, open_loops
+from drive_env.loops.worst_margins import HIGHEST, LOWEST, POINTS
+from drive_env.trials.score import VARIANTS
+from tuning.response.measured_loop import GOOD_MISFIT
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from drive_env.devices import Device
+    from drive_env.loops.dynamics import Dynamics
+    from drive_env.loops.linear_model import Plant
+    from drive_env.loops.margins import Margins
+    from drive_env.loops.sampled import OuterLoops
+    from drive_env.motors import Motor
+    from tuning.auto.stages import Basis, RecordedGains
+    from tuning.identify.estimate import Identification
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+AT_ONCE = 512  # machines that are computed at once
+TWIST = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of two inertias on one spring
+
+
+class Mechanism(NamedTuple):
+    """What rotors move: M q'' + D q' + K q = torque, (joints, joints) each; what each turns, (axes, joints)."""
+
+    M: Floats
+    D: Floats
+    K: Floats
+    rotors: Floats
+
+    def varied(self, rotor: float, inertia: float, stiffness: float) -> Mechanism:
+        """Return it with other inertia and stiffness of what is beyond the rotors, each of this inertia [kg*m^2]."""
+        own = self.rotors.T @ (np.minimum(rotor, np.diag(self.rotors @ self.M @ self.rotors.T))[:, None] * self.rotors)
+        return self._replace(M=own + inertia * (self.M - own), K=stiffness * self.K)
+
+
+def one_axis(plant: Plant) -> Mechanism:
+    """Return what an axis moves that is alone."""
+    if not plant.is_elastic:
+        return Mechanism(np.array([[plant.inertia]]), np.array([[plant.viscous]]), np.zeros((1, 1)), np.eye(1))
+    rotor = plant.rotor_inertia
+    stiffness = (plant.inertia - rotor) * (2.0 * math.pi * plant.anti_resonance) ** 2
+    damping = 2.0 * plant.damping * stiffness / (2.0 * math.pi * plant.resonance)
+    return Mechanism(
+        np.diag([rotor, plant.inertia - rotor]), damping * TWIST + np.diag([plant.viscous, 0.0]), stiffness * TWIST,
+        np.eye(2)[:1],
+    )  # fmt: skip
+
+
+def two_ends(first: Plant, second: Plant) -> Mechanism | None:
+    """Return what two axes move that drive one part, by what each moves while the other one is off.
+
+    Args:
+        first: One axis; its inertia is the whole one, its anti-resonance that of the part on the other rotor.
+        second: The other axis, likewise.
+
+    Returns:
+        None where neither knows its resonance, or no mass has these frequencies.
+    """
+    elastic = [plant for plant in (first, second) if plant.is_elastic]
+    if not elastic:
+        return None
+    total = math.sqrt(first.inertia * second.inertia)
+    w = float(np.mean([plant.resonance for plant in elastic])) * 2.0 * math.pi
+    held = [(plant if plant.is_elastic else elastic[0]).anti_resonance * 2.0 * math.pi for plant in (first, second)]
+    u, v, free = 1.0 / held[0] ** 2, 1.0 / held[1] ** 2, 1.0 / w**2
+    half = u + v - 2.0 * free
+    if half <= abs(u - v):
+        return None
+    k = total / (half + math.sqrt(half**2 - (u - v) ** 2))
+    own = np.diag([k * v, k * u])
+    M = own + 0.5 * (total - own.sum()) * np.array([[0.0, 1.0], [1.0, 0.0]])
+    damping = 2.0 * float(np.mean([plant.damping for plant in elastic])) * k / w
+    viscous = 0.25 * (first.viscous + second.viscous) * np.eye(2)
+    # Each inertia is told by its own torque constant: that of the other axis may be another.
+    scale = np.sqrt([first.inertia / total, second.inertia / total])
+    scale = np.outer(scale, scale)
+    return Mechanism(M * scale, damping * TWIST + viscous, k * TWIST, np.eye(2))
+
+
+class LoopModel:
+    """The outer loops of one machine with any gains.
+
+    Args:
+        device: The drive.
+        motor: The motor; its rotor's inertia stays where that of the load becomes another.
+        plants: Its axes; what their windings, filters and delays are.
+        moved: What they move.
+    """
+
+    def __init__(self, device: Device, motor: Motor, plants: Sequence[Plant], moved: Mechanism) -> None:
+        self.device, self.axes = device, len(plants)
+        self._velocity_p = np.array([variant.velocity_p for variant in VARIANTS])
+        parts = [moved.varied(motor.inertia, variant.inertia, variant.stiffness) for variant in VARIANTS]
+
+        def each(values: Sequence[float]) -> Floats:
+            return np.tile(values, (len(parts), 1))
+
+        torque = [plant.torque_constant for plant in plants]
+        emf = [t / 1.5 if math.isnan(p.emf_constant) else p.emf_constant for t, p in zip(torque, plants, strict=True)]
+        windings = Windings(
+            each([plant.R for plant in plants]), each([plant.L for plant in plants]), each(emf), each(torque),
+            each([plant.supply for plant in plants]), each([corner(device, plant) for plant in plants]),
+        )  # fmt: skip
+        M, D, K = (np.array([getattr(part, name) for part in parts]) for name in ("M", "D", "K"))
+        self._machines = linear_machines(windings, M, D, K, moved.rotors)
+
+    def slack(self, dynamics: Dynamics, gains: Integers, *, nominal: bool = False) -> Floats:
+        """Return how far the loops keep the dynamics, relative, (sets,): 0 where a constraint is just kept.
+
+        Args:
+            dynamics: What they must keep.
+            gains: Raw, (sets, axes, count).
+            nominal: Whether to look at the machine as it is alone, not at what it may become.
+        """
+        count = 1 if nominal else len(self._velocity_p)
+        size = max(AT_ONCE // count, 1)
+        parts = [self._slack(dynamics, gains[k : k + size], count) for k in range(0, len(gains), size)]
+        return np.concatenate(parts)
+
+    def kept(self, dynamics: Dynamics, gains: Integers) -> dict[str, float]:
+        """Return how much of the dynamics the machine keeps as it may become, by the name of what is different.
+
+        Args:
+            dynamics: What is 1.
+            gains: Raw, (axes, count).
+        """
+        clearance, _ = self._clearance(dynamics, gains[None], len(VARIANTS))
+        rows = zip(VARIANTS[1:], clearance[0, 1:].tolist(), strict=True)
+        return {variant.name: max(kept, 0.0) for variant, kept in rows}
+
+    def _slack(self, dynamics: Dynamics, gains: Integers, count: int) -> Floats:
+        clearance, overshoot = self._clearance(dynamics, gains, count)
+        return dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
+
+    def _clearance(self, dynamics: Dynamics, gains: Integers, count: int) -> tuple[Floats, Floats]:
+        """Return the clearance of the first variants, (sets, count), and the overshoot of a csp step, (sets,)."""
+        sets = len(gains)
+        machines = LinearMachines(*(np.tile(part[:count], (sets, 1, 1)[: part.ndim]) for part in self._machines))
+        raw = np.repeat(gains, count, axis=0).reshape(-1, gains.shape[-1])
+        raw = self.device.gains.with_velocity_p(raw, np.tile(np.repeat(self._velocity_p[:count], self.axes), sets))
+        cascade = CascadeGains.of(self.device, raw.reshape(sets * count, self.axes, -1))
+        clearance, overshoot = loop_clearance(dynamics, LoopRates.of(self.device), machines, cascade)
+        return clearance.reshape(sets, count), overshoot.reshape(sets, count)[:, 0]
+
+    def open_loops(self, gains: Integers, f: Floats) -> OuterLoops:
+        """Return the open loops of the machine as it is, each with the others closed, (axes, n).
+
+        Args:
+            gains: Raw, (axes, count).
+            f: Frequencies [Hz], (n,).
+        """
+        machine = LinearMachines(*(part[:1] for part in self._machines))
+        loops = open_loops(LoopRates.of(self.device), machine, CascadeGains.of(self.device, gains[None]), f[None])
+        return type(loops)(*(loop[0] for loop in loops))
+
+
+def corner(device: Device, plant: Plant) -> float:
+    """Return the corner of the velocity filter [Hz] that delays as much as filter and delay of an axis together.
+
+    An emulated drive has no delay besides its own; low frequencies hardly distinguish the two lags.
+    """
+    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING
+
+    lag = VELOCITY_FILTER_DAMPING / math.pi
+    more = plant.delay - 1.0 / device.velocity_rate
+    return lag / max(lag / plant.velocity_filter + more, 1e-6)
+
+
+class LinkedAxis:
+    """One of two linked axes with any gains, the other one's as they are: as `MeasuredAxis`, by the model of both.
+
+    Args:
+        model: Of their machine, by the measured responses of both.
+        axis: Which of the two.
+        gains: Raw, of both, (2, count).
+    """
+
+    def __init__(self, model: LoopModel, axis: int, gains: Integers) -> None:
+        self._model, self._axis, self._gains = model, axis, gains
+
+    def _whole(self, gains: Integers) -> Integers:
+        whole = np.repeat(self._gains[None], len(gains), axis=0)
+        whole[:, self._axis] = gains
+        return whole
+
+    def margins(self, gains: Integers) -> dict[str, Margins]:
+        """Return the margins of the outer loops with gains, (count,)."""
+        f = np.geomspace(LOWEST, HIGHEST * self._model.device.velocity_rate, POINTS)
+        loops = self._model.open_loops(self._whole(gains[None])[0], f)
+        return {name: margins(f, loop[self._axis]) for name, loop in zip(loops._fields, loops, strict=True)}
+
+    def slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
+        """Return how far the machine keeps the dynamics with gains of this axis, raw, (sets, count): (sets,)."""
+        return self._model.slack(dynamics, self._whole(gains))
+
+
+def fitted_plant(basis: Basis, recorded: RecordedGains | None, k: int) -> tuple[Plant, Identification]:
+    """Return the plant of an axis and what is known of it: as identified, and as its response was fitted last."""
+    plant, found = basis.identified.known(k)
+    if np.isfinite(found.together):
+        plant = replace(plant, inertia=found.together)  # what all axes move, each its share
+    fit = None if recorded is None or recorded.response is None or recorded.unseen[k] else recorded.response.fits[k]
+    if fit is None or fit.reason or fit.misfit > GOOD_MISFIT:
+        return plant, found
+    fitted = replace(fit.plant, R=plant.R, L=plant.L, supply=plant.supply)
+    known = {name: one for name, one in fit.estimates.items() if one.is_known and name in found.estimates}
+    return fitted, replace(found, estimates={**found.estimates, **known})
+
+
+def loop_models(
+    target: Target, basis: Basis, recorded: RecordedGains | None, where: Mask
+) -> list[tuple[LoopModel, Integers]]:
+    """Return the models of chosen axes: of each machine of two linked ones, of every other axis alone, and its axes."""
+    models = []
+    for axes in np.flatnonzero(where).reshape(-1, 2) if is_pair(target) else np.flatnonzero(where)[:, None]:
+        plants = [fitted_plant(basis, recorded, int(k))[0] for k in axes]
+        moved = two_ends(*(alone(basis, recorded, int(k)) for k in axes)) if is_pair(target) else None
+        if moved is not None:
+            models.append((LoopModel(target.device, target.motor, plants, moved), axes))
+            continue
+        for k, plant in zip(axes, plants, strict=True):
+            rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf) if target.linked else plant
+            models.append((LoopModel(target.device, target.motor, [rigid], one_axis(rigid)), np.array([k])))
+    return models
+
+
+def is_pair(target: Target) -> bool:
+    """Return whether a machine is the two ends of one part."""
+    return target.linked and target.axes_per_machine == 2
+
+
+def alone(basis: Basis, recorded: RecordedGains | None, k: int) -> Plant:
+    """Return the plant of one of two linked axes while the other one is off: it moves the whole part."""
+    plant, found = basis.identified.known(k)
+    fits = [found.fit]
+    if recorded is not None and recorded.response is not None and not recorded.unseen[k]:
+        fits.append(recorded.response.fits[k])
+    good = [fit for fit in fits if fit is not None and not fit.reason and fit.misfit <= GOOD_MISFIT]
+    return good[-1].plant if good else replace(plant, inertia=2.0 * plant.inertia)
