@@ -13,7 +13,8 @@ from drive_env.gains import cascade_columns
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto import design as module
-from tuning.auto.design import _of_each, design
+from tuning.auto.design import Judge, _of_each, design
+from tuning.auto.loop_model import LoopModel, one_axis
 from tuning.auto.twin import WORLDS, FrictionGuess, Known, Spread, Twins, least_gains
 from tuning.target import emulated
 
@@ -31,8 +32,10 @@ def known(load):
 def both_twins(load):
     """Return twins for the many and for the few, and the plant."""
     one, scaler = known(load)
+    models = [(LoopModel(DEVICE, MOTOR, [one.plant], one_axis(one.plant)), np.array([0]))]
     coarse = Twins(DEVICE, MOTOR, [one], scaler, 32, worlds=WORLDS[:1], num_threads=1)
-    return coarse, Twins(DEVICE, MOTOR, [one], scaler, 32, repeats=2, num_threads=1), one.plant
+    fine = Twins(DEVICE, MOTOR, [one], scaler, 32, repeats=2, num_threads=1)
+    return Judge(coarse, models, [None]), Judge(fine, models, [None]), one.plant
 
 
 @pytest.fixture(scope="module", params=["inertia", "belt"])
@@ -82,13 +85,16 @@ def test_velocity_p_stays_below_what_the_drive_has_shown_to_be_too_much(designed
 
 
 # --- on a judge whose truth is known ----------------------------------------------------------------------------------
-class Judge:
+class Bounds:
     """The faster the better, but for a bound of velocity P and of position P over velocity I."""
 
-    device, num_axes = DEVICE, 1
+    twins = SimpleNamespace(device=DEVICE, num_axes=1)
 
     def __init__(self, most=900.0):
         self.most, self.asked = most, 0
+
+    def of_machines(self, values, reduce):
+        return values
 
     def slack(self, gains, *, nominal=False):
         ratio = gains[..., POSITION_P] / gains[..., VELOCITY_I]
@@ -102,7 +108,7 @@ class Judge:
 
 def test_it_comes_to_the_border_of_the_constraints_and_not_across():
     plant = known("inertia")[0].plant
-    coarse, fine = Judge(), Judge()
+    coarse, fine = Bounds(), Bounds()
     found = design(coarse, fine, [plant])
     assert 0.0 < found.slack[0, 0] < 0.1
     assert 0.9 * 900 < found.gains[0, 0, VELOCITY_P] < 900
@@ -110,7 +116,7 @@ def test_it_comes_to_the_border_of_the_constraints_and_not_across():
 
 
 def test_where_no_gains_keep_the_constraints_the_nearest_are_found_and_that_is_said():
-    found = design(Judge(most=0.5), Judge(most=0.5), [known("inertia")[0].plant])
+    found = design(Bounds(most=0.5), Bounds(most=0.5), [known("inertia")[0].plant])
     assert found.slack[0, 0] < 0.0
     assert found.gains[0, 0, VELOCITY_P] == found.gains[0, :, VELOCITY_P].min() < 100
 
@@ -127,19 +133,37 @@ def test_what_say_raises_ends_a_design():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        design(Judge(), Judge(), [known("inertia")[0].plant], stop)
+        design(Bounds(), Bounds(), [known("inertia")[0].plant], stop)
 
 
-def test_the_design_is_made_for_the_worst_of_measurement_and_twin():
-    """What a measured loop refuses is refused, whatever the twin says of it."""
-    from tuning.auto.correction import _Corrected
+def judged(slack, models, axes=1):
+    """Return a judge whose measured loops have slack by their velocity P, and twins that cost 2.0 and keep all."""
+    twins = SimpleNamespace(
+        dynamics=None, num_axes=axes, device=DEVICE, judge=lambda gains: (np.full(gains.shape[:2], 2.0), 1.0)
+    )
+    measured = SimpleNamespace(slack=lambda dynamics, gains: slack(gains[:, VELOCITY_P]))
+    return Judge(twins, models, [measured] * axes)
 
-    twins = Judge()
-    twins.dynamics = None
-    twins.judge = lambda gains: (np.ones(gains.shape[:2]), twins.slack(gains))
-    measured = SimpleNamespace(slack=lambda dynamics, gains: 1.0 - gains[:, VELOCITY_P] / 400.0)
-    both = _Corrected(twins, [measured])
-    rows = np.full((1, 3, DEVICE.gains.count), 100)
-    rows[0, :, POSITION_P], rows[0, :, VELOCITY_P] = 10, (300, 500, 1000)
+
+def sets(*velocity_p):
+    """Return sets of gains with these velocity P, (sets, count)."""
+    rows = np.full((len(velocity_p), DEVICE.gains.count), 100)
+    rows[:, VELOCITY_P] = velocity_p
+    return rows
+
+
+def test_the_design_is_made_for_the_worst_of_measurement_and_model():
+    """What a measured loop refuses is refused, whatever the model says of it."""
+    model = SimpleNamespace(slack=lambda dynamics, gains, nominal: 1.0 - gains[:, 0, VELOCITY_P] / 900.0)
+    both = judged(lambda p: 1.0 - p / 400.0, [(model, np.array([0]))])
+    rows = sets(300, 500, 1000)[None]
     assert both.slack(rows)[0] == pytest.approx([0.25, -0.25, -1.5])
     assert (both.score(rows)[0] < 30.0).tolist() == [True, False, False]
+
+
+def test_axes_of_one_machine_have_one_slack_and_the_worst_cost():
+    model = SimpleNamespace(slack=lambda dynamics, gains, nominal: 1.0 - gains[..., VELOCITY_P].max(axis=1) / 900.0)
+    both = judged(lambda p: np.ones(len(p)), [(model, np.array([0, 1]))], axes=2)
+    rows = np.array([sets(300, 600), sets(450, 450)])
+    np.testing.assert_allclose(both.slack(rows), [[0.5, 1.0 / 3.0]] * 2)
+    np.testing.assert_array_equal(*both.score(rows))

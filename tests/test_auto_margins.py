@@ -157,9 +157,22 @@ def test_gains_before_that_are_kept_are_not_rejected_for_what_they_were(monkeypa
     assert not bench.journals[0].reason and len(bench.journals[0].reservations) == 1
 
 
-def verdict_on(found, overshoot, monkeypatch):
+@pytest.mark.parametrize(("kept", "verdict"), [(0.5, ""), (0.38, ""), (0.35, "reserved"), (0.1, "rejected")])
+def test_a_machine_as_it_may_become_keeps_less_of_the_dynamics_and_not_nothing(kept, verdict, monkeypatch):
+    """Of standard dynamics 40 %, less what a model is off; of stiff ones likewise."""
+    bench, start = verdict_on({"velocity": SOUND, "position": SOUND}, 0.1, monkeypatch)
+    stiff = SimpleNamespace(kept=lambda dynamics, gains: {"x": kept * (1.4 if dynamics.name == "stiff" else 1.0)})
+    monkeypatch.setattr(auto_margins, "loop_models", lambda *given: [(stiff, np.array([0]))])
+    auto_margins.judge(bench, basis(start.gains), start)
+    (journal,) = bench.journals
+    assert ("rejected" if journal.reason else "reserved" if journal.reservations else "") == verdict, vars(journal)
+
+
+def verdict_on(found, overshoot, monkeypatch, variant=1.0):
     """Return a bench of one axis whose measured loops have these margins, and its gains."""
     monkeypatch.setattr(auto_margins, "measured_axis", lambda *given: SimpleNamespace(margins=lambda gains: found))
+    model = SimpleNamespace(kept=lambda dynamics, gains: {"load inertia x 2": variant})
+    monkeypatch.setattr(auto_margins, "loop_models", lambda *given: [(model, np.array([0]))])
     gains = np.array([[4000, 1500, 500, 300, 100]])
     response = SimpleNamespace(
         gains=gains, notes=((),), at_least=lambda *given: AtLeast(50.0, 9.0), fits=(None,), open_loop=np.ones((9, 1))

@@ -31,7 +31,8 @@ from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto.checks import unsafe_gains
-from tuning.auto.design import design
+from tuning.auto.design import Judge, design
+from tuning.auto.loop_model import LoopModel, one_axis
 from tuning.auto.one_button import auto
 from tuning.auto.twin import FrictionGuess, Known, Twins, least_gains
 from tuning.certificate.certificate import si_gains
@@ -192,7 +193,8 @@ def test_a_design_on_twins_stays_within_its_ranges(device):
     assert least_gains(device).tolist() == [1, 1, 20, 1, 1]  # a T_i of 0.65 s
     known = Known(RIGID, FrictionGuess(0.1, 1e-4), 10.0)
     with Twins(device, MOTOR, [known], np.array([65536.0]), 16) as twins:
-        found = design(twins, twins, [RIGID])
+        judge = Judge(twins, [(LoopModel(device, MOTOR, [RIGID], one_axis(RIGID)), np.array([0]))], [None])
+        found = design(judge, judge, [RIGID])
     assert found.cost[0, 0] < 10.0 and found.slack[0, 0] > 0.0
     assert (found.gains >= least_gains(device)).all() and (found.gains <= device.gains.highest).all()
 

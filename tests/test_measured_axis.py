@@ -32,12 +32,12 @@ def raw(inertia, velocity, position, integration):
     )
 
 
-def measured(plant, gains, f=F, loops=BOTH, trusted=None, fit=None):
+def measured(plant, gains, f=F, trusted=None, fit=None):
     """Return an axis whose measured velocity loop is the model's, without noise."""
     L = velocity_open_loop(DEVICE, plant, gains, f)
     good = np.ones(len(f), bool) if trusted is None else trusted
     response = SimpleNamespace(device=DEVICE, fits=(fit,), gains=gains[None], refined=lambda axis: (f, L, good))
-    return MeasuredAxis(response, 0, plant, loops)
+    return MeasuredAxis(response, 0, plant)
 
 
 @pytest.fixture(scope="module", params=["inertia", "two_mass"])
@@ -107,14 +107,6 @@ def test_many_sets_at_once_are_each_by_itself():
     rows = np.array([raw(inertia, 20.0 + k, 5.0 + 0.3 * k, 5.0) for k in range(AT_ONCE + 5)])
     alone = [float(seen.slack(STANDARD, row[None])[0]) for row in rows[::17]]
     assert seen.slack(STANDARD, rows)[::17] == pytest.approx(alone)
-
-
-def test_of_linked_axes_the_velocity_loop_alone_is_judged():
-    """Its position loop is not that of one axis: the others move it, too."""
-    _, inertia, plant = machine_of("inertia")
-    gains = raw(inertia, *UNSTABLE[0])  # whose position loop is unstable
-    alone = measured(plant, raw(inertia, *SOFT), loops=("velocity",))
-    assert [*alone.margins(gains)] == ["velocity"] and alone.slack(STANDARD, gains[None])[0] > 0.0
 
 
 def test_lines_that_are_not_coherent_count_only_where_a_model_fits():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.auto.bench import LOOK_BACK_TIME
-from tuning.auto.twin import Known, known_of
 from tuning.link_energy import trial_reach
 
 if TYPE_CHECKING:
@@ -39,20 +38,11 @@ class IdentifiedAxes:
     found: tuple[Identification | None, ...]
     plants: tuple[Plant | None, ...]
 
-    @property
-    def doubtful(self) -> tuple[bool, ...]:
-        """Whether the model of an axis, and so its digital twins, is of an axis as it is not."""
-        return tuple(one is not None and bool(one.doubt) for one in self.found)
-
     def known(self, axis: int) -> tuple[Plant, Identification]:
         """Return model and identification of an axis that goes on."""
         plant, found = self.plants[axis], self.found[axis]
         assert plant is not None and found is not None, "an axis in the run has both"
         return plant, found
-
-    def twins(self, axes: Iterable[int], reach: Floats) -> list[Known]:
-        """Return the data of the digital twins of axes; `reach` is how far rotors may turn [rad], (num_axes,)."""
-        return [known_of(*self.known(axis), float(reach[axis])) for axis in axes]
 
 
 @dataclass(frozen=True)
