@@ -70,7 +70,6 @@ def scores_of(device_name, load, parameters, sets, dynamics="standard", repeats=
         scale = drives.read(Role.POSITION_SCALE)
         score.set_moves(plan_move(motor, inertia.reshape(-1), scale, np.tile(reach(load), count)))
     J = inertia.reshape(count, -1)[0]
-    score.set_reference(np.tile(gains_of(RULE, device, motor, J, supply), (count, 1)))
     found = score.score(np.concatenate([gains_of(wanted, device, motor, J, supply) for wanted in sets]))
     score.close()
     return found
