@@ -248,7 +248,6 @@ def _score():  # type: ignore[no-untyped-def]
         scorer.set_machines(drives.machine.parameters, drives.machine.supply)
     scorer.set_moves(plan_move(motor, np.full(1, BELT_INERTIA), 65536, reach("belt")))
     rule = rule_gains(find_device("tmcm1636"), motor, [BELT_INERTIA])
-    scorer.set_reference(rule)
     return scorer, rule
 
 

@@ -1,7 +1,7 @@
 """Fit the rule of drive_env/gains.py: `python -m research.fit_rule` tries sets of constants on random machines.
 
 Every set of constants is scored by the mean of ln robust cost over all machines of all loads: the mean of a logarithm,
-so that a machine's own scale does not count, nor E_0, which no set of constants has a say in.
+so that a machine's own scale does not count.
 """
 
 from __future__ import annotations
@@ -53,11 +53,6 @@ class Bench:
             self.score_of.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
             scaler = drives.read(Role.POSITION_SCALE)
             self.score_of.set_moves(plan_move(self.motor, self.inertia, scaler, np.tile(reach(load), machines)))
-        self.set_reference(BASELINE_RULE)
-
-    def set_reference(self, rule: Rule) -> None:
-        """Take E_0 from a rule."""
-        self.score_of.set_reference(rule_gains(self.device, self.motor, self.inertia, rule))
 
     def score(self, rule: Rule) -> Scores:
         """Return the scores of a rule's gains on these machines."""
@@ -108,7 +103,6 @@ def main() -> None:
     print(best.rule, f"mean ln robust cost {best.score:.3f}; before {dict(found)[BASELINE_RULE]:.3f}")
     for load in LOADS:
         bench = Bench(load, options.motor, options.machines, options.seed + 1)
-        bench.set_reference(best.rule)
         scores = bench.score(best.rule)
         low, middle, high = np.percentile(scores.robust_cost, (5, 50, 95))
         print(f"{load}: robust cost {middle:.2f} ({low:.2f} ... {high:.2f}) on {options.machines} unseen machines")

@@ -97,7 +97,7 @@ def test_a_drive_is_tuned_whatever_gains_it_had(five, axis):
     J = np.array([true_plant(drives, axis).inertia])
     hidden.set_machines({k: v[[axis]] for k, v in drives.machine.parameters.items()}, drives.machine.supply[[axis]])
     hidden.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0))[[axis]], np.array([np.inf])))
-    rule = hidden.set_reference(rule_gains(drives.device, drives.motor, J)).performance[0]
+    rule = hidden.score(rule_gains(drives.device, drives.motor, J)).performance[0]
     scores = hidden.score(after[[axis]])
     assert scores.performance[0] < 1.3 * rule and scores.slack[0] > -0.1, scores
     hidden.close()
@@ -520,7 +520,7 @@ def hidden_ratio(target, machines, found):
     reach = np.where(target.high >= -target.low, target.high, target.low)
     score.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0)), reach))
     rule = [rule_gains(drives.device, drives.motor, j, supply=v)[0] for j, v in zip(J, target.supply, strict=True)]
-    reference = score.set_reference(np.array(rule)).performance
+    reference = score.score(np.array(rule)).performance
     scores = score.score(found)
     score.close()
     return scores.performance / reference, scores.slack

@@ -13,7 +13,7 @@ from drive_env.gains import cascade_columns
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto import design as module
-from tuning.auto.design import Judge, _of_each, design
+from tuning.auto.design import LEAST_TORQUE, Judge, _around, _of_each, design
 from tuning.auto.loop_model import LoopModel, one_axis
 from tuning.auto.twin import WORLDS, FrictionGuess, Known, Spread, Twins, least_gains
 from tuning.target import emulated
@@ -69,7 +69,8 @@ def test_no_random_search_finds_much_better_gains(designed):
     rng, best = np.random.default_rng(7), found.gains[0, 0]
     factors = np.exp(rng.uniform(np.log(0.3), np.log(3.0), (300, DEVICE.gains.count)))
     rows = np.maximum(np.rint(best * factors), least_gains(DEVICE)).astype(np.int64)
-    rows[:, TORQUE_P] = np.minimum(rows[:, TORQUE_P], found.gains[0, :, TORQUE_P].max())
+    most = found.gains[0, :, TORQUE_P].max()
+    rows[:, TORQUE_P] = np.clip(rows[:, TORQUE_P], LEAST_TORQUE * most, most)
     searched = fine.score(rows[None])[0]
     assert found.cost[0, 0] < 1.3 * searched.min()
     assert found.cost[0, 0] < 0.3 * np.median(searched), "most of them keep no constraints"
@@ -126,6 +127,13 @@ def test_of_every_bandwidth_the_most_promising_that_keep_the_constraints_are_loo
     slack = np.array([[0.1, 0.2, -0.1, 0.3, -0.3, -0.1, -0.2, -0.4]])
     promise = np.array([[3.0, 2.0, 1.0, 4.0, 1.0, 2.0, 3.0, 4.0]])
     assert _of_each(slack, promise, 2).tolist() == [[1, 0, 5, 6]], "of the second one those that come nearest"
+
+
+def test_torque_p_is_looked_for_between_three_tenths_of_its_greatest_and_that():
+    for torque_p in (1000, 310):
+        near = _around(DEVICE, np.array([torque_p, 200, 800, 100, 50]), 1.25, 1000)[:, TORQUE_P]
+        assert (near.min(), near.max()) == (max(round(torque_p / 1.25), 300), min(round(torque_p * 1.25), 1000))
+    assert min(module.TORQUES) >= LEAST_TORQUE
 
 
 def test_what_say_raises_ends_a_design():

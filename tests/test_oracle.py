@@ -22,10 +22,13 @@ def test_nothing_near_the_oracle_keeps_the_constraints_and_is_better(machine):
     rng = np.random.default_rng(5)
     near = np.exp(rng.normal(0.0, 0.1, (48, *best.gains.shape)))
     near[..., 1] = 1.0  # torque I follows the winding
-    near[..., 0] = np.minimum(near[..., 0], 1.0)  # and P may not go beyond its phase margin
     yardstick = Yardstick([machine], None, copies=len(near))
-    scores = yardstick.score(np.rint(best.gains * near).astype(np.int64).reshape(-1, best.gains.shape[1]))
+    box = module._Box.of(yardstick)
+    scores = yardstick.score(box.whole(np.log(best.gains * near)).reshape(-1, best.gains.shape[1]))
     yardstick.close()
+    # P of the current loop keeps 60 degrees, and is no low-pass of the velocity loop either.
+    assert box.least[0, 0] - box.most[0, 0] == pytest.approx(np.log(0.3))
+    assert np.abs(np.log(best.gains) - np.clip(np.log(best.gains), box.least, box.most)).max() < 1e-3
     assert best.slack > 0.0
     assert scores.performance[scores.slack > 0.0].min() > 0.97 * best.performance
 

@@ -151,9 +151,10 @@ def _add_robust_cost(machines: Sequence[Machine], sides: Sequence[Evaluation]) -
     ]
     yardstick = Yardstick(group, num_threads=1)
     try:
+        rule = yardstick.score(yardstick.rule_gains).robust_cost
         for side in sides:
             costs = yardstick.score(np.concatenate([_answer(episode) for episode in side.episodes])).robust_cost
-            side.values = {ROBUST_COST: list(map(float, costs / yardstick.rule)), **side.values}
+            side.values = {ROBUST_COST: list(map(float, costs / rule)), **side.values}
             side.lower_is_better = {ROBUST_COST: True, **side.lower_is_better}
     finally:
         yardstick.close()

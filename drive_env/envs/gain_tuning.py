@@ -336,7 +336,7 @@ class GainTuning(VectorEnvironment):
         if self._score is not None:
             self._score.set_machines(self._parameters, self._volts(), mask)
             self._score.set_moves(self._move, mask)
-            robust_cost = self._score.set_reference(self._rule, mask).robust_cost
+            robust_cost = self._score.score_rule(self._rule, mask).robust_cost
             self._robust_cost = np.where(mask, robust_cost, self._robust_cost)
         drives.emergencies()
         info = self._told()

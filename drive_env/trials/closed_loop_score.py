@@ -32,7 +32,7 @@ from drive_env.trials.positioning import (
     wrapped,
     write_profile,
 )
-from drive_env.trials.score import LOAD_SHARE, CurrentSwings, RobustScore, Terms, swings
+from drive_env.trials.score import LOAD_SHARE, CurrentSwings, StepperScore, Terms, swings
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -43,7 +43,7 @@ AWAY = 4.0  # full steps
 LONGEST_PUSH = 30  # ms
 
 
-class ClosedLoopScore(RobustScore):
+class ClosedLoopScore(StepperScore):
     """As `RobustScore`, of steppers whose loop is closed."""
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:

@@ -43,6 +43,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.rotor_swing import EXPLAINED, LENGTH, FreeSwing, inertia_of_swings
+from drive_env.trials.score import below_trip
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -74,7 +75,6 @@ STIFF_SHARE = 0.6  # of the ramp's inertia, below which a swing is that of the r
 # Scales of the terms of J.
 LOAD_ANGLE = 0.5  # full steps, 45 degrees electrical: 30 % of the torque are left
 VIBRATION = 0.1  # full steps from millisecond to millisecond
-TRIP = 30.0
 OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.02, 0.1
 
 
@@ -133,8 +133,9 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
 
     J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 q^0.4 (1 + (a/0.5)^2)^0.2 (1 + (n/0.1)^2)^0.2 (1 + max(0, os - 2 %)/10 %)
 
-    with q the effort, a the load angle and n the vibration in full steps; at most 30, which lost steps cost. The ripple
-    of the measured current that J of a servo has is not among them: there is none to measure.
+    with q the effort, a the load angle and n the vibration in full steps; beyond 15 it is bent as
+    `score.cost` is, and lost steps cost 30. The ripple of the measured current that J of a servo has is not among them:
+    there is none to measure.
     """
     raw = (
         terms.settling**0.4
@@ -144,7 +145,7 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
         * (1.0 + (terms.noise / VIBRATION) ** 2) ** 0.2
         * (1.0 + np.maximum(0.0, terms.overshoot - OVERSHOOT_FREE) / OVERSHOOT_SCALE)
     )
-    return np.where(terms.tripped | ~np.isfinite(raw), TRIP, np.minimum(raw, TRIP))
+    return below_trip(raw, terms.tripped)
 
 
 class OpenLoopTrial(NamedTuple):

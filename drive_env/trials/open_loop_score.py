@@ -26,13 +26,13 @@ from drive_env.trials.open_loop import (
     with_run_current,
 )
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
-from drive_env.trials.score import CurrentSwings, RobustScore, Scores
+from drive_env.trials.score import CurrentSwings, Scores, StepperScore
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-class OpenLoopScore(RobustScore):
+class OpenLoopScore(StepperScore):
     """As `RobustScore`, of open-loop steppers; it has no swings of a measured current, which are nan."""
 
     def _settling_scale(self, filters: Floats) -> Floats:

@@ -21,7 +21,7 @@ from drive_env.phase_current import swing_period
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW
 from drive_env.trials.position_pid import PID_P, pid_terms, pid_time, steps_of
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
-from drive_env.trials.score import CurrentSwings, RobustScore, Terms
+from drive_env.trials.score import CurrentSwings, StepperScore, Terms
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -29,7 +29,7 @@ Integers = NDArray[np.int64]
 CLOSING = 0.01  # s: a PID has no initialisation
 
 
-class PidScore(RobustScore):
+class PidScore(StepperScore):
     """As `RobustScore`, of steppers whose position a PID regulates; they have no swing of a measured current: nan.
 
     Args:

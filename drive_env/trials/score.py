@@ -2,16 +2,21 @@
 
 Lower is better. The performance J judges every machine on its own scales:
 
-    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a fault scores 30
+    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %)
+
+    beyond 15 bent towards 30 (30 - 225/J, which goes on with the same slope); a fault scores 30
 
     t_s = t_0 + integral of min(1, |e|/w) dt from the profile's end to the load step; w = max(1 % of the move, 3 counts)
     t_0 = four times the sum of the small time constants
-    E_d = integral of |e| dt after a load step of 0.3 rated torque; E_0 that with the gains of the baseline rule
+    E_d = integral of |e| dt after a load step of 0.3 rated torque
+    E_0 = 132 T t^3 / J, that of a rigid axis with w_v = 0.45/t, T_i = 4/w_v, k_v = w_v/3: T_i T/(J w_v k_v), with the
+          load step's torque T, the inertia J at the rotor and the sum t of the small time constants; of a machine of
+          several axes the largest of all, since one that the load does not reach would have none
     n   = RMS increment of the demanded current from millisecond to millisecond, at rest before the load step, over the
           rated current; on a bus, and of a drive that does not tell its current's error, that of the actual current
     os  = largest way beyond the target over the move
 
-An open-loop stepper has a J of its own (`open_loop.py`).
+An open-loop stepper has a J of its own (`open_loop.py`). E_0 of steppers is E_d with the gains of the baseline rule.
 
 The *robust performance* is half of J plus half of the largest J of the machine as it is and its variants. It counts
 among gains that keep the constraints: the margins of the dynamics (drive_env/loops/dynamics.py) in every outer loop of
@@ -69,8 +74,10 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 TRIP = 30.0
+BENT = TRIP / 2.0  # where J begins to bend towards it
 NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
 LOAD_SHARE = 0.3  # of the rated torque
+E_0_SHARE = 4.0 * 3.0 / 0.45**3  # of T t^3 / J
 _NOISE = 7919.0  # between the seeds of the noise of runs that are repeated
 # Parts of the demanded current. What a drive has no object for, it does not tell.
 _DEMANDED: tuple[ObjectName, ...] = (cia402.TORQUE_ACTUAL, Role.TORQUE_ERROR)
@@ -139,8 +146,15 @@ def cost(terms: Terms) -> Floats:
         * (1.0 + (terms.noise / NOISE) ** 2) ** 0.2
         * (1.0 + np.maximum(0.0, terms.overshoot - OVERSHOOT_FREE) / OVERSHOOT_SCALE)
     )
-    # Not finite: the axis left physics. Nothing is worse than a trip, or tripping early would pay.
-    return np.where(terms.tripped | ~np.isfinite(raw), TRIP, np.minimum(raw, TRIP))
+    return below_trip(raw, terms.tripped)
+
+
+def below_trip(raw: Floats, tripped: Mask) -> Floats:
+    """Return J below what a trip scores, or tripping early would pay, but so that what is worse still costs more."""
+    with np.errstate(divide="ignore"):
+        bent = np.where(raw <= BENT, raw, TRIP - BENT**2 / raw)
+    # Not finite: the axis left physics.
+    return np.where(tripped | ~np.isfinite(raw), TRIP, bent)
 
 
 def robust_performance(j: Floats) -> Floats:
@@ -252,9 +266,11 @@ class RobustScore:
             later = np.tile(np.repeat(np.arange(repeats) > 0, len(self.variants)), num_machines)
             self._drives.machine.seed_noise(seeds, later)
         packed = one(found)
-        lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()
+        self._ways = way(packed).joints
+        levers = np.abs(self._ways @ packed.plant.disturbance[:, 0])
         # Against the move, as a load that lies in the way does.
-        self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(lever)
+        self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(levers.max())
+        self._pushed = LOAD_SHARE * self._drives.motor.rated_torque * levers / levers.max()  # torque at each rotor
         self._constant: Floats = np.zeros(num_machines * self._runs)
         axes = (num_machines, self._runs, found.num_axes)
         factors = np.tile([v.velocity_p * v.run_current for v in self.variants], repeats)
@@ -285,8 +301,9 @@ class RobustScore:
         machine.supply = np.where(np.repeat(each, self._axes[2]), volts, machine.supply)
         filters = machine.parameters["stage.velocity_filter"]
         self._t_0 = np.repeat(self._settling_scale(filters), self._axes[2])
+        machine.reset()  # each run begins where the load starts: there its inertia counts, and it is linearised
+        self._reference = self._disturbance_scale(filters)
         if self._has_loops:
-            machine.reset()  # a load is linearised where it stands, and each run begins at its start
             self._loops = true_machines(self._drives)
 
     def set_constant_load(self, torque: Floats) -> None:
@@ -306,13 +323,9 @@ class RobustScore:
             move.counts,
         )
 
-    def set_reference(self, gains: Integers, where: Mask | None = None) -> Scores:
-        """Take these gains, those of the baseline rule, for E_0; return their scores, E_d/E_0 of the nominal one 1."""
-        mask = np.ones(self.num_machines, bool) if where is None else where
-        measured = self._run(gains)
-        nominal = measured[1][:, :: len(self.variants)].mean(axis=1)
-        self._reference = np.where(mask[:, None], nominal, self._reference)
-        return self._constrained(self._scores(*measured), gains)
+    def score_rule(self, gains: Integers, where: Mask | None = None) -> Scores:
+        """Return the scores of the baseline rule's gains, of which a stepper's machines `where` take their E_0."""
+        return self.score(gains)
 
     def score(self, gains: Integers) -> Scores:
         """Return the scores of gains, raw integers of shape (num_machines * axes, count) in the device's order."""
@@ -366,6 +379,14 @@ class RobustScore:
     def _settling_scale(self, filters: Floats) -> Floats:
         """Return t_0 of the machines with these velocity filters [s]."""
         return 4.0 * small_time_constants(self._drives.device, filters)
+
+    def _disturbance_scale(self, filters: Floats) -> Floats:
+        """Return E_0 of the machines with these velocity filters where they stand [rad s], (num_machines, axes)."""
+        small = small_time_constants(self._drives.device, filters[:: self._runs])
+        mass = np.concatenate([group.load.mass_matrix() for group in self._drives.inside.groups])[:: self._runs]
+        inertia = np.einsum("ad,cde,ae->ca", self._ways, mass, self._ways)
+        found = E_0_SHARE * (self._pushed / inertia).max(axis=1) * small**3
+        return np.repeat(found[:, None], self._axes[2], axis=1)
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values of (num_machines * axes,) for the axes of all variants."""
@@ -435,6 +456,21 @@ class RobustScore:
             worth, j.mean(axis=1), of_worst, moving.max(axis=1), resting.mean(axis=1), worth,
             np.full(self.num_machines, np.inf), np.full((self.num_machines, len(self.variants)), np.nan), nothing,
         )  # fmt: skip
+
+
+class StepperScore(RobustScore):
+    """As `RobustScore`, of steppers: no loop tells what E_0 could be, so it is E_d with the baseline rule's gains."""
+
+    def score_rule(self, gains: Integers, where: Mask | None = None) -> Scores:
+        """Take the baseline rule's gains for E_0 of the machines `where`; return their scores, with E_d/E_0 1."""
+        mask = np.ones(self.num_machines, bool) if where is None else where
+        measured = self._run(gains)
+        nominal = measured[1][:, :: len(self.variants)].mean(axis=1)
+        self._reference = np.where(mask[:, None], nominal, self._reference)
+        return self._constrained(self._scores(*measured), gains)
+
+    def _disturbance_scale(self, filters: Floats) -> Floats:
+        return self._reference
 
 
 def swings(current: Floats, rated_current: float, shape: tuple[int, ...]) -> CurrentSwings:

@@ -35,6 +35,7 @@ BANDWIDTHS = np.geomspace(0.01, 1.2, 20)
 INTEGRATIONS = (1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
 POSITIONS = (0.08, 0.12, 0.18, 0.25, 0.33, 0.42, 0.55, 0.75, 1.0)
 TORQUES = (1.0, 0.6, 0.36)
+LEAST_TORQUE = 0.3  # below it the current loop is a low-pass of the velocity loop, which no engineer signs
 # The current loop: its crossover times its own lag, one and a half periods; 60 degrees of phase margin.
 CURRENT_CROSSOVER, CURRENT_LAG = 0.52, 1.5
 EACH_NOMINAL, EACH = 24, 6  # of every bandwidth: whose variants are looked at, and that are tried on the twin
@@ -205,5 +206,5 @@ def _around(device: Device, gains: Integers, step: float, most_torque_p: int) ->
     factors = np.array(list(product((1.0 / step, 1.0, step), repeat=4)))
     rows = np.tile(gains.astype(float), (len(factors), 1))
     rows[:, [torque_p, velocity_p, velocity_i, position_p]] *= factors
-    rows[:, torque_p] = np.minimum(rows[:, torque_p], most_torque_p)
+    rows[:, torque_p] = np.clip(rows[:, torque_p], LEAST_TORQUE * most_torque_p, most_torque_p)
     return _whole(device, rows)

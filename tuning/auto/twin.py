@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import integers_per_si, rule_gains
+from drive_env.gains import integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
@@ -283,7 +283,6 @@ class _Part:
         move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]), highest_ramp(device))
         distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:4])
         self._robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
-        self._robust.set_reference(self._spread(rule_gains(device, motor, inertia)))
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values per axis, (axes, ...), for all machines, (machines, ...)."""

@@ -3,7 +3,8 @@
 No tuner can know them. They are searched on the true machine by its true robust cost: random sets of gains over all
 bandwidths, then differential evolution (Storn and Price, doi:10.1023/A:1008202821328, with the steps towards the best
 of JADE, doi:10.1109/TEVC.2009.2014613). All axes of a machine get their gains together. The current loop is not
-searched beyond the crossover that leaves it 60 degrees, since the constraints are those of the outer loops.
+searched beyond the crossover that leaves it 60 degrees, nor below 0.3 of that, since the constraints are those of the
+outer loops.
 
 The gains of the suites' machines are kept in oracles.csv; what they are worth is scored anew whenever they are used, so
 that a row that no longer fits its machine or the score is noticed, and searched anew.
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from drive_env.gains import has_linear_model, integers_per_si
 from drive_env.whole_file import write_table
 from mechanics.untrusted import read_rows
-from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG
+from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG, LEAST_TORQUE
 from tuning.compare.suite import SuiteMachine, groups
 from tuning.compare.yardstick import Yardstick
 
@@ -120,6 +121,7 @@ class _Box(NamedTuple):
                 most[axis, p] = rule[axis, p] = np.log(
                     CURRENT_CROSSOVER * device.current_rate / CURRENT_LAG * L * per_si["current", "P"]
                 )
+                least[axis, p] = most[axis, p] + np.log(LEAST_TORQUE)
                 # Zeros at the winding's pole.
                 least[axis, i] = most[axis, i] = rule[axis, i] = np.log(max(R / L * per_si["current", "I"], 1.0))
         outer = np.array([row.loop != "current" for row in device.gains.rows])
