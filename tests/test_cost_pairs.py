@@ -102,7 +102,7 @@ PAIRS = [
     (T, "belt", {}, Set(25, 8, 3), Set(60, 8, 3), "the belt's resonance is about to swing"),
     (T, "two_mass", {}, Set(16, 7, 3), Set(4, 1.5, 3), "80/140 Hz: stiff against too slow, both with all margins"),
     (T, "two_mass", {}, Set(4, 1), Set(3, 0.6), "both have all margins, one is a third faster"),
-    (T, "two_mass", {}, Set(16, 7), Set(16, 7, NONE), "without an integral it stays off its place under load"),
+    (T, "two_mass", {}, Set(16, 7, 3), Set(16, 7, NONE), "without an integral it stays off its place under load"),
     (T, "two_mass", {}, Set(16, 7), Set(60, 7), "velocity P at the edge: the shaft swings with 10 % more"),
     (T, "two_mass", {}, Set(8, 3), Set(80, 10), "sluggish is better than unstable"),
     (G, "two_mass", {}, Set(60, 20), Set(60, 60), "position loop as fast as the velocity loop"),

@@ -105,6 +105,28 @@ def true_machines(drives: Drives) -> LinearMachines:
     return linear_machines(windings, M, D, K, parts[0].rotors)
 
 
+def elastic_lags(drives: Drives) -> Floats:
+    """Return by how much springs hold up each axis of emulated machines [s], (machines, axes); 0 of a rigid one.
+
+    While a rotor accelerates by a and the others stand, what hangs on its springs is twisted behind it: the square of
+    the lag is the energy of that over that of the motion. On one spring it is the square root of the load's share of
+    the inertia, over the angular frequency of the anti-resonance.
+    """
+    machine = drives.machine
+    assert machine is not None, "of emulated machines"
+    parts = []
+    for group in machine.drives.inside.groups:
+        M, _, K, rotors = linear_load(group.load)
+        one = np.linalg.pinv(rotors)  # each rotor turned by 1, (joints, axes)
+        free = np.linalg.svd(rotors)[2][len(rotors) :].T  # how joints may move while all rotors stand
+        soft = np.linalg.pinv(free.T @ K @ free, rcond=RIGID, hermitian=True)
+        moved = one - free @ (soft @ (free.T @ K @ one))
+        pushed = free.T @ M @ moved
+        twisted, turned = (np.einsum("cja,cja->ca", a, b) for a, b in ((pushed, soft @ pushed), (moved, M @ moved)))
+        parts.append(np.sqrt(twisted / turned))
+    return np.concatenate(parts)
+
+
 def _first_resonance(found: LinearLoad, copy: int, name: str) -> tuple[float, float, tuple[float, float, float] | None]:
     """Return inertia and viscous friction at the rotor, and anti-resonance, resonance [Hz], damping of the first."""
     M, D, K, rotor = found.M[copy], found.D[copy], found.K[copy], found.rotors[0]

@@ -7,11 +7,12 @@ Lower is better. The performance J judges every machine on its own scales:
     beyond 15 bent towards 30 (30 - 225/J, which goes on with the same slope); a fault scores 30
 
     t_s = t_0 + integral of min(1, |e|/w) dt from the profile's end to the load step; w = max(1 % of the move, 3 counts)
-    t_0 = four times the sum of the small time constants
+    t_0 = four times t, the sum of the small time constants, or 0.9 of the lag of what hangs on springs where that is
+          more: with most of the inertia on one spring, w_v = 0.45/t is half the anti-resonance
     E_d = integral of |e| dt after a load step of 0.3 rated torque
     E_0 = 132 T t^3 / J, that of a rigid axis with w_v = 0.45/t, T_i = 4/w_v, k_v = w_v/3: T_i T/(J w_v k_v), with the
-          load step's torque T, the inertia J at the rotor and the sum t of the small time constants; of a machine of
-          several axes the largest of all, since one that the load does not reach would have none
+          load step's torque T and the inertia J at the rotor; of a machine of several axes the largest of all, since
+          one that the load does not reach would have none
     n   = RMS increment of the demanded current from millisecond to millisecond, at rest before the load step, over the
           rated current; on a bus, and of a drive that does not tell its current's error, that of the actual current
     os  = largest way beyond the target over the move
@@ -47,7 +48,7 @@ from drive_env.emulator.parameters import WIRING
 from drive_env.gains import has_linear_model, small_time_constants, write_gains
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
-from drive_env.loops.true_plant import true_machines
+from drive_env.loops.true_plant import elastic_lags, true_machines
 from drive_env.trials.positioning import (
     CYCLE,
     SETTLED,
@@ -77,6 +78,7 @@ TRIP = 30.0
 BENT = TRIP / 2.0  # where J begins to bend towards it
 NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
 LOAD_SHARE = 0.3  # of the rated torque
+ELASTIC = 2.0 * 0.45  # of the lag of what hangs on springs: a velocity loop of half its angular frequency
 E_0_SHARE = 4.0 * 3.0 / 0.45**3  # of T t^3 / J
 _NOISE = 7919.0  # between the seeds of the noise of runs that are repeated
 # Parts of the demanded current. What a drive has no object for, it does not tell.
@@ -302,9 +304,11 @@ class RobustScore:
         filters = machine.parameters["stage.velocity_filter"]
         self._t_0 = np.repeat(self._settling_scale(filters), self._axes[2])
         machine.reset()  # each run begins where the load starts: there its inertia counts, and it is linearised
-        self._reference = self._disturbance_scale(filters)
         if self._has_loops:
+            lags = elastic_lags(self._drives).reshape(self._axes)[:, :1]
+            self._t_0 = np.maximum(self._t_0, 4.0 * np.broadcast_to(ELASTIC * lags, self._axes).reshape(-1))
             self._loops = true_machines(self._drives)
+        self._reference = self._disturbance_scale()
 
     def set_constant_load(self, torque: Floats) -> None:
         """Set a constant load [N*m], (num_machines,), signed as `machine.load_torque`."""
@@ -380,12 +384,12 @@ class RobustScore:
         """Return t_0 of the machines with these velocity filters [s]."""
         return 4.0 * small_time_constants(self._drives.device, filters)
 
-    def _disturbance_scale(self, filters: Floats) -> Floats:
-        """Return E_0 of the machines with these velocity filters where they stand [rad s], (num_machines, axes)."""
-        small = small_time_constants(self._drives.device, filters[:: self._runs])
+    def _disturbance_scale(self) -> Floats:
+        """Return E_0 of the machines where they stand [rad s], (num_machines, axes)."""
+        lag = 0.25 * self._t_0.reshape(self._axes)[:, 0]
         mass = np.concatenate([group.load.mass_matrix() for group in self._drives.inside.groups])[:: self._runs]
         inertia = np.einsum("ad,cde,ae->ca", self._ways, mass, self._ways)
-        found = E_0_SHARE * (self._pushed / inertia).max(axis=1) * small**3
+        found = (E_0_SHARE * self._pushed / inertia * lag**3).max(axis=1)
         return np.repeat(found[:, None], self._axes[2], axis=1)
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -469,7 +473,7 @@ class StepperScore(RobustScore):
         self._reference = np.where(mask[:, None], nominal, self._reference)
         return self._constrained(self._scores(*measured), gains)
 
-    def _disturbance_scale(self, filters: Floats) -> Floats:
+    def _disturbance_scale(self) -> Floats:
         return self._reference
 
 
