@@ -180,7 +180,7 @@ class Scores(NamedTuple):
     overshoot: of a csp step, (num_machines,); nan where there is no linear model. swing: What a trial
     would measure, the largest RMS increment of the current over 25 ms until the load step, over the rated one,
     likewise, and the largest of several runs; J does not count it. rest: How the current swings about its trend before
-    the load step (RMS), over the rated one, likewise, and the mean of several runs; neither does J count that.
+    the load step (RMS), over the rated one, likewise, and the RMS over several runs; neither does J count that.
     """
 
     robust_cost: Floats
@@ -210,9 +210,9 @@ class RobustScore:
     The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
     is none on this load (a stiffness where nothing is elastic) is left out.
 
-    With one run of each variant, what is scored is partly the noise: an axis that stands between two counts of its
-    encoder hunts in one run and rests in the next. `repeats` runs of each, every one with a noise of its own, and the
-    mean of their scores, say what gains are worth.
+    With one run of each variant, what is scored is partly the noise and the place: an axis that stands between two
+    counts of its encoder may hunt where it rests in the middle of one. `repeats` runs of each, every one with a noise
+    of its own and to a place of its own within a count, and the mean of their scores, say what gains are worth.
 
     Args:
         device: Name of the device.
@@ -411,7 +411,10 @@ class RobustScore:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             power_up(drives)
-            start(drives, move.distance)
+            machines, runs, axes = self._axes
+            place = np.repeat(np.tile(np.arange(runs) // len(self.variants), machines), axes) / self.repeats
+            target = move.distance + np.rint(place * move.increments / move.counts).astype(np.int64)
+            start(drives, target)
             demanded = [name for name in _DEMANDED if not isinstance(name, Role) or name in drives.device.roles]
             objects: list[ObjectName] = [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
             free = drives.record(objects, SETTLED * CYCLE)
@@ -425,13 +428,13 @@ class RobustScore:
             move,
             self._t_0,
             drives.motor.rated_current,
-            move.distance,
+            target,
             direction,
         )
         tripped = ~cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED) | np.repeat(
             drives.machine.diverged, self._axes[2]
         )
-        error = np.abs(wrapped(move.distance - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
+        error = np.abs(wrapped(target - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
         shape = self._axes
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
         measured = free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives)
@@ -457,7 +460,7 @@ class RobustScore:
         worth = robust_performance(j).mean(axis=1)
         nothing = np.full(self.num_machines, np.nan)
         return Scores(
-            worth, j.mean(axis=1), of_worst, moving.max(axis=1), resting.mean(axis=1), worth,
+            worth, j.mean(axis=1), of_worst, moving.max(axis=1), np.sqrt(np.square(resting).mean(axis=1)), worth,
             np.full(self.num_machines, np.inf), np.full((self.num_machines, len(self.variants)), np.nan), nothing,
         )  # fmt: skip
 

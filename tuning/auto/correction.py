@@ -37,7 +37,7 @@ Mask = NDArray[np.bool_]
 
 CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
-SETS, RUNS = 32, 2  # of gains at once on the twins, and runs of each on all worlds
+SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
 # Velocity P passes the encoder's noise and counts on to the current: what it is lowered to where an axis does not rest.
 CALMER, LEAST_CALMER, MOST_CALMER = 0.9, 0.5, 0.85

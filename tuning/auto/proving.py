@@ -102,9 +102,9 @@ class Shown(NamedTuple):
     """A recorded move: times [s], (n,); demanded and actual angle from its start [rad] and current [A], (n, num_axes).
 
     where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
-    measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), where it was most
-    of several places of an encoder count, (num_axes,). noise: What the measurement of the current makes of that,
-    alike; 0 where it was not measured, since the swing is small enough as it is.
+    measured terms, (num_axes,). swing: Of the current at rest afterwards, in several places of an encoder count, over
+    the rated one (RMS over all), (num_axes,). noise: What the measurement of the current makes of that, alike; 0 where
+    it was not measured, since the swing is small enough as it is.
     """
 
     t: Floats
@@ -357,7 +357,7 @@ class ProvingGround:
         return np.where(where, np.minimum(current.std(axis=0), change) / self.target.motor.rated_current, noise)
 
     def _swing(self, at: Integers, where: Mask) -> Floats:
-        """Return how much the current swings at rest, over the rated one (RMS), the most of several places.
+        """Return how much the current swings at rest in several places, over the rated one (RMS over all of them).
 
         Args:
             at: Where the axes are [inc]; they end within a count of it, on the side from which they came.
@@ -365,7 +365,7 @@ class ProvingGround:
         """
         drives, rated = self.target.drives, self.target.motor.rated_current
         back = -np.sign(self._direction * self.move.distance)
-        worst = np.zeros(self.target.num_axes)
+        squares, worst = np.zeros((2, self.target.num_axes))
         for place in range(PLACES):
             if place:
                 # Increments may be as coarse as counts.
@@ -378,8 +378,8 @@ class ProvingGround:
                 worst[stopped] = OSCILLATION
                 self._shaken |= stopped
                 seen.append(window[cia402.TORQUE_ACTUAL])
-            worst = np.maximum(worst, np.concatenate(seen[SETTLED:]).std(axis=0) * self._ampere / rated)
-        return worst
+            squares += np.concatenate(seen[SETTLED:]).var(axis=0) / PLACES
+        return np.maximum(worst, np.sqrt(squares) * self._ampere / rated)
 
     def _hold_still(self, where: Mask) -> None:
         """Come to rest with the present gains, and start from there: a frequency response leaves an axis turning.

@@ -35,14 +35,14 @@ Integers = NDArray[np.int64]
 KEPT = Path(__file__).with_name("oracles.csv")
 HEAD = ("device", "machine", "digest", "gains", "performance", "slack")
 STALE = 0.05  # relative: a kept performance that is off by more than this is one of another score
-POPULATION, REPEATED = 48, 2  # sets of gains, and runs of each with a noise of its own
+POPULATION, REPEATED = 48, 3  # sets of gains, and runs of each, to other places and with another noise
 DRAWS = 2304  # random sets of a machine of one axis; fewer with more axes
 GENERATIONS = {1: 45, 2: 45}  # by axes
 MANY_AXES = 12  # generations of a machine of more axes, each of which takes seconds
 BANDS = 16  # of bandwidth, each of which has its best draws in the first population
 # Draws over the baseline rule's gains, natural logarithms: of all outer gains together, and of each gain on its own.
 TOGETHER, EACH = (-2.5, 2.2), (-1.2, 1.2)
-FINALISTS = 8  # of the last population, scored with all repeats
+FINALISTS = 16  # of the last population, scored with all repeats
 SPREAD = 0.01  # relative cost within the better half of the population at which it has converged
 
 
