@@ -373,20 +373,21 @@ def test_variants_are_parallel_machines_with_their_parameters(two_mass):
     assert inertia[0] / inertia[0, 0] == pytest.approx([1, 2, 0.5, 1, 1, 1])
 
 
-def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
+def test_repeats_are_runs_with_other_noises_and_places_and_a_score_is_their_mean():
     repeated, alone, gains = bench("two_mass", 2, repeats=3), bench("two_mass", 2), times(1.4, 2)
     seeds = repeated._drives.inside.noise_seeds.reshape(2, 3, len(VARIANTS))
     assert (seeds == seeds[:1, :, :1]).all(), "variants are compared under the same noise, and machines are"
     assert seeds[0, 0, 0] == alone._drives.inside.noise_seeds[0], "the first run is that of a score without repeats"
     found = []
-    for seed in seeds[0, :, 0]:
+    for k, seed in enumerate(seeds[0, :, 0]):
         alone._drives.inside.noise_seeds[:] = seed
+        alone._place[:] = k / 3.0  # of a count of the encoder
         found.append(alone.score(gains))
     scores = repeated.score(gains)
     repeated.close(), alone.close()
     assert len({one.performance[0] for one in found}) == 3
     np.testing.assert_allclose(scores.performance, np.mean([one.performance for one in found], axis=0))
-    # Loops have no noise; what swings at rest counts by its mean.
+    # Loops have no noise; what swings at rest counts by its RMS.
     for alike in found:
         np.testing.assert_array_equal(scores.clearance, alike.clearance)
         np.testing.assert_array_equal(scores.overshoot, alike.overshoot)
@@ -396,7 +397,7 @@ def test_repeats_are_runs_with_other_noises_and_a_score_is_their_mean():
     np.testing.assert_allclose(scores.j, np.mean([one.j for one in found], axis=0))
     np.testing.assert_allclose(scores.terms.settling, np.mean([one.terms.settling for one in found], axis=0))
     np.testing.assert_allclose(scores.swing, np.max([one.swing for one in found], axis=0))
-    np.testing.assert_allclose(scores.rest, np.mean([one.rest for one in found], axis=0))
+    np.testing.assert_allclose(scores.rest, np.sqrt(np.mean([one.rest**2 for one in found], axis=0)))
 
 
 def test_a_score_depends_on_machine_and_gains_alone(two_mass):
@@ -589,7 +590,7 @@ def scored(variants=VARIANTS[:3], repeats=1, **recorded):
     made._drives = Machines(**recorded)
     made._constant, made._load_torque = np.zeros(6), -0.25
     made._factors = np.tile(np.repeat([1.0, 2.0, 3.0], 2), 2)
-    made._t_0, made._reference = np.full(12, 0.01), np.ones((2, 2))
+    made._t_0, made._reference, made._place = np.full(12, 0.01), np.ones((2, 2)), np.zeros(12)
     one = np.full(12, 10_000)
     made._move = Move(one * np.tile([1, -1], 6), one, one, np.full(12, SCALE), 4096 / (2 * np.pi))
     return made
@@ -665,7 +666,7 @@ def test_a_run_is_a_move_and_then_a_load_step(unmoved):
     ]  # fmt: skip
     written = unmoved[0][1]
     assert written[:, 2].tolist() == [800, 800, 1600, 1600, 2400, 2400] * 2
-    assert unmoved[1][1] is made._move and unmoved[3][1] is made._move.distance
+    assert unmoved[1][1] is made._move and unmoved[3][1].tolist() == made._move.distance.tolist()
     assert terms.settling.shape == disturbance.shape == swings.moving.shape == (2, 3, 2)
     assert not terms.tripped.any() and (terms.disturbance == 1.0).all()
     # It stands still: 10,000 increments from its target, out of the band for 90 ms, and for 100 ms under load.
@@ -715,14 +716,14 @@ def test_a_machine_is_its_worst_axis_and_its_robust_cost_half_its_worst_variant(
     """J of two axes: 32^0.4 is 4, 243^0.4 is 9."""
     made = scored()
     terms = by_hand([[[1.0, 32.0], [1.0, 1.0], [243.0, 1.0]], [[32.0, 32.0], [1.0, 32.0], [1.0, 1.0]]])
-    moving, resting = np.arange(12.0).reshape(2, 3, 2), -np.arange(12.0).reshape(2, 3, 2)
+    moving = resting = np.arange(12.0).reshape(2, 3, 2)
     made._reference = np.array([[2.0, 2.0], [1.0, 1.0]])
     found = made._scores(terms, np.ones((2, 3, 2)) * [[[2.0]], [[1.0]]], CurrentSwings(moving, resting))
     np.testing.assert_allclose(found.j, [[4.0, 1.0, 9.0], [4.0, 4.0, 1.0]])
     np.testing.assert_allclose(found.performance, [0.5 * 4.0 + 0.5 * 9.0, 4.0])
     assert found.terms.settling.tolist() == [[32.0, 1.0, 243.0], [32.0, 32.0, 1.0]]
     assert found.swing.tolist() == [[1.0, 3.0, 5.0], [7.0, 9.0, 11.0]]
-    assert found.rest.tolist() == [[0.0, -2.0, -4.0], [-6.0, -8.0, -10.0]]
+    assert found.rest.tolist() == found.swing.tolist()
 
 
 def test_runs_that_are_repeated_count_by_their_mean_and_a_swing_by_its_largest():
@@ -734,7 +735,8 @@ def test_runs_that_are_repeated_count_by_their_mean_and_a_swing_by_its_largest()
     np.testing.assert_allclose(found.j, [[14.0 / 3.0], [32.0 / 3.0]])
     np.testing.assert_allclose(found.terms.settling[0], [(1.0 + 32.0 + 243.0) / 3.0])
     assert found.terms.tripped.tolist() == [[False], [True]]
-    assert found.swing.tolist() == [[5.0], [11.0]] and found.rest.tolist() == [[3.0], [9.0]]
+    assert found.swing.tolist() == [[5.0], [11.0]]
+    np.testing.assert_allclose(found.rest**2, [[(1.0 + 9.0 + 25.0) / 3.0], [(49.0 + 81.0 + 121.0) / 3.0]])
 
 
 def test_a_steppers_scale_is_the_disturbance_of_the_rules_nominal_runs_of_machines_that_are_asked_for():

@@ -278,6 +278,8 @@ class RobustScore:
         factors = np.tile([v.velocity_p * v.run_current for v in self.variants], repeats)
         self._factors = np.tile(np.repeat(factors, axes[2]), axes[0])
         self._axes = axes
+        # Where within a count of the encoder a run ends, as shares of it.
+        self._place = np.repeat(np.tile(np.arange(self._runs) // len(self.variants), num_machines), axes[2]) / repeats
         self._t_0 = np.ones(self._drives.num_axes)
         self._reference = np.ones((axes[0], axes[2]))  # E_0 [rad s]
         zero = np.zeros(self._drives.num_axes)
@@ -411,9 +413,7 @@ class RobustScore:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             power_up(drives)
-            machines, runs, axes = self._axes
-            place = np.repeat(np.tile(np.arange(runs) // len(self.variants), machines), axes) / self.repeats
-            target = move.distance + np.rint(place * move.increments / move.counts).astype(np.int64)
+            target = move.distance + np.rint(self._place * move.increments / move.counts).astype(np.int64)
             start(drives, target)
             demanded = [name for name in _DEMANDED if not isinstance(name, Role) or name in drives.device.roles]
             objects: list[ObjectName] = [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
