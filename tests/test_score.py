@@ -337,13 +337,13 @@ def test_a_load_has_the_variants_that_it_can_have():
 
 
 def test_the_scale_of_the_disturbance_is_that_of_a_rigid_cascade_by_hand():
-    """132 T t^3 / J, whatever the gains are; on a soft shaft t is 0.9 of the load's lag."""
+    """132 T t^3 / J, whatever the gains are; on a soft shaft t is 4.5 times the load's lag."""
     for load, parameters in (("inertia", {}), ("two_mass", {"load.stiffness": 1.0}), ("two_mass", {})):
         score = bench(load, 2, **parameters)
         true = {name: values.reshape(2, -1)[:, 0] for name, values in score._drives.machine.parameters.items()}
         J, t = true["load.inertia"] + MOTOR.inertia, float(small_time_constants(DEVICE, 400.0))
         if load == "two_mass":
-            t = np.maximum(t, 0.9 * true["load.inertia"] / np.sqrt(J * true["load.stiffness"]))
+            t = np.maximum(t, 4.5 * true["load.inertia"] / np.sqrt(J * true["load.stiffness"]))
         w = 0.45 / t
         T_i, k_v = 4.0 / w, w / 3.0
         expected = 0.3 * MOTOR.rated_torque * T_i / (J * w * k_v)
