@@ -226,8 +226,10 @@ def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
             value = getattr(one, asked.field)
             if asked.missed(value, asked.error):
                 told = f"{value:.{asked.digits}f} {asked.unit}".rstrip()
-                wanted = f"{dynamics.name} dynamics ask for {asked.limit:g}"
-                texts.append(f"the {loop} loop has a {asked.name} of {told}, and {wanted}")
+                texts.append(
+                    f"the {loop} loop has a {asked.name} of {told}, and {dynamics.name} dynamics ask for "
+                    f"{asked.limit:g}"
+                )
     return texts
 
 
