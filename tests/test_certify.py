@@ -126,6 +126,7 @@ def test_a_correction_says_what_gave_way_why_and_whether_it_stayed(steps, final,
     journal = Journal()
     for old, new in steps:
         journal.correct(np.array(old), np.array(new), OVERSHOT)
+        journal.correct(np.array(new), np.array(new), "as its other axes were")  # which changes nothing here
     bench = SimpleNamespace(
         journals=[journal], before=np.ones((1, 5), np.int64), ground=None, spent=np.zeros(1), dynamics=STANDARD,
         target=SimpleNamespace(num_axes=1, drives=SimpleNamespace(time_waits=True, bus=None, observers=())),

@@ -63,8 +63,9 @@ class Journal:
         self.reservations.append(text)
 
     def correct(self, old: Integers, new: Integers, reason: str, outcome: str = TAKEN) -> None:
-        """Add that gains, raw, (count,), gave way to others."""
-        self.corrections.append(Correction(tuple(map(int, old)), tuple(map(int, new)), reason, outcome))
+        """Add that gains, raw, (count,), gave way to others, unless they are the same."""
+        if not np.array_equal(old, new):
+            self.corrections.append(Correction(tuple(map(int, old)), tuple(map(int, new)), reason, outcome))
 
 
 class AutoBench:

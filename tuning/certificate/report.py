@@ -160,8 +160,8 @@ def _crossovers(figures: Mapping[str, float]) -> str:
     if figures[RATIO] <= USUAL_RATIO or math.isnan(figures[RATIO]):
         return text
     return text + (
-        f"<p class='reserved'>The position loop crosses over beyond {USUAL_RATIO:g} of the velocity loop's crossover, "
-        "which is the usual advice. What counts are the margins of both loops.</p>"
+        f"<p class='reserved'>The position loop crosses over beyond {USUAL_RATIO:g} of the velocity loop's crossover; "
+        "usual advice is to stay below. What counts are the margins of both loops.</p>"
     )
 
 
@@ -173,7 +173,7 @@ def _corrections(corrections: Sequence[Correction], known: GainSet) -> str:
             for title, old, new in zip(known.titles, one.old, one.new, strict=True)
             if old != new
         ]
-        rows.append([str(number), ", ".join(changed) or "no gain of this axis", one.reason, one.outcome])
+        rows.append([str(number), ", ".join(changed), one.reason, one.outcome])
     return _table(("", "gains", "because", "outcome"), rows)
 
 
