@@ -1,4 +1,4 @@
-"""Read a certificate: is it as it was written, what is the verdict, which reservations, figures before and after.
+"""Read a certificate: is it as it was written, what is the verdict, what was asked for and is kept, figures.
 
 python examples/read_certificate.py tuned/certificate.json
 
@@ -36,6 +36,13 @@ def main() -> int:
         print(f"axis {axis.axis}: {axis.verdict}")
         for text in axis.reservations:
             print(f"  reservation: {text}")
+        for one in axis.requirements:
+            found = f"{'at least ' * one.is_bound}{one.found:.3g}" if math.isfinite(one.found) else "-"
+            print(f"  {axis.dynamics} dynamics, {one.name}: {found} for {one.asked:g}, {one.kept}")
+        if axis.figures:
+            print(f"  {listed(axis.figures)}")
+        for one in axis.corrections:
+            print(f"  corrected from {list(one.old)} to {list(one.new)}, since {one.reason}: {one.outcome}")
         for loop in axis.frequency_responses:
             print(f"  {loop.name}, {GAINS[loop.tuned]}: {listed(loop.margins)}")
         for step in axis.steps:

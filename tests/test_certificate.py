@@ -22,10 +22,17 @@ from drive_env.gains import Gains, bandwidths_from_gains, gains_in_si
 from drive_env.loops.margins import Margins, margins
 from drive_env.motors import find_motor
 from tuning.certificate.certificate import (
+    CROSSOVERS,
+    KEPT,
+    NEARLY_KEPT,
+    NOT_MEASURED,
+    TAKEN,
     AxisCertificate,
     Certificate,
     CertificateError,
+    Correction,
     FrequencyResponse,
+    Requirement,
     StatedParameter,
     StepResponse,
     frequency_response,
@@ -77,6 +84,16 @@ def certificate():
         after_si=si_gains(DEVICE, 24.0, AFTER_GAINS),
         steps=(step(False, 0.02), step(True, 0.005)),
         frequency_responses=(bode(False, 20.0, np.ones(60)), bode(True, 50.0, np.where(F < 200.0, 0.99, 0.5))),
+        dynamics="standard",
+        requirements=(
+            Requirement("velocity loop, phase margin [deg]", 45.0, 44.2, False, NEARLY_KEPT),
+            Requirement("velocity loop, gain margin [dB]", 8.0, 9.5, True, KEPT),
+            Requirement("overshoot of a step of 50 counts in csp [%]", 20.0, math.nan, False, NOT_MEASURED),
+        ),
+        figures=dict(zip(CROSSOVERS, (1400.0, 50.0, 35.5, 0.71), strict=True)),
+        corrections=(
+            Correction(tuple(AFTER_GAINS._replace(position_p=620)), tuple(AFTER_GAINS), "it overshot by 24 %", TAKEN),
+        ),
         notes=("2042h:02 would be 2000.4",),
         hardware_seconds=7.25,
         aborts=2,
@@ -111,7 +128,8 @@ def test_the_file_is_strict_json_with_all_that_is_promised(certificate):
     }  # fmt: skip
     assert set(data["axes"][0]) == {
         "axis", "accepted", "reason", "reservations", "identified", "before", "after", "before_si", "after_si", "steps",
-        "frequency_responses", "notes", "hardware_seconds", "aborts",
+        "frequency_responses", "dynamics", "requirements", "figures", "corrections", "notes", "hardware_seconds",
+        "aborts",
     }  # fmt: skip
 
 
@@ -154,10 +172,10 @@ def test_any_change_shows(certificate, tmp_path, where, value):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("", "is not a certificate"),
-    ("[1]", "is not a certificate of format 2"),
-    ('{"a": 1}', "is not a certificate of format 2"),
+    ("[1]", "is not a certificate of format 3"),
+    ('{"a": 1}', "is not a certificate of format 3"),
     ('{"format": 1, "sha256": "", "x": NaN}', "NaN is not a number of JSON"),
-    ('{"format": 2, "sha256": ""}', "is not a certificate of this version: 'tuner'"),
+    ('{"format": 3, "sha256": ""}', "is not a certificate of this version: 'tuner'"),
 ])  # fmt: skip
 def test_what_is_no_certificate_is_said_to_be_none(tmp_path, text, message):
     path = tmp_path / "certificate.json"
@@ -273,7 +291,9 @@ def test_the_report_says_everything_that_the_certificate_holds(certificate):
     words = Page(to_html(certificate)).words
     for said in ("0.3612", "0.355 to 0.367", "ohm", "not identified", "travel too short: 0.1 <turns>", "1400",
                  "all checks passed", "2042h:02 would be 2000.4", "multisine", "7.25", "2", "new gains in the drive",
-                 "none", "418.9", "numpy", "phase margin [deg]", "90", "settling [s]", "0.07824", "seed", "7",
+                 "none", "418.9", "numpy", "Dynamics asked for: standard", "at least 9.5", NEARLY_KEPT, NOT_MEASURED,
+                 "35.5", "position P 620 → 500", "it overshot by 24 %", TAKEN,
+                 "phase margin [deg]", "90", "settling [s]", "0.07824", "seed", "7",
                  certificate.hash()):  # fmt: skip
         assert any(said in word for word in words), said
 
@@ -313,8 +333,8 @@ def test_what_a_tuner_guessed_is_in_neither_file(certificate):
     found = identified(Identification(
         {"coulomb": guess, "inertia": known, "damping": guess}, 4.0,
         {"coulomb": refused("A", reason), "inertia": known},
-    ))  # fmt: skip
-    assert set(found) == {"coulomb", "inertia"}
+    ), find_motor("qbl4208"))  # fmt: skip
+    assert set(found) == {"coulomb", "inertia", "inertia_ratio"}
     assert (found["inertia"].value, found["inertia"].low, found["inertia"].high) == known[:3]
     paper = replace(certificate, axes=(replace(certificate.axes[0], identified=found),))
     words = Page(to_html(paper)).words
@@ -325,7 +345,31 @@ def test_what_a_tuner_guessed_is_in_neither_file(certificate):
 
 def test_what_has_no_guesses_is_identified_as_it_is():
     known = Estimate(0.36, 0.35, 0.37, "ohm")
-    assert identified(Identification({"resistance": known}, 4.0)) == {"resistance": StatedParameter(*known)}
+    found = identified(Identification({"resistance": known}, 4.0), find_motor("qbl4208"))
+    assert found == {"resistance": StatedParameter(*known)}
+
+
+@pytest.mark.parametrize(("total", "ratio"), [((3.0, 2.5, 3.5), (2.0, 1.5, 2.5)), ((1.0, 0.9, 1.1), (0.0, 0.0, 0.1))])
+def test_the_load_is_told_as_a_multiple_of_the_rotor(total, ratio):
+    motor = find_motor("qbl4208")
+    known = Estimate(*(motor.inertia * J for J in total), "kg*m^2")
+    found = identified(Identification({"inertia": known}, 4.0), motor)["inertia_ratio"]
+    assert (found.value, found.low, found.high) == pytest.approx(ratio)
+
+
+def test_a_load_that_is_not_known_is_said_to_be_none():
+    unknown = refused("kg*m^2", "it does not turn")
+    found = identified(Identification({"inertia": unknown}, 4.0), find_motor("qbl4208"))["inertia_ratio"]
+    assert math.isnan(found.value) and found.reason == "it does not turn"
+
+
+@pytest.mark.parametrize(("ratio", "told"), [(0.5, False), (0.51, True), (math.nan, False)])
+def test_a_position_loop_near_the_velocity_loop_is_pointed_out(certificate, ratio, told):
+    axis = certificate.axes[0]
+    figures = {**axis.figures, CROSSOVERS[-1]: ratio}
+    words = Page(to_html(replace(certificate, axes=(replace(axis, figures=figures),)))).words
+    assert any("crosses over beyond 0.5 of the velocity loop's" in word for word in words) == told
+    assert axis.verdict == "accepted"
 
 
 def test_an_axis_of_which_nothing_is_known_has_a_report_too(certificate):

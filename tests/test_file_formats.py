@@ -31,7 +31,9 @@ from drive_env.motors import MOTORS, NUMBERS, find_motor
 from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,
+    Correction,
     FrequencyResponse,
+    Requirement,
     StatedParameter,
     StepResponse,
 )
@@ -76,6 +78,8 @@ def certificate(tmp_path_factory):
         0, True, "", (), {"inertia": StatedParameter(1.0, 0.9, 1.1, "kg*m^2")}, (1,) * 5, (1,) * 5, {}, {},
         (StepResponse("move", True, "rad", row, row, row, row),),
         (FrequencyResponse("velocity loop", True, row, row, row, row),),
+        "standard", (Requirement("velocity loop, Ms", 2.0, 1.5, False, "kept"),), {},
+        (Correction((1,) * 5, (1,) * 5, "", ""),),
     )  # fmt: skip
     made = Certificate("auto", "tmcm1636", "qbl4208", "belt", 24.0, 0, {}, (axis,), {})
     folder = tmp_path_factory.mktemp("certificate")
@@ -89,6 +93,8 @@ def test_certificate(certificate):
     assert fields("certificate axis") == list(axis)
     assert fields("certificate identified") == list(axis["identified"]["inertia"])
     assert fields("certificate step") == list(axis["steps"][0])
+    assert fields("certificate requirement") == list(axis["requirements"][0])
+    assert fields("certificate correction") == list(axis["corrections"][0])
     assert fields("certificate response") == list(axis["frequency_responses"][0])
 
 

@@ -7,11 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from drive_env import motion
 from drive_env.gains import Gains, gains_in_si, write_gains
+from mechanics.shaft import one, way
 from tuning.auto import load_step as module
 from tuning.auto.load_step import BEFORE, NAME, load_step
 from tuning.target import emulated
 
+TURN = 2.0 * np.pi
+DIP, RECOVERY = "greatest dip of the rotor [turns]", "recovery to within 5 % of the dip [ms]"
 SOFT, STIFF = Gains(4021, 1573, 600, 1200, 300), Gains(4021, 1573, 900, 1800, 500)
 
 
@@ -34,10 +38,33 @@ def test_the_error_adds_up_to_what_the_gains_say(target):
         after = step.t >= BEFORE
         assert abs(np.sum(step.actual[after]) * 1e-3) == pytest.approx(expected, rel=0.05)
         assert np.mean(step.current[-50:]) - np.mean(step.current[:20]) == pytest.approx(i, rel=0.1)
-        assert step.figures["disturbance dip [rad]"] == pytest.approx(np.abs(step.actual[after]).max(), rel=0.02)
+        assert step.figures[DIP] == pytest.approx(np.abs(step.actual[after]).max() / TURN, rel=0.02)
         assert step.tuned and step.name == NAME and step.unit == "rad"
-    dips = [found[axis].figures["disturbance dip [rad]"] for axis in (0, 1)]
+    dips = [found[axis].figures[DIP] for axis in (0, 1)]
     assert dips[1] < 0.7 * dips[0]
+
+
+@pytest.mark.parametrize(("load", "gains"), [("inertia", STIFF), ("belt", Gains(5580, 1579, 1099, 1845, 395))])
+def test_dip_and_recovery_are_those_of_the_rotor_in_the_emulator(load, gains):
+    """Without an encoder: the same load step by hand, the angle that the physics has every millisecond."""
+    with emulated(load=load, num_machines=2, num_threads=1) as target:
+        drives, machine = target.drives, target.drives.machine
+        write_gains(drives, np.array([gains, gains]))
+        found = load_step(target, np.ones(2, bool))[0].figures
+        motion.enable(drives, mode="pp")
+        drives.advance(0.1)
+        rest = machine.rotor_angle[1]
+        packed = one(machine.drives.load)
+        lever = abs(float((way(packed).joints @ packed.plant.disturbance[:, 0])[0]))
+        machine.load_torque = np.full(2, -0.3 * target.motor.rated_torque / lever)
+        angle = []
+        for _ in range(300):
+            drives.advance(1e-3)
+            angle.append(abs(machine.rotor_angle[1] - rest))
+    dip = max(angle)
+    away = np.flatnonzero(np.array(angle) > 0.05 * dip)[-1] + 2.0  # [ms]
+    assert found[DIP] == pytest.approx(dip / TURN, rel=0.1)
+    assert found[RECOVERY] == pytest.approx(away, rel=0.15, abs=3.0)
 
 
 def test_the_machines_are_left_alone_afterwards(target):
@@ -139,8 +166,8 @@ def test_what_is_recorded_is_the_first_step_and_the_swing_the_worst_of_all_rests
     np.testing.assert_allclose(step.current[:20], 0.5)
     assert step.current[-1] == pytest.approx(0.01 * (50.0 + 0.5 * 299.0 + swings[0]))
     assert step.figures["current at rest afterwards, RMS [% of rated]"] == pytest.approx(1.0, rel=1e-3)
-    assert step.figures["disturbance dip [rad]"] == pytest.approx(8.0)
-    assert step.figures["recovery [s]"] == pytest.approx(1e-3 + 0.05 * np.log(10.0), abs=1e-4)
+    assert step.figures[DIP] == pytest.approx(8.0 / TURN)
+    assert step.figures[RECOVERY] == pytest.approx(1.0 + 50.0 * np.log(20.0), abs=0.1)
     assert (step.name, step.tuned, step.unit) == ("load step of 0.3 rated torque at standstill", True, "rad")
     assert not step.reference.any() and len(step.reference) == 320
 

@@ -283,14 +283,20 @@ def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
     with EmulatedDrives("tmcm6212", **MACHINES) as drives:
         inside = act(drives)
     outside = on_bus("tmcm6212", act)
-    obstacle = "teeth lost at an obstacle"
+    loaded = ("teeth lost at an obstacle", "load of 30 % that does not stop it came within [s]",
+              "obstacle that stops it came within [s]")  # fmt: skip
     for (after, figures, verdict, own), (far, seen, told, reservations) in zip(inside, outside, strict=True):
         assert after == far and verdict != "rejected" and told == "accepted with reservations"
         assert all("teeth before the stall" in text for text in own)
         assert figures.keys() == seen.keys()
-        numbers = [name for name, value in figures.items() if value is not None and name != obstacle]
+        numbers = [name for name, value in figures.items() if value is not None and name not in loaded]
         assert [seen[name] for name in numbers] == pytest.approx([figures[name] for name in numbers], rel=1e-3)
-        assert seen[obstacle] is None and len(reservations) == 1 and "not proved with a load" in reservations[0]
+        assert [figures[name] for name in loaded[1:]] == [0.15, 0.03]
+        assert (
+            all(seen[name] is None for name in loaded)
+            and len(reservations) == 1
+            and "not proved with a load" in reservations[0]
+        )
         assert after["stall_threshold"] != 0 or after["coolstep_lower"] > 0
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.gains import read_gains
 from drive_env.trials.positioning import longer_way, wrapped
+from tuning.certificate.certificate import TAKEN, Correction
 from tuning.identify.wiring import Key, write_wiring
 from tuning.stop_causes import stop_causes
 
@@ -40,12 +41,14 @@ class Journal:
         reservations: Checks that could not be made or are near a limit; with any of them the certificate is not a plain
             accept.
         notes: Further remarks.
+        corrections: Gains that gave way to others.
     """
 
     def __init__(self) -> None:
         self.reason = ""
         self.reservations: list[str] = []
         self.notes: list[str] = []
+        self.corrections: list[Correction] = []
 
     def stop(self, reason: str) -> None:
         """Take the axis out of the run; its first reason counts."""
@@ -58,6 +61,11 @@ class Journal:
     def reserve(self, text: str) -> None:
         """Add a reservation."""
         self.reservations.append(text)
+
+    def correct(self, old: Integers, new: Integers, reason: str, outcome: str = TAKEN) -> None:
+        """Add that gains, raw, (count,), gave way to others, unless they are the same."""
+        if not np.array_equal(old, new):
+            self.corrections.append(Correction(tuple(map(int, old)), tuple(map(int, new)), reason, outcome))
 
 
 class AutoBench:

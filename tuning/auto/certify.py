@@ -10,10 +10,20 @@ from numpy.typing import NDArray
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from tuning.auto.load_step import NOISE, SWING
+from tuning.auto.loop_margins import OVERSHOOT_ERROR, AskedMargin, asked_margins
+from tuning.auto.proving import STEP_SIZE
 from tuning.certificate.certificate import (
+    CROSSOVERS,
+    KEPT,
+    MARGIN_NAMES,
+    NEARLY_KEPT,
+    NOT_KEPT,
+    NOT_MEASURED,
+    SEEN_KEPT,
     AxisCertificate,
     Certificate,
     FrequencyResponse,
+    Requirement,
     StepResponse,
     envelope,
     frequency_response,
@@ -24,12 +34,14 @@ from tuning.runs.inputs import hashes
 from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
     from tuning.auto.proving import Shown
     from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
 
 Floats = NDArray[np.float64]
 
+LOOPS = ("velocity", "position")
 # Of a loop whose margins are not known: its lines are shown as what they are.
 UNKNOWN = Margins(*(np.nan,) * len(Margins._fields))
 MODEL_LOW, MODEL_HIGH, MODEL_POINTS = 2.0, 1000.0, 200  # frequencies of a loop that is a model's alone [Hz]
@@ -69,13 +81,17 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
         accepted=outcome.accepted,
         reservations=outcome.reservations,
         reason=outcome.reason or f"{_opening(outcome)}; the gains were verified {outcome.verified}",
-        identified={} if outcome.identified is None else identified(outcome.identified),
+        identified={} if outcome.identified is None else identified(outcome.identified, target.motor),
         before=outcome.before,
         after=outcome.after,
         before_si=si_gains(target.device, supply, outcome.before),
         after_si=si_gains(target.device, supply, outcome.after),
         steps=(*_steps(result, axis), *loaded) if outcome.accepted else (),
         frequency_responses=_responses(target, result, axis, outcome) if outcome.accepted else (),
+        dynamics=result.dynamics.name,
+        requirements=requirements(result.dynamics, outcome) if outcome.accepted else (),
+        figures=_crossovers(target, outcome) if outcome.accepted else {},
+        corrections=outcome.corrections,
         notes=outcome.notes,
         hardware_seconds=float(result.drive_seconds[axis]),
         aborts=int(result.aborts[axis]),
@@ -84,6 +100,44 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
 
 def _opening(outcome: AxisResult) -> str:
     return "all checks passed" if not outcome.reservations else "all checks that could be made passed"
+
+
+def requirements(dynamics: Dynamics, outcome: AxisResult) -> tuple[Requirement, ...]:
+    """Return what dynamics ask of an axis with its gains, and whether it was measured to be kept."""
+    rows = []
+    for loop in LOOPS:
+        found, least = outcome.margins.get(loop, UNKNOWN), outcome.at_least.get(loop)
+        whole = np.isfinite([found.phase_deg, found.gain_db]).all()
+        for asked in asked_margins(dynamics):
+            value, bound = getattr(found, asked.field), getattr(least, asked.field, np.nan)
+            is_bound = not np.isfinite(value) and not np.isnan(bound)
+            kept = _kept(asked, value)
+            if is_bound and not asked.missed(bound):  # a lower one says nothing: the margin itself may be above it
+                kept = KEPT
+            elif kept != NOT_MEASURED and asked.field == "ms" and not whole:
+                kept = SEEN_KEPT if kept != NOT_KEPT else kept
+            name = f"{loop} loop, {MARGIN_NAMES[asked.field]}"
+            rows.append(Requirement(name, asked.limit, bound if is_bound else value, is_bound, kept))
+    allowed = AskedMargin("", "", 100.0 * dynamics.overshoot, 100.0 * OVERSHOOT_ERROR, "%", 0, -1.0)
+    overshoot = float(np.maximum(100.0 * outcome.overshoot, 0.0))
+    name = f"overshoot of a step of {STEP_SIZE} counts in csp [%]"
+    return (*rows, Requirement(name, allowed.limit, overshoot, False, _kept(allowed, overshoot)))
+
+
+def _kept(asked: AskedMargin, value: float) -> str:
+    if np.isnan(value):
+        return NOT_MEASURED
+    return NOT_KEPT if asked.missed(value, asked.error) else NEARLY_KEPT if asked.missed(value) else KEPT
+
+
+def _crossovers(target: Target, outcome: AxisResult) -> dict[str, float]:
+    """Return where the loops cross over, the current loop by its design and the outer loops as measured."""
+    known, plant, current = target.device.gains, outcome.plant, np.nan
+    if plant is not None and not known.opens(outcome.after, "current"):
+        f = np.geomspace(MODEL_LOW, 0.49 * target.device.current_rate, MODEL_POINTS)
+        current = margins(f, OPEN_LOOPS["current"](target.device, plant, outcome.after, f)).crossover_hz
+    velocity, position = (outcome.margins.get(loop, UNKNOWN).crossover_hz for loop in LOOPS)
+    return dict(zip(CROSSOVERS, (current, velocity, position, position / velocity), strict=True))
 
 
 def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:

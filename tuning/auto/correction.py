@@ -251,9 +251,12 @@ def _try(
         return recorded, np.zeros_like(where)
     for k in map(int, np.flatnonzero(where & ~proof.passed)):
         bench.journals[k].note(f"corrected gains failed their trial: {proof.reason[k]}")
+        bench.journals[k].correct(recorded.gains[k], gains[k], why[k], f"failed their trial: {proof.reason[k]}")
     passed = bench.whole_machines(proof.passed & where)
     for k in map(int, np.flatnonzero(passed)):
-        bench.journals[k].note(f"gains designed again from what was measured: {why[k] or 'as its other axes were'}")
+        reason = why[k] or "as its other axes were"
+        bench.journals[k].note(f"gains designed again from what was measured: {reason}")
+        bench.journals[k].correct(recorded.gains[k], gains[k], reason)
     unknown = np.full(len(where), np.nan)
     fresh = replace(
         recorded, gains=gains, proof=proof.cost, cost=unknown, failed=("",) * len(where), swing=np.zeros(len(where)),

@@ -6,6 +6,7 @@ rest after it are not accepted.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,7 @@ Mask = NDArray[np.bool_]
 
 NAME = "load step of 0.3 rated torque at standstill"
 SHARE = 0.3  # of the rated torque
+RECOVERED = 0.05  # of the dip: the band of recovery
 # s: until the axis stands, then recorded before the step and after it, and at the end of that looked whether it stands.
 REST, BEFORE, AFTER, LOOKED_AT = 0.1, 0.02, 0.3, 0.1
 SWING = "current at rest afterwards, RMS [% of rated]"
@@ -79,13 +81,13 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
         for window in windows
     ]
     swing = np.max(ends, axis=0) / target.motor.rated_current
-    found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
+    found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE, band=RECOVERED)
     return {
         axis: StepResponse(
             NAME, True, "rad", t, np.zeros(len(t)), angle[:, axis], current[:, axis],
             {
-                "disturbance dip [rad]": float(found.dip[axis]),
-                "recovery [s]": float(found.recovery_time[axis]),
+                "greatest dip of the rotor [turns]": float(found.dip[axis]) / (2.0 * math.pi),
+                "recovery to within 5 % of the dip [ms]": 1e3 * float(found.recovery_time[axis]),
                 SWING: 100.0 * float(swing[axis]),
             },
         )

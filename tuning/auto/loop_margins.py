@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -234,19 +234,45 @@ def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None
             tell(f"{told}; {dynamics.name} dynamics allow {100.0 * dynamics.overshoot:.0f} %")
 
 
+class AskedMargin(NamedTuple):
+    """A margin that dynamics ask for: its name, its field of `Margins`, the limit, what a measurement may be off.
+
+    sign: 1 where the margin must be the limit at least, -1 where at most.
+    """
+
+    name: str
+    field: str
+    limit: float
+    error: float
+    unit: str
+    digits: int
+    sign: float = 1.0
+
+    def missed(self, value: float, error: float = 0.0) -> bool:
+        """Return whether a value is beyond the limit by more than an error; one that was not measured is not."""
+        return self.sign * (value - self.limit) < -error
+
+
+def asked_margins(dynamics: Dynamics) -> tuple[AskedMargin, ...]:
+    """Return the margins that dynamics ask for of each outer loop."""
+    return (
+        AskedMargin("phase margin", "phase_deg", dynamics.phase_deg, PHASE_ERROR, "degrees", 0),
+        AskedMargin("gain margin", "gain_db", dynamics.gain_db, GAIN_ERROR, "dB", 1),
+        AskedMargin("sensitivity peak Ms", "ms", dynamics.ms, dynamics.ms * (MS_ERROR - 1.0), "", 1, -1.0),
+    )
+
+
 def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
     """Return which margins of loops are smaller than the dynamics ask for, in words; what was not measured is not."""
     texts = []
     for loop, one in found.items():
-        for name, value, asked, error, unit, digits in (
-            ("phase margin", one.phase_deg, dynamics.phase_deg, PHASE_ERROR, " degrees", 0),
-            ("gain margin", one.gain_db, dynamics.gain_db, GAIN_ERROR, " dB", 1),
-            ("sensitivity peak Ms", -one.ms, -dynamics.ms, dynamics.ms * (MS_ERROR - 1.0), "", 1),
-        ):
-            if value < asked - error:
+        for asked in asked_margins(dynamics):
+            value = getattr(one, asked.field)
+            if asked.missed(value, asked.error):
+                told = f"{value:.{asked.digits}f} {asked.unit}".rstrip()
                 texts.append(
-                    f"the {loop} loop has a {name} of {abs(value):.{digits}f}{unit}, and {dynamics.name} dynamics ask "
-                    f"for {abs(asked):g}"
+                    f"the {loop} loop has a {asked.name} of {told}, and {dynamics.name} dynamics ask for "
+                    f"{asked.limit:g}"
                 )
     return texts
 

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.certificate.certificate import verdict
+from tuning.certificate.certificate import TAKEN, verdict
 from tuning.lateness import late_first
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.auto.stages import Basis, RecordedGains, Verdict
-    from tuning.certificate.certificate import StepResponse
+    from tuning.certificate.certificate import Correction, StepResponse
     from tuning.identify.estimate import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
@@ -46,6 +49,8 @@ class AxisResult:
         margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
         at_least: Lower bounds of margins that were not measured, likewise.
         slack: How far the measured loops keep the dynamics, relative; nan where they were not measured.
+        overshoot: Of a step of the set-point in csp, over the step; nan where none was made.
+        corrections: Gains that gave way to others, in their order.
         is_kept: Whether the gains before were better and are kept.
     """
 
@@ -62,6 +67,8 @@ class AxisResult:
     margins: Mapping[str, Margins] = field(default_factory=dict)
     at_least: Mapping[str, AtLeast] = field(default_factory=dict)
     slack: float = np.nan
+    overshoot: float = np.nan
+    corrections: tuple[Correction, ...] = ()
     is_kept: bool = False
 
     @property
@@ -80,7 +87,7 @@ class Result(NamedTuple):
 
     drive_seconds, moves, aborts and violations: Of each axis, (num_axes,). shown: A recorded move with the new gains,
     None if none was made. earlier: One with those before, likewise. response: The velocity loop's, likewise.
-    loaded: Response to a load step, of emulated machines.
+    loaded: Response to a load step, of emulated machines. dynamics: What the loops were to keep.
     file: The snapshot that brings everything back. kept: Whether drives on a bus stored the gains.
     """
 
@@ -93,6 +100,7 @@ class Result(NamedTuple):
     earlier: Shown | None
     response: MeasuredLoop | None
     loaded: Mapping[int, StepResponse]
+    dynamics: Dynamics
     file: Path
     kept: bool
 
@@ -115,12 +123,28 @@ def collect(
                 tuple(map(int, bench.before[k])), tuple(map(int, gains)), reason, tuple(journal.reservations),
                 tuple(journal.notes), identified.found[k], identified.plants[k], float(recorded.cost[k]),
                 float(recorded.proof[k]), verdict.verified[k], verdict.margins[k], verdict.at_least[k],
-                float(recorded.slack[k]), bool(recorded.kept[k]),
+                float(recorded.slack[k]), float(recorded.overshoot[k]), _outcomes(journal.corrections, recorded, k),
+                bool(recorded.kept[k]),
             )
         )  # fmt: skip
     ground, zero = bench.ground, np.zeros(bench.target.num_axes, np.int64)
     counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
     return Result(
-        tuple(axes), bench.spent, *counts, recorded.shown, recorded.earlier, recorded.response, recorded.loaded, file,
-        kept,
+        tuple(axes), bench.spent, *counts, recorded.shown, recorded.earlier, recorded.response, recorded.loaded,
+        bench.dynamics, file, kept,
     )  # fmt: skip
+
+
+def _outcomes(corrections: Sequence[Correction], recorded: RecordedGains, k: int) -> tuple[Correction, ...]:
+    """Return corrections of an axis; of those whose new gains passed their trial and did not stay it says why."""
+    nexts = [*(one.old for one in corrections[1:]), tuple(map(int, recorded.gains[k]))]
+    told = []
+    for number, (one, then) in enumerate(zip(corrections, nexts, strict=False)):
+        if one.outcome == TAKEN and one.new != then:
+            last = number == len(corrections) - 1
+            why = (
+                "the gains before are kept" if last and recorded.kept[k] else "no better as measured: the old ones stay"
+            )
+            one = replace(one, outcome=why)
+        told.append(one)
+    return tuple(told)

@@ -60,6 +60,9 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
         passed = bench.whole_machines(found.passed | ~open_) & open_
         best = np.where(passed[:, None], tried, best)
         proof = np.where(passed, found.cost, proof)
+        for k in map(int, np.flatnonzero(passed)):
+            if tried is not gains:
+                bench.journals[k].correct(gains[k], tried[k], f"the designed gains failed their trial: {last[k]}")
         for k in map(int, np.flatnonzero(open_ & ~passed)):
             last[k] = found.reason[k] or "another axis of its machine did not pass"
             if tried is not basis.calm:

@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.devices.gain_set import Gain
     from drive_env.loops.margins import Margins
+    from drive_env.motors import Motor
     from tuning.identify.estimate import Identification
     from tuning.response.measured_loop import AtLeast
     from tuning.target import Target
 
-FORMAT = 2
+FORMAT = 3
 STEPPER_FORMAT = "stepper 1"  # of stepper-certificate.json, which tuning/stepper/result.py writes
 HASH = "sha256"
 
@@ -58,7 +59,7 @@ class StepResponse:
         t: Sample times [s], shape (n,).
         reference, actual: Set-point and actual value, shape (n,).
         current: Actual current [A, peak i_q], shape (n,).
-        figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "disturbance dip [rpm]" -> value;
+        figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "greatest dip [turns]" -> value;
             nan where there is none. A disturbance exists on the emulator only.
     """
 
@@ -107,6 +108,50 @@ class StatedParameter:
     reason: str = ""
 
 
+KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED = (
+    "kept", "kept within the error of the measurement", "not kept", "not measured",
+)  # fmt: skip
+SEEN_KEPT = "kept where it was measured"  # a peak may lie where it was not
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What the dynamics ask of an axis, and what it has.
+
+    Attributes:
+        name: What is asked for, with its unit, e.g. "velocity loop, phase margin [deg]".
+        asked: The least, of Ms and overshoot the most.
+        found: What was measured; nan where nothing was.
+        is_bound: Whether `found` is a lower bound by a model, not a measurement.
+        kept: One of `KEPT`, `NEARLY_KEPT`, `SEEN_KEPT`, `NOT_KEPT` and `NOT_MEASURED`.
+    """
+
+    name: str
+    asked: float
+    found: float
+    is_bound: bool
+    kept: str
+
+
+TAKEN = "taken"
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Gains that gave way to others since the drive showed something else than was designed.
+
+    Attributes:
+        old, new: Raw integers in the order of the device's gain set.
+        reason: What the drive showed with the old ones.
+        outcome: What came of the new ones, `TAKEN` where they stay.
+    """
+
+    old: tuple[int, ...]
+    new: tuple[int, ...]
+    reason: str
+    outcome: str
+
+
 @dataclass(frozen=True)
 class AxisCertificate:
     """The result of one axis.
@@ -121,6 +166,10 @@ class AxisCertificate:
         before_si, after_si: The same in SI, as `si_gains` has them: name with unit -> value.
         steps: Recorded moves.
         frequency_responses: Open loops.
+        dynamics: Name of the dynamics that were asked for, or their numbers.
+        requirements: What these ask for, and whether it is kept.
+        figures: The `CROSSOVERS` of the loops; nan where there is none.
+        corrections: Which gains gave way to which, and why, in their order.
         notes: What no integer reached, limits met, what was left out.
         hardware_seconds: Time that passed on the drive [s].
         aborts: Trials that were stopped.
@@ -137,6 +186,10 @@ class AxisCertificate:
     after_si: Mapping[str, float]
     steps: tuple[StepResponse, ...] = ()
     frequency_responses: tuple[FrequencyResponse, ...] = ()
+    dynamics: str = ""
+    requirements: tuple[Requirement, ...] = ()
+    figures: Mapping[str, float] = field(default_factory=dict)
+    corrections: tuple[Correction, ...] = ()
     notes: tuple[str, ...] = ()
     hardware_seconds: float = 0.0
     aborts: int = 0
@@ -196,6 +249,12 @@ SI_UNITS = {  # of a gain by its loop and part, in the order of `SiGains`
     ("velocity", "I"): "s",
     ("position", "P"): "1/s",
 }
+CROSSOVERS = (
+    "crossover of the current loop, as designed [Hz]",
+    "crossover of the velocity loop, as measured [Hz]",
+    "crossover of the position loop, as measured [Hz]",
+    "crossover of the position loop over that of the velocity loop",
+)
 MARGIN_NAMES = {
     "phase_deg": "phase margin [deg]",
     "gain_db": "gain margin [dB]",
@@ -207,10 +266,20 @@ MARGIN_NAMES = {
 }
 
 
-def identified(identification: Identification) -> dict[str, StatedParameter]:
-    """Return the identified parameters for a certificate, without a tuner's guesses."""
+def identified(identification: Identification, motor: Motor) -> dict[str, StatedParameter]:
+    """Return the identified parameters for a certificate, without a tuner's guesses, and the load's inertia ratio.
+
+    That is the identified total inertia less the rotor's, over the rotor's as its data sheet has it.
+    """
     told = identification.estimates if identification.told is None else identification.told
-    return {name: StatedParameter(*estimate) for name, estimate in told.items()}
+    found = {name: StatedParameter(*estimate) for name, estimate in told.items()}
+    if (total := found.get("inertia")) is not None:
+        # What a measurement is off may leave less than the rotor.
+        value, low, high = (
+            float(np.maximum(J / motor.inertia - 1.0, 0.0)) for J in (total.value, total.low, total.high)
+        )
+        found["inertia_ratio"] = StatedParameter(value, low, high, "1", total.reason)
+    return found
 
 
 def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:

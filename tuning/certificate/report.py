@@ -13,14 +13,17 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.figure import Figure
 
 from drive_env.devices import find_device
-from tuning.certificate.certificate import CertificateError
+from tuning.certificate.certificate import CROSSOVERS, CertificateError
 from tuning.certificate.certificate_pictures import bode_picture, step_picture
 from tuning.identify.estimate import TITLES, interval
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
-    from tuning.certificate.certificate import AxisCertificate, Certificate
+    from tuning.certificate.certificate import AxisCertificate, Certificate, Correction
 
+RATIO = CROSSOVERS[-1]
+# Usual advice, not a limit: of the best gains of single axes that keep all constraints three quarters are beyond it.
+USUAL_RATIO = 0.5
 SEAL = "<!-- sha256 of all before this line: "
 
 STYLE = """
@@ -105,6 +108,12 @@ def _axis(axis: AxisCertificate, known: GainSet) -> list[str]:
         "<h3>Gains</h3>",
         _gains(axis, known),
     ]
+    if axis.requirements:
+        parts += [f"<h3>Dynamics asked for: {escape(axis.dynamics)}</h3>", _requirements(axis)]
+    if axis.figures:
+        parts += ["<h3>Bandwidths</h3>", _crossovers(axis.figures)]
+    if axis.corrections:
+        parts += ["<h3>Corrections by what the drive showed</h3>", _corrections(axis.corrections, known)]
     if axis.notes:
         parts.append(_list("notes", axis.notes))
     if axis.identified:
@@ -136,6 +145,36 @@ def _gains(axis: AxisCertificate, known: GainSet) -> str:
         cells = [name, label, axis.before[k], axis.after[k], meaning, _figure(before), _figure(after)]
         rows.append([str(cell) for cell in cells])
     return _table(("gain", "object", "before", "after", "in SI units", "before", "after"), rows, numbers=(2, 3, 5, 6))
+
+
+def _requirements(axis: AxisCertificate) -> str:
+    rows = []
+    for one in axis.requirements:
+        bound = "at least " if one.is_bound else ""
+        rows.append([one.name, _figure(one.asked), f"{bound}{_figure(one.found)}", one.kept])
+    return _table(("", "asked for", "found", ""), rows, numbers=(1, 2))
+
+
+def _crossovers(figures: Mapping[str, float]) -> str:
+    text = _pairs({name: _figure(value) if math.isfinite(value) else "not measured" for name, value in figures.items()})
+    if figures[RATIO] <= USUAL_RATIO or math.isnan(figures[RATIO]):
+        return text
+    return text + (
+        f"<p class='reserved'>The position loop crosses over beyond {USUAL_RATIO:g} of the velocity loop's crossover; "
+        "usual advice is to stay below. What counts are the margins of both loops.</p>"
+    )
+
+
+def _corrections(corrections: Sequence[Correction], known: GainSet) -> str:
+    rows = []
+    for number, one in enumerate(corrections, start=1):
+        changed = [
+            f"{title} {old} → {new}"
+            for title, old, new in zip(known.titles, one.old, one.new, strict=True)
+            if old != new
+        ]
+        rows.append([str(number), ", ".join(changed), one.reason, one.outcome])
+    return _table(("", "gains", "because", "outcome"), rows)
 
 
 def _identified(axis: AxisCertificate) -> str:

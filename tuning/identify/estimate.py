@@ -25,6 +25,7 @@ TITLES = {  # as people read them
     "pole_pairs": "pole pairs",
     "encoder_direction": "encoder direction",
     "inertia": "total inertia",
+    "inertia_ratio": "load inertia over the rotor's",
     "coulomb": "Coulomb friction",
     "viscous": "viscous friction",
     "offset": "constant load (gravity)",

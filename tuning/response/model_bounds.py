@@ -40,7 +40,9 @@ def why_unbounded(identified: Identification) -> str:
     pair = [fit.estimates[name] for name in ("anti_resonance", "resonance")]
     # Twins make do with a guess.
     if fit.plant.is_elastic and not all(one.is_known for one in pair):
-        return f"its resonance is not known for certain: {' '.join(one.reason for one in pair if one.reason)}"
+        # Both are refused by the same look at the response, mostly for the same reason.
+        reasons = dict.fromkeys(one.reason for one in pair if one.reason)
+        return f"its resonance is not known for certain: {'; '.join(reasons)}"
     return ""
 
 

@@ -7,6 +7,7 @@ let CoolStep take current away, and prove that no step is lost. The state before
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -31,7 +32,7 @@ from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, can_store, restore
 from tuning.stepper.closed_loop import LOOP_FIGURES, tune_loop
 from tuning.stepper.load_detection import LoadDetection
-from tuning.stepper.obstacle import REACTION, can_load, prove_with_load, why_not_loaded
+from tuning.stepper.obstacle import OBSTACLE_RISE, REACTION, RISE, can_load, prove_with_load, why_not_loaded
 from tuning.stepper.result import StepperAxis, StepperResult, figure
 from tuning.target import Target, timed
 
@@ -225,7 +226,7 @@ def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed:
         lower = target.device.gains.column(*LOWER)
         if lower is not None and (cooled := going & ~proof.withstood & (detection.gains[:, lower] > 0)).any():
             detection.leave_coolstep_off(
-                cooled, "with it a load of 30 % of the holding torque, which comes within 0.15 s, stops the axis"
+                cooled, f"with it a load of 30 % of the holding torque, which comes within {RISE:g} s, stops the axis"
             )
             proof = prove_with_load(target, moves, speed, run, going)
         for k in np.flatnonzero(going & ~proof.withstood):
@@ -300,7 +301,7 @@ def _axis(
     known = target.device.gains
     run = known.column("current", "amplitude")
     assert run is not None, "an open loop has a run current"
-    identified = bench.identified
+    identified, is_loaded = bench.identified, math.isfinite(proof["lost"][k])
     figures = {
         "inertia [kg m^2]": figure(identified.inertia[k]),
         "dry friction [N m]": figure(identified.coulomb[k] * constant),
@@ -312,6 +313,8 @@ def _axis(
         "load angle at which the reading is to be 0 [deg electrical]": figure(float(np.degrees(STALL_ANGLE))),
         "stop on stall above [rad/s]": figure(found.stop_speed[k]),
         "current saved by CoolStep, by the load angle [%]": figure(100.0 * found.saved[k]),
+        "load of 30 % that does not stop it came within [s]": figure(RISE if is_loaded else math.nan),
+        "obstacle that stops it came within [s]": figure(OBSTACLE_RISE if is_loaded else math.nan),
         "teeth lost at an obstacle": figure(proof["lost"][k]),
     }
     figures |= {name: figure(values[k]) for name, values in proof.items() if name in LOOP_FIGURES}
