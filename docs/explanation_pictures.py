@@ -219,14 +219,14 @@ def score_parts() -> str:
 
 # --- runs and their plots ---------------------------------------------------------------------------------------------
 class Example(NamedTuple):
-    """Gains of the worked example in docs/explanation/score.md, as the drive's integers; None: the baseline rule's."""
+    """Gains of the worked example in docs/explanation/score.md, as the drive's integers."""
 
     name: str
-    gains: tuple[int, int, int, int, int] | None
+    gains: tuple[int, int, int, int, int]
 
 
 EXAMPLES = (
-    Example("baseline rule", None),
+    Example("lively", (4021, 1573, 908, 1499, 592)),
     Example("faster: velocity P x 1.4, position P x 2", (4021, 1573, 1271, 1499, 1184)),
     Example("as auto designs", (5580, 1579, 1099, 1845, 395)),  # `drive-tune auto --load belt`
 )
@@ -234,10 +234,8 @@ BELT_INERTIA = 2.34e-5  # kg*m^2 at the rotor, as `drive-tune identify --load be
 
 
 def _score():  # type: ignore[no-untyped-def]
-    """Return the scorer of a belt axis, set up with the baseline rule as its reference, and that rule's integers."""
+    """Return the scorer of a belt axis, ready to score."""
     from drive_env import EmulatedDrives
-    from drive_env.devices import find_device
-    from drive_env.gains import rule_gains
     from drive_env.motors import MOTORS
     from drive_env.trials.positioning import plan_move, reach
     from drive_env.trials.score import RobustScore
@@ -247,16 +245,15 @@ def _score():  # type: ignore[no-untyped-def]
     with EmulatedDrives(load="belt", num_machines=1, num_threads=1) as drives:
         scorer.set_machines(drives.machine.parameters, drives.machine.supply)
     scorer.set_moves(plan_move(motor, np.full(1, BELT_INERTIA), 65536, reach("belt")))
-    rule = rule_gains(find_device("tmcm1636"), motor, [BELT_INERTIA])
-    return scorer, rule
+    return scorer
 
 
 def worked_example() -> list[tuple[str, list[int], dict[str, float]]]:
     """Return of each example its name, its integers and figures: terms, J and clearance of variants, robust cost."""
-    scorer, rule = _score()
+    scorer = _score()
     found = []
     for name, own in EXAMPLES:
-        gains = rule if own is None else np.array([own], np.int64)
+        gains = np.array([own], np.int64)
         scores = scorer.score(gains)
         terms = scores.terms
         figures = {
@@ -343,16 +340,15 @@ def emulator_imperfections(path: Path) -> None:
 
 
 def score_move(path: Path) -> None:
-    """Plot the trial that J is made of, with the baseline rule's gains: move, rest, load step."""
+    """Plot the trial that J is made of, with lively gains: move, rest, load step."""
     from drive_env import EmulatedDrives, cia402
     from drive_env.gains import write_gains
     from drive_env.trials.positioning import plan_move, power_up, reach, start, write_profile
 
-    scorer, rule = _score()
-    scorer.close()
+    _score().close()
     with EmulatedDrives("tmcm1636", load="belt", num_threads=1) as drives:
         move = plan_move(drives.motor, np.full(1, BELT_INERTIA), 65536, reach("belt"))
-        write_gains(drives, rule)
+        write_gains(drives, np.array(EXAMPLES[0].gains)[None])
         write_profile(drives, move)
         power_up(drives)
         start(drives, move.distance)
@@ -464,11 +460,12 @@ def certificate_rest(path: Path) -> None:
     from drive_env import EmulatedDrives, motion
     from drive_env.gains import write_gains
 
-    _, rule = _score()
     figure, ((axes,),) = _axes(2.6)
-    for factor, colour, name in ((3.0, RED, "velocity P x 3"), (1.0, GREEN, "baseline rule")):
+    for factor, colour, name in ((3.0, RED, "velocity P x 3"), (1.0, GREEN, "lively")):
         with EmulatedDrives("tmcm1636", load="belt", num_threads=1) as drives:
-            write_gains(drives, np.rint(rule * np.array([1, 1, factor, 1, 1])).astype(np.int64))
+            write_gains(
+                drives, np.rint(np.array([EXAMPLES[0].gains]) * np.array([1, 1, factor, 1, 1])).astype(np.int64)
+            )
             motion.enable(drives, mode="pp")
             drives.advance(0.3)
             drives.machine.load_torque = -0.3 * drives.motor.rated_torque / _lever()

@@ -22,7 +22,7 @@ from tuning.response.measured_loop import COHERENT
 from tuning.response.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated
 
-SOFT = BASELINE_RULE._replace(speed=0.1)  # crossover at about 20 Hz
+SOFT = BASELINE_RULE._replace(speed=0.1, integration=1.38, position=1.0)  # crossover at about 20 Hz
 FINE = {"motor.encoder_interpolation": 16.0}  # 65,536 counts per turn
 GRID = np.geomspace(5.0, 1000.0, 4000)
 

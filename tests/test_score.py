@@ -42,7 +42,6 @@ from drive_env.trials.score import (
 )
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
-from research import fit_rule
 from tuning.target import emulated
 
 DEVICE, MOTOR = find_device("tmcm1636"), MOTORS["qbl4208"]
@@ -251,11 +250,11 @@ def test_small_time_constants_of_the_device():
 
 
 def test_the_rule_is_its_formula_in_bandwidths():
-    rule = BASELINE_RULE._replace(inertia=0.5, speed=0.2, integration=5.0, position=0.25)
+    rule = BASELINE_RULE._replace(speed=0.2, integration=5.0, position=0.25)
     J = np.array([3.0, 12.0]) * MOTOR.inertia
     gains = rule_gains(DEVICE, MOTOR, J, rule)
-    for k, share in ((0, 1.0), (1, 0.5)):  # four times the inertia, half the speed
-        w_v = share * 0.2 / float(small_time_constants(DEVICE, 400.0))
+    w_v = 0.2 / float(small_time_constants(DEVICE, 400.0))
+    for k in range(2):
         exact = gains_from_bandwidths(
             DEVICE, MOTOR, J[k], current_hz=1000.0, velocity_hz=w_v / 2 / np.pi, position_hz=0.25 * w_v / 2 / np.pi
         )
@@ -268,25 +267,13 @@ def test_the_rule_stays_within_the_registers():
     assert gains.max() <= 32767
 
 
-def test_more_inertia_makes_the_baseline_rule_slower():
+def test_whatever_the_inertia_the_baseline_rule_has_one_bandwidth():
     J = np.array([2.0, 10.0]) * MOTOR.inertia
-    slow, fast = (bandwidths_from_gains(DEVICE, MOTOR, j, Gains(*map(int, row))).velocity_hz
-                  for j, row in zip(J[::-1], rule_gains(DEVICE, MOTOR, J)[::-1], strict=True))  # fmt: skip
-    assert slow < fast
-
-
-def test_a_fit_never_ends_worse_than_the_rule_in_force(monkeypatch):
-    monkeypatch.setattr(fit_rule, "SETS", 4)
-    monkeypatch.setattr(fit_rule, "LOCAL", 2)
-    bench = fit_rule.Bench("two_mass", "qbl4208", 2, 0, num_threads=1)
-    found = fit_rule.fit([bench])
-    bench.score_of.close()
-    assert len(found) == 4
-    assert BASELINE_RULE in dict(found)
-    assert [one.score for one in found] == sorted(one.score for one in found)
-    for rule, _ in found:
-        for name, (low, high) in fit_rule.RANGES.items():
-            assert low <= getattr(rule, name) <= high
+    found = [bandwidths_from_gains(DEVICE, MOTOR, j, Gains(*map(int, row))).velocity_hz
+             for j, row in zip(J, rule_gains(DEVICE, MOTOR, J), strict=True)]  # fmt: skip
+    assert found == pytest.approx(
+        [BASELINE_RULE.speed / small_time_constants(DEVICE, 400.0) / (2 * np.pi)] * 2, rel=0.01
+    )
 
 
 # --- the robust cost of machines --------------------------------------------------------------------------------------
@@ -308,11 +295,12 @@ def two_mass():
     score.close()
 
 
-RULE = rule_gains(DEVICE, MOTOR, [3 * MOTOR.inertia])
+# What two masses of 80/140 Hz stand with margins.
+CALM = bandwidth_gains(DEVICE, MOTOR, 3 * MOTOR.inertia, current_hz=1000.0, velocity_hz=16.0, position_hz=7.0)[None]
 
 
 def times(factor, machines=4):
-    gains = np.repeat(RULE, machines, axis=0)
+    gains = np.repeat(CALM, machines, axis=0)
     gains[:, P] = np.rint(gains[:, P] * factor)
     return gains
 
@@ -423,8 +411,8 @@ def test_a_variant_of_the_gains_is_the_machine_with_those_gains(two_mass, varian
 
 def test_too_much_and_too_little_gain_perform_worse(two_mass):
     slow, right, shaking = (float(two_mass.score(times(f)).performance[0]) for f in (0.2, 1.0, 8.0))
-    assert slow > 1.3 * right
-    assert shaking > 3.0 * right
+    assert slow > 1.1 * right
+    assert shaking > 1.2 * right
 
 
 def test_too_much_and_too_little_gain_cost_more():
@@ -454,16 +442,16 @@ def test_a_machine_that_cannot_be_enabled_performs_as_a_trip_and_is_farther_off_
 
 def test_a_machine_is_as_good_as_its_worst_axis():
     score = bench("gantry", 1)
-    gains = np.repeat(RULE, 2, axis=0)
+    gains = bandwidths(45.0, 15.0, axes=2)
     found = []
     for one_axis in (gains, bandwidths(20.0, 4.0, axes=2)):
         worse = one_axis.copy()
         worse[1, P] *= 20
         found += [score.score(one_axis), score.score(worse)]
     score.close()
-    of_rule, worse, slow, shaking = found
-    assert float(worse.performance[0]) > 2.0 * float(of_rule.performance[0])
-    assert worse.clearance[0, 0] < 0.0 < of_rule.clearance[0, 0]
+    calm, worse, slow, shaking = found
+    assert float(worse.performance[0]) > 2.0 * float(calm.performance[0])
+    assert worse.clearance[0, 0] < 0.0 < calm.clearance[0, 0]
     assert float(shaking.robust_cost[0]) > 2.0 * float(slow.robust_cost[0])  # the slow ones keep all margins
 
 
@@ -495,7 +483,7 @@ def test_soft_standard_and_stiff_ask_different_margins_of_one_machine():
 def test_a_score_does_not_depend_on_where_the_machine_stood_when_it_was_set():
     """A robot's inertia is another where the last move ended, and a run begins where the load starts."""
     score = bench("robot", 1)
-    gains = np.repeat(RULE, 6, axis=0)
+    gains = np.repeat(CALM, 6, axis=0)
     with EmulatedDrives(load="robot", num_machines=1, num_threads=1) as drives:
         parameters, supply = drives.machine.parameters, drives.machine.supply[:1]
         first = score.score(gains)

@@ -40,10 +40,9 @@ Integers = NDArray[np.int64]
 
 # What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
 FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
-# The baseline rule at a third of its speed and with three times its integration time: where a safe search begins.
-SAFE_RULE = BASELINE_RULE._replace(
-    speed=BASELINE_RULE.speed / 3.0, integration=3.0 * BASELINE_RULE.integration, position=0.3 * BASELINE_RULE.position
-)
+# The baseline rule at a sixth of its speed and half its position gain, with which no elastic axis of the public suite
+# oscillates: where a safe search begins.
+SAFE_RULE = BASELINE_RULE._replace(speed=BASELINE_RULE.speed / 6.0, position=0.5 * BASELINE_RULE.position)
 
 # CoolStep where a search begins: the lowest threshold, a band above it, quick up and slow down.
 FIRST_COOLSTEP = {LOWER: 1, WIDTH: 2, DOWN: 2, UP: 3}
