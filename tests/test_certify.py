@@ -53,7 +53,7 @@ def test_crossovers_are_those_of_the_true_linear_machine(load):
         write_gains(target.drives, gains)
         truth, plant, rates = true_machines(target.drives), true_plant(target.drives), LoopRates.of(target.device)
         response = frequency_response.measure(target)
-        found = MeasuredAxis(response, 0, plant, ("velocity", "position")).margins(gains[0])
+        found = MeasuredAxis(response, 0, plant).margins(gains[0])
         axis = AxisResult(GAINS[load], GAINS[load], plant=plant, margins=found)
         (paper,) = certificate(target, result(axis, response=response), seed=0).axes
     f = np.geomspace(1.0, 0.49 * rates.velocity_rate, 4000)
