@@ -59,6 +59,10 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
         (("identify", "-c", "can0", "--travel", "-1:1"), "will turn. Is its way clear? There is no terminal to ask"),
         (("response", "--lockstep"), "--travel is missing"),
         (("auto", "--axes", "linked"), "add --bus"),
+        (("auto", "--dynamics", "harsh"), "dynamics 'harsh': give soft, standard, stiff"),
+        (("auto", "--inertia-range", "2/0.5"), "the least lies between 0.2 and 1, the greatest between 1 and 5"),
+        (("auto", "--device", "tmcm3313", "--dynamics", "soft"), "no linear model of its loops; leave --dynamics out"),
+        (("auto", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
         (("auto", "--bus", "--yes"), "--travel is missing"),
     ],
 )

@@ -322,6 +322,13 @@ def test_a_load_has_the_variants_that_it_can_have():
     assert names["two_mass"] == [variant.name for variant in VARIANTS if variant.run_current == 1.0]  # a servo
 
 
+def test_the_variants_inertia_is_the_range_that_dynamics_ask_for():
+    score = RobustScore("tmcm1636", "inertia", "qbl4208", 1, num_threads=1, dynamics=find_dynamics("soft", "1/3"))
+    assert [variant.inertia for variant in score.variants] == [1.0, 3.0, 1.0, 1.0]  # nothing twice
+    assert score.variants[1].name == "load inertia x 3"
+    score.close()
+
+
 def test_the_rules_disturbance_is_the_scale(two_mass):
     assert two_mass.set_reference(times(1.0)).terms.disturbance[:, 0] == pytest.approx(1.0)
 

@@ -240,7 +240,8 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
     blind = bench.going & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
-        soft, *more = design_axes(bench, basis, blind, recorded=recorded, dynamics=find_dynamics("soft"), most=most)
+        asked = find_dynamics("soft", bench.dynamics.inertia_range)
+        soft, *more = design_axes(bench, basis, blind, recorded=recorded, dynamics=asked, most=most)
         designed = np.where(blind[:, None], soft, designed)
         cost, present = (np.where(blind, one, all_) for one, all_ in zip(more, (cost, present), strict=True))
     for k in map(int, np.flatnonzero(bench.going)):

@@ -39,11 +39,6 @@ class IdentifiedAxes:
     found: tuple[Identification | None, ...]
     plants: tuple[Plant | None, ...]
 
-    @property
-    def doubtful(self) -> tuple[bool, ...]:
-        """Whether the model of an axis, and so its digital twins, is of an axis as it is not."""
-        return tuple(one is not None and bool(one.doubt) for one in self.found)
-
     def known(self, axis: int) -> tuple[Plant, Identification]:
         """Return model and identification of an axis that goes on."""
         plant, found = self.plants[axis], self.found[axis]

@@ -66,7 +66,7 @@ class Yardstick:
                 for J, volts in zip(each(inertia), self.supply, strict=True)
             ]
         )
-        self.rule = self._score.set_reference(self.rule_gains).robust_cost  # E_0 is that of the baseline rule
+        self._score.set_reference(self.rule_gains)  # E_0 is that of the baseline rule
 
     def score(self, gains: Integers) -> Scores:
         """Return the scores of every copy, gains being raw, (num_machines * axes, count)."""
