@@ -124,6 +124,7 @@ WORLDS = (
     MachineVariant("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
 MOST_SWING = 0.8 * OSCILLATION  # what the current may swing in a move, of the rated one
+ANY_REACH, ANY_SCALER = 2.0 * math.pi, 65536.0  # of twins that need not move as their axes do
 FARTHEST = 0.6  # relative: an interval that says less than this says nothing
 
 
@@ -279,6 +280,21 @@ class Twins:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def linear_twins(device: Device, motor: Motor, plants: Sequence[Plant], dynamics: Dynamics, sets: int = 1) -> Twins:
+    """Return twins of axes of which only the linear model is known: they say how far gains keep the dynamics.
+
+    Args:
+        device: The drive.
+        motor: The motor, as its data sheet has it.
+        plants: The axes.
+        dynamics: What the loops must keep.
+        sets: Sets of gains per axis whose slack is computed at once.
+    """
+    known = [Known(plant, FrictionGuess(0.0, plant.viscous / plant.torque_constant), ANY_REACH) for plant in plants]
+    scaler = np.full(len(known), ANY_SCALER)
+    return Twins(device, motor, known, scaler, sets, num_threads=1, worlds=WORLDS[:1], dynamics=dynamics)
 
 
 class _Part:
