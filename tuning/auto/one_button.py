@@ -160,10 +160,10 @@ def tell_of_lateness(bench: AutoBench) -> None:
         bench.reserve(np.ones(bench.target.num_axes, bool), late)
 
 
-def tune(target: Target, rng: np.random.Generator) -> Outcome:
+def tune(target: Target, rng: np.random.Generator, dynamics: str | Dynamics = DEFAULT) -> Outcome:
     """Tune a target as a tuner of `drive-tune rank`."""
     with tempfile.TemporaryDirectory() as folder:
-        found = auto(target, Path(folder) / "before.toml", keep=False)
+        found = auto(target, Path(folder) / "before.toml", dynamics=dynamics, keep=False)
     return Outcome(
         np.array([axis.after for axis in found.axes], np.int64),
         found.drive_seconds,
