@@ -27,8 +27,25 @@ def test_rules_show_gains_margins_and_what_a_relay_measured():
     assert list(axis["proposals"]) == ["simc", "margin_45", "relay, measured"]
     for proposal in axis["proposals"].values():
         assert all(0 < gain <= RAW_MAX for gain in proposal["gains"].values())
-        assert proposal["velocity_margins"]["phase_deg"] > 40.0
-    assert axis["proposals"]["margin_45"]["velocity_margins"]["phase_deg"] == pytest.approx(45.0, abs=1.5)
+        assert all(one["phase_deg"] > 40.0 for one in proposal["margins"].values())
+        assert proposal["keeps"] is (proposal["slack"] >= 0.0)
+    assert axis["proposals"]["margin_45"]["margins"]["velocity"]["phase_deg"] == pytest.approx(45.0, abs=1.5)
+    assert axis["dynamics"] == "standard"
+
+
+def test_rules_say_which_of_them_keep_the_dynamics_asked_for():
+    kept = {}
+    for dynamics in ("soft", "40/7/2.2"):
+        done = drive_tune("rules", "margin_45", "margin_60", "--load", "inertia", "--dynamics", dynamics)
+        assert done.exit_code == 0, done.output
+        assert f"kept: by {dynamics} dynamics" in done.stdout
+        rows = [line.split() for line in done.stdout.splitlines() if line.startswith("margin_")]
+        kept[dynamics] = {row[0]: row[-1] for row in rows}
+        assert all(row[-3].count("/") == row[-2].count("/") == 2 for row in rows)  # of both loops
+    assert kept == {
+        "soft": {"margin_45": "no", "margin_60": "yes"},
+        "40/7/2.2": {"margin_45": "yes", "margin_60": "yes"},
+    }
 
 
 @pytest.mark.slow
@@ -52,6 +69,8 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
             "will turn. Is its way clear? There is no terminal to ask; confirm with --yes",
         ),
         (("rules", "--load", "brick"), "no load is named 'brick'"),
+        (("rules", "--dynamics", "45/8"), "dynamics '45/8': give soft, standard, stiff"),
+        (("rules", "--device", "tmcm3313", "--dynamics", "soft"), "this drive has no linear model of its loops"),
         (("auto", "--motor", "brick"), "brick"),
         (("auto", "--node", "1"), "--travel is missing"),
         (("auto", "--channel", "can0"), "--travel is missing"),
@@ -59,6 +78,10 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
         (("identify", "-c", "can0", "--travel", "-1:1"), "will turn. Is its way clear? There is no terminal to ask"),
         (("response", "--lockstep"), "--travel is missing"),
         (("auto", "--axes", "linked"), "add --bus"),
+        (("auto", "--dynamics", "harsh"), "dynamics 'harsh': give soft, standard, stiff"),
+        (("auto", "--inertia-range", "2/0.5"), "the least lies between 0.2 and 1, the greatest between 1 and 5"),
+        (("auto", "--device", "tmcm3313", "--dynamics", "soft"), "no linear model of its loops; leave --dynamics out"),
+        (("auto", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
         (("auto", "--bus", "--yes"), "--travel is missing"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -84,6 +85,28 @@ def test_dynamics_that_do_not_exist(text, reason):
     with pytest.raises(ValueError) as refusal:
         find_dynamics(text)
     assert str(refusal.value) == f"dynamics {text!r}: {ASKED}{reason}"
+
+
+def test_the_load_inertia_that_loops_must_bear():
+    assert find_dynamics("soft").inertia_range == (0.5, 2.0)
+    wide = find_dynamics("soft", "0.25/4")
+    assert wide.inertia_range == (0.25, 4.0) and replace(wide, inertia_range=(0.5, 2.0)) == find_dynamics("soft")
+    assert find_dynamics(wide) is wide and find_dynamics(wide, (1.0, 1.5)).inertia_range == (1.0, 1.5)
+
+
+RANGE = "give the least and the greatest load inertia over the one it is tuned with, as 0.5/2"
+WITHIN = "; the least lies between 0.2 and 1, the greatest between 1 and 5"
+
+
+@pytest.mark.parametrize(("given", "reason"), [
+    ("2", ""), ("0.5/1/2", ""), ("half/twice", ""), ("", ""), ((0.5,), ""),
+    ("2/0.5", WITHIN), ("0.1/2", WITHIN), ("0.5/6", WITHIN), ("1.1/2", WITHIN), ("0.5/0.9", WITHIN), ("nan/2", WITHIN),
+    ((0.5, np.inf), WITHIN),
+])  # fmt: skip
+def test_ranges_of_inertia_that_are_none(given, reason):
+    with pytest.raises(ValueError) as refusal:
+        find_dynamics("standard", given)
+    assert str(refusal.value) == f"inertia range {given!r}: {RANGE}{reason}"
 
 
 # --- the region around -1 ---------------------------------------------------------------------------------------------

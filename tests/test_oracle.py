@@ -49,7 +49,7 @@ def test_what_is_kept_are_gains_and_their_figures_are_scored_anew(monkeypatch):
 @pytest.mark.parametrize("stale", ["machine", "performance", "slack"])
 def test_a_row_that_no_longer_holds_is_searched_anew(stale, monkeypatch, tmp_path):
     true, shares = read_oracles()[digest(RIGID)], []
-    monkeypatch.setattr(module, "search_oracle", lambda machine, num_threads: "searched")
+    monkeypatch.setattr(module, "search_oracle", lambda machine, num_threads, dynamics: "searched")
     machine, row = RIGID, true
     if stale == "machine":
         machine = replace(RIGID, supply=RIGID.supply + 1.0)
@@ -61,6 +61,28 @@ def test_a_row_that_no_longer_holds_is_searched_anew(stale, monkeypatch, tmp_pat
     write_oracles(file, [RIGID], {RIGID.name: row})
     assert find_oracles([machine], progress=shares.append, kept=file) == {machine.name: "searched"}
     assert shares == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(("dynamics", "is_searched"), [("soft", True), ("45/8/2", False), ("standard", False)])
+def test_the_file_has_oracles_for_standard_dynamics_alone(dynamics, is_searched, monkeypatch):
+    asked = []
+
+    def search(machine, num_threads, dynamics):
+        asked.append((machine.name, dynamics))
+
+    monkeypatch.setattr(module, "search_oracle", search)
+    find_oracles([RIGID], dynamics=dynamics)
+    assert asked == ([(RIGID.name, dynamics)] if is_searched else [])
+
+
+@pytest.mark.slow
+def test_softer_dynamics_have_a_slower_oracle_that_keeps_them():
+    soft, standard = (search_oracle(RIGID, dynamics=name) for name in ("soft", "standard"))
+    assert soft.performance > standard.performance and soft.slack > 0.0
+    yardstick = Yardstick([RIGID], None)
+    worst = yardstick.margins(soft.gains)
+    yardstick.close()
+    assert worst.phase_deg[0] > 59.0 and worst.ms[0] < 1.52
 
 
 def test_every_axis_is_kept_in_the_file(tmp_path):

@@ -19,7 +19,7 @@ from tuning.compare import comparison as compare_module
 from tuning.compare import tuners
 from tuning.compare.comparison import compare
 from tuning.compare.comparison_files import save
-from tuning.compare.oracle import find_oracles
+from tuning.compare.oracle import digest, find_oracles, read_oracles
 from tuning.compare.suite import load_suite, open_group
 from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
 from tuning.compare.yardstick import REPEATS
@@ -105,6 +105,31 @@ def test_the_cost_is_the_robust_cost_of_the_machine():
     assert [row.relative for row in found.rows] == pytest.approx(
         expected.performance / [best[machine.name].performance for machine in RIGID]
     )
+
+
+def test_gains_are_judged_by_the_dynamics_asked_for():
+    best, rows = find_oracles(RIGID), {}
+    for dynamics in ("soft", "standard"):
+        found = compare(RIGID, {"truth": knows_the_truth}, oracles=best, dynamics=dynamics)
+        rows[dynamics] = found.of("truth")
+        assert found.tuners[0].kept == (1.0 if dynamics == "standard" else 0.0)
+        assert all(row.near == (dynamics == "standard") for row in rows[dynamics])
+    for soft, standard in zip(rows["soft"], rows["standard"], strict=True):
+        assert soft.slack < standard.slack and soft.performance == standard.performance
+        assert soft.robust_cost > 30.0 > standard.robust_cost
+
+
+def test_auto_is_asked_for_the_dynamics_and_no_other_tuner(monkeypatch):
+    asked = {}
+
+    def auto(target, file, *, dynamics, keep):
+        asked["dynamics"] = dynamics
+        raise RuntimeError("that is all")
+
+    monkeypatch.setattr("tuning.auto.one_button.auto", auto)
+    compare(RIGID[:1], {"auto": find_tuner("auto", dynamics="soft")}, oracles=find_oracles(RIGID[:1]))
+    assert asked == {"dynamics": "soft"}
+    assert find_tuner("tpe", 5, "soft").keywords == find_tuner("tpe", 5).keywords
 
 
 def test_a_summary_is_of_all_machines():
@@ -376,6 +401,22 @@ def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     assert f"{row['median']:.6g}" == next(line["median"] for line in first if line["tuner"] == "baseline")
 
 
+def test_the_command_searches_the_oracles_of_other_dynamics_and_says_so(tmp_path, monkeypatch):
+    kept, asked = read_oracles()[digest(RIGID[0])], []
+
+    def search(machine, num_threads, dynamics):
+        asked.append((machine.name, dynamics))
+        return kept
+
+    monkeypatch.setattr("tuning.compare.oracle.search_oracle", search)
+    result = run("rank", "-t", "factory", "--count", 1, "--dynamics", "soft", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "no oracles for soft dynamics are kept; they are searched first" in result.stderr
+    assert "on 1 machines, soft dynamics" in result.stdout
+    assert len(asked) == 1 and asked[0][1] == "soft"
+    assert 'dynamics = "soft"' in (tmp_path / "out" / "settings.toml").read_text()
+
+
 def test_a_run_that_is_interrupted_prints_the_figures_it_has(monkeypatch, tmp_path):
     """Two loads: the second is never done."""
     calls = []
@@ -405,6 +446,8 @@ def test_the_command_lists_tuners_and_suites():
         (("rank", "-t", "luck"), "no tuner is named 'luck'"),
         (("rank", "--suite", "secret"), "no suite is named 'secret'"),
         (("rank", "--count", "0"), "count must be 1 or more"),
+        (("rank", "--dynamics", "harsh"), "dynamics 'harsh': give soft, standard, stiff"),
+        (("rank", "--dynamics", ""), "dynamics '': give soft, standard, stiff"),
         (("rank", "--seed", "-1"), "--seed must be 0 or more, not -1"),
         (("optimise", "--sampler", "luck"), "no sampler is named 'luck'"),
         (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES has one"),

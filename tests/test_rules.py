@@ -14,7 +14,8 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
-from drive_env.loops.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
+from drive_env.loops.dynamics import find_dynamics
+from drive_env.loops.linear_model import OPEN_LOOPS, Plant, current_open_loop, position_open_loop, velocity_open_loop
 from drive_env.loops.margins import Margins, margins
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import MOTORS, find_motor
@@ -28,7 +29,7 @@ from tuning.rules.pole_placement import place_first_order
 from tuning.rules.proposal import Workbench
 from tuning.rules.relay import Swing, gains_from_swing
 from tuning.rules.rules_by_name import MEANINGS, RULES, propose
-from tuning.rules.side_by_side import velocity_margins
+from tuning.rules.side_by_side import outer_margins, slacks
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
@@ -477,12 +478,31 @@ def test_what_a_rule_asks_for_is_over_what_an_ampere_accelerates_by(rule, share,
 
 
 # --- side by side -----------------------------------------------------------------------------------------------------
-def test_the_margins_of_a_proposal_are_those_of_its_velocity_loop():
+def test_the_margins_of_a_proposal_are_those_of_its_outer_loops():
     """From 0.5 Hz to just below half the loop's rate."""
     gains = propose("simc", DEVICE, MOTOR, plant()).gains
-    found = velocity_margins(DEVICE, plant(), gains)
-    assert found == pytest.approx(margins(F, velocity_open_loop(DEVICE, plant(), gains, F)), rel=1e-3)
-    assert len(found) == 7
+    found = outer_margins(DEVICE, plant(), gains)
+    assert list(found) == ["velocity", "position"]
+    for loop, one in found.items():
+        assert one == pytest.approx(margins(F, OPEN_LOOPS[loop](DEVICE, plant(), gains, F)), rel=1e-3), loop
+        assert len(one) == 7
+
+
+@pytest.mark.parametrize("axis", [plant(), plant(anti_resonance=80.0, resonance=140.0)], ids=["rigid", "elastic"])
+def test_proposals_keep_dynamics_by_the_loops_of_the_axis_and_of_its_variants(axis):
+    target = SimpleNamespace(device=DEVICE, motor=MOTOR)
+    rows = {name: propose(name, DEVICE, MOTOR, axis) for name in ("margin_45", "margin_60")}
+    by_name = {name: slacks(target, axis, rows, find_dynamics(name)) for name in ("soft", "standard", "stiff")}
+    for dynamics, slack in by_name.items():
+        asked = find_dynamics(dynamics)
+        for name, row in rows.items():
+            loops = [OPEN_LOOPS[loop](DEVICE, axis, row.gains, F) for loop in ("velocity", "position")]
+            least = min(float(asked.clearance(loop)) for loop in loops)
+            assert slack[name] <= least - 1.0 + 0.02, (dynamics, name)  # variants and overshoot may be tighter
+    assert by_name["soft"]["margin_45"] < by_name["standard"]["margin_45"] < by_name["stiff"]["margin_45"]
+    assert by_name["soft"]["margin_45"] < 0.0 < by_name["standard"]["margin_60"]
+    wide = slacks(target, axis, rows, find_dynamics("standard", "0.5/5"))
+    assert wide["margin_45"] < by_name["standard"]["margin_45"]
 
 
 def test_axes_without_an_inertia_have_a_reason_in_place_of_a_model(monkeypatch):

@@ -354,6 +354,13 @@ def test_all_axes_of_a_machine_have_the_scale_of_the_one_that_a_load_moves_most(
     assert np.ptp(scale) == 0.0 < scale[0]
 
 
+def test_the_variants_inertia_is_the_range_that_dynamics_ask_for():
+    score = RobustScore("tmcm1636", "inertia", "qbl4208", 1, num_threads=1, dynamics=find_dynamics("soft", "1/3"))
+    assert [variant.inertia for variant in score.variants] == [1.0, 3.0, 1.0, 1.0]  # nothing twice
+    assert score.variants[1].name == "load inertia x 3"
+    score.close()
+
+
 def test_variants_are_parallel_machines_with_their_parameters(two_mass):
     stiffness = two_mass._drives.machine.parameters["load.stiffness"].reshape(4, 6)
     inertia = two_mass._drives.machine.parameters["load.inertia"].reshape(4, 6)

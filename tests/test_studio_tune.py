@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -252,6 +253,14 @@ def test_auto_is_stopped_and_everything_is_as_before(desk, tmp_path, when):
     assert all_parameters(desk) == before
     stand_still(desk)
     assert not (tmp_path / "auto" / "report.html").exists()
+
+
+def test_auto_is_asked_for_the_dynamics_of_the_page(monkeypatch, tmp_path):
+    asked = {}
+    monkeypatch.setattr("tuning.auto.run_to_files.auto_to_files", lambda *_, **options: asked.update(options))
+    target = SimpleNamespace(device=find_device("tmcm1636"))
+    tune_jobs.auto(True, "soft")(target, TunerSession("auto", tmp_path), lambda what, share: None)
+    assert asked == {"keep": True, "dynamics": "soft"}
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.emulator.parameters import WIRING
 from drive_env.gains import has_linear_model, small_time_constants, write_gains
-from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics, loop_clearance
+from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
 from drive_env.loops.true_plant import elastic_lags, true_machines
 from drive_env.trials.positioning import (
@@ -100,14 +100,19 @@ class Variant(NamedTuple):
     run_current: float = 1.0
 
 
-VARIANTS = (
-    Variant("nominal"),
-    Variant("load inertia x 2", inertia=2.0),
-    Variant("load inertia x 0.5", inertia=0.5),
-    Variant("stiffness x 0.8", stiffness=0.8),
-    Variant("velocity P x 1.5", velocity_p=1.5),
-    Variant("velocity P x 0.67", velocity_p=0.67),
-)
+def servo_variants(inertia_range: tuple[float, float] = INERTIA_RANGE) -> tuple[Variant, ...]:
+    """Return the variants of a servo's machine, whose load inertia may become these multiples of what it is."""
+    low, high = inertia_range
+    return (
+        Variant("nominal"),
+        *(Variant(f"load inertia x {x:g}", inertia=x) for x in (high, low) if x != 1.0),
+        Variant("stiffness x 0.8", stiffness=0.8),
+        Variant("velocity P x 1.5", velocity_p=1.5),
+        Variant("velocity P x 0.67", velocity_p=0.67),
+    )
+
+
+VARIANTS = servo_variants()
 # A stepper's step rates are near to what its torque allows: twice the inertia is another machine.
 STEPPER_VARIANTS = (
     Variant("nominal"),
@@ -251,7 +256,7 @@ class RobustScore:
         fields = {parameter.field for parameter in found.parameters}
         self.variants = tuple(
             variant
-            for variant in (VARIANTS if self._has_loops else STEPPER_VARIANTS)
+            for variant in (servo_variants(self.dynamics.inertia_range) if self._has_loops else STEPPER_VARIANTS)
             if (variant.inertia == 1.0 or fields & set(_INERTIA))
             and (variant.stiffness == 1.0 or fields & set(_STIFFNESS))
             and (variant.velocity_p == 1.0 or not by_current)

@@ -75,7 +75,9 @@ def design_axes(
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
     # The response of a linked axis was measured without the other one; what both say is in their model.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
-    models = [(model, np.searchsorted(axes, of)) for model, of in loop_models(target, basis, recorded, where)]
+    models = [
+        (model, np.searchsorted(axes, of)) for model, of in loop_models(target, basis, recorded, where, bench.dynamics)
+    ]
     most = np.full(target.num_axes, np.inf) if most is None else most
 
     def judge(**more: Any) -> Judge:
@@ -197,7 +199,8 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
     blind = bench.going & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
-        soft, *more = design_axes(bench, basis, blind, recorded=recorded, dynamics=find_dynamics("soft"), most=most)
+        asked = find_dynamics("soft", bench.dynamics.inertia_range)
+        soft, *more = design_axes(bench, basis, blind, recorded=recorded, dynamics=asked, most=most)
         designed = np.where(blind[:, None], soft, designed)
         cost, present = (np.where(blind, one, all_) for one, all_ in zip(more, (cost, present), strict=True))
     for k in map(int, np.flatnonzero(bench.going)):

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.loops.dynamics import loop_clearance
+from drive_env.loops.dynamics import INERTIA_RANGE, loop_clearance
 from drive_env.loops.margins import margins
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, Windings, linear_machines, open_loops
 from drive_env.loops.worst_margins import HIGHEST, LOWEST, POINTS
-from drive_env.trials.score import VARIANTS
+from drive_env.trials.score import servo_variants
 from tuning.response.measured_loop import GOOD_MISFIT
 
 if TYPE_CHECKING:
@@ -108,12 +108,20 @@ class LoopModel:
         motor: The motor; its rotor's inertia stays where that of the load becomes another.
         plants: Its axes; what their windings, filters and delays are.
         moved: What they move.
+        inertia_range: What the load's inertia may become, over what it is.
     """
 
-    def __init__(self, device: Device, motor: Motor, plants: Sequence[Plant], moved: Mechanism) -> None:
-        self.device, self.axes = device, len(plants)
-        self._velocity_p = np.array([variant.velocity_p for variant in VARIANTS])
-        parts = [moved.varied(motor.inertia, variant.inertia, variant.stiffness) for variant in VARIANTS]
+    def __init__(
+        self,
+        device: Device,
+        motor: Motor,
+        plants: Sequence[Plant],
+        moved: Mechanism,
+        inertia_range: tuple[float, float] = INERTIA_RANGE,
+    ) -> None:
+        self.device, self.axes, self._variants = device, len(plants), servo_variants(inertia_range)
+        self._velocity_p = np.array([variant.velocity_p for variant in self._variants])
+        parts = [moved.varied(motor.inertia, variant.inertia, variant.stiffness) for variant in self._variants]
 
         def each(values: Sequence[float]) -> Floats:
             return np.tile(values, (len(parts), 1))
@@ -147,8 +155,8 @@ class LoopModel:
             dynamics: What is 1.
             gains: Raw, (axes, count).
         """
-        clearance, _ = self._clearance(dynamics, gains[None], len(VARIANTS))
-        rows = zip(VARIANTS[1:], clearance[0, 1:].tolist(), strict=True)
+        clearance, _ = self._clearance(dynamics, gains[None], len(self._variants))
+        rows = zip(self._variants[1:], clearance[0, 1:].tolist(), strict=True)
         return {variant.name: max(kept, 0.0) for variant, kept in rows}
 
     def _slack(self, dynamics: Dynamics, gains: Integers, count: int) -> Floats:
@@ -187,6 +195,11 @@ def corner(device: Device, plant: Plant) -> float:
     lag = VELOCITY_FILTER_DAMPING / math.pi
     more = plant.delay - 1.0 / device.velocity_rate
     return lag / max(lag / plant.velocity_filter + more, 1e-6)
+
+
+def model_of(device: Device, motor: Motor, plant: Plant, dynamics: Dynamics) -> LoopModel:
+    """Return the model of an axis that is alone, with the load that dynamics ask for."""
+    return LoopModel(device, motor, [plant], one_axis(plant), dynamics.inertia_range)
 
 
 class LinkedAxis:
@@ -231,7 +244,7 @@ def fitted_plant(basis: Basis, recorded: RecordedGains | None, k: int) -> tuple[
 
 
 def loop_models(
-    target: Target, basis: Basis, recorded: RecordedGains | None, where: Mask
+    target: Target, basis: Basis, recorded: RecordedGains | None, where: Mask, dynamics: Dynamics
 ) -> list[tuple[LoopModel, Integers]]:
     """Return the models of chosen axes: of each machine of two linked ones, of every other axis alone, and its axes."""
     models = []
@@ -239,11 +252,11 @@ def loop_models(
         plants = [fitted_plant(basis, recorded, int(k))[0] for k in axes]
         moved = two_ends(*(alone(basis, recorded, int(k)) for k in axes)) if is_pair(target) else None
         if moved is not None:
-            models.append((LoopModel(target.device, target.motor, plants, moved), axes))
+            models.append((LoopModel(target.device, target.motor, plants, moved, dynamics.inertia_range), axes))
             continue
         for k, plant in zip(axes, plants, strict=True):
             rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf) if target.linked else plant
-            models.append((LoopModel(target.device, target.motor, [rigid], one_axis(rigid)), np.array([k])))
+            models.append((model_of(target.device, target.motor, rigid, dynamics), np.array([k])))
     return models
 
 

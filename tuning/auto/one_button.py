@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.gains import check_linear_model
-from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
+from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
 from tuning.auto.correction import correct, design_axes
@@ -127,6 +127,11 @@ def prove_found(
         say("identifying", 0.05)
         identified = identify(bench, experiments)
         fresh = commission(bench, identified)
+        if bench.dynamics.inertia_range != INERTIA_RANGE:
+            low, high = bench.dynamics.inertia_range
+            bench.note(
+                bench.going, f"gains were designed for a load inertia of {low:g} to {high:g} times that of the tuning"
+            )
         basis = prepare(bench, identified)
         tried = find(bench, basis, say) if bench.going.any() else TriedGains.only(bench.before)
         recorded = correct(bench, basis, tried, target, say)
@@ -155,10 +160,10 @@ def tell_of_lateness(bench: AutoBench) -> None:
         bench.reserve(np.ones(bench.target.num_axes, bool), late)
 
 
-def tune(target: Target, rng: np.random.Generator) -> Outcome:
+def tune(target: Target, rng: np.random.Generator, dynamics: str | Dynamics = DEFAULT) -> Outcome:
     """Tune a target as a tuner of `drive-tune rank`."""
     with tempfile.TemporaryDirectory() as folder:
-        found = auto(target, Path(folder) / "before.toml", keep=False)
+        found = auto(target, Path(folder) / "before.toml", dynamics=dynamics, keep=False)
     return Outcome(
         np.array([axis.after for axis in found.axes], np.int64),
         found.drive_seconds,

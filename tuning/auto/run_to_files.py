@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from drive_env.loops.dynamics import DEFAULT
 
 if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
     from tuning.auto.result import Result
     from tuning.stepper.result import StepperResult
     from tuning.target import Target
@@ -19,7 +20,13 @@ Progress = Callable[[str, float], None]
 
 
 def auto_to_files(
-    target: Target, folder: Path, progress: Progress, *, seed: int = 0, keep: bool = True, dynamics: str = DEFAULT
+    target: Target,
+    folder: Path,
+    progress: Progress,
+    *,
+    seed: int = 0,
+    keep: bool = True,
+    dynamics: str | Dynamics = DEFAULT,
 ) -> Result:
     """Tune axes with closed loops; before.toml, certificate.json and report.html are in the folder afterwards.
 

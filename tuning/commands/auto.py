@@ -14,6 +14,7 @@ from tuning.commands.options import (
     DynamicsOption,
     Json,
     TargetOptions,
+    asked_dynamics,
     errors_as_exit_codes,
     print_json,
     progress_bar,
@@ -29,7 +30,15 @@ if TYPE_CHECKING:
 @takes(TargetOptions)
 def auto(
     drive: TargetOptions,
-    dynamics: DynamicsOption = "standard",
+    dynamics: DynamicsOption = None,
+    inertia_range: Annotated[
+        str | None,
+        typer.Option(
+            "--inertia-range",
+            help="Load inertia that the tuned axis must bear with weaker margins, over that of tuning: LOW/HIGH.",
+            show_default="0.5/2",
+        ),
+    ] = None,
     store: Annotated[
         bool,
         typer.Option("--store/--no-store", help="Drives on a bus store the gains, so that they survive a power cycle."),
@@ -49,12 +58,11 @@ def auto(
     report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
-        from drive_env.loops.dynamics import find_dynamics
         from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files
         from tuning.runs import provenance
         from tuning.way_back import way_back
 
-        find_dynamics(dynamics)  # before anything is done
+        asked = asked_dynamics(dynamics, drive.device, inertia_range)  # before anything is done
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
         file = folder / BEFORE if drive.bus else None
@@ -67,7 +75,7 @@ def auto(
             else:
                 with progress_bar("tuning") as show:
                     result = auto_to_files(
-                        target, folder, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=dynamics
+                        target, folder, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=asked
                     )
                 _report(target, result, folder, json)
         if not result.accepted.all():

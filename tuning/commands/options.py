@@ -30,6 +30,7 @@ from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
 
 if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
     from tuning.runs.inputs import Input
     from tuning.snapshot import Transaction
     from tuning.target import Target
@@ -49,14 +50,11 @@ LoadName = Annotated[
     str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF file.")
 ]
 ForeignEds = Annotated[Path | None, typer.Option("--eds", hidden=True)]  # as drive-env has it; refused with the remedy
-DynamicsOption = Annotated[
-    str,
-    typer.Option(
-        "--dynamics",
-        help="What the outer loops must keep: soft (60 degrees, 12 dB, Ms 1.5), standard (45, 8, 2.0), stiff (35, 6, "
-        "2.5), or phase margin/gain margin/Ms as 50/10/1.8.",
-    ),
-]
+DYNAMICS = (
+    "What the outer loops must keep: soft (60 degrees, 12 dB, Ms 1.5), standard (45, 8, 2.0), stiff (35, 6, 2.5), or "
+    "phase margin/gain margin/Ms as 50/10/1.8."
+)
+DynamicsOption = Annotated[str | None, typer.Option("--dynamics", help=DYNAMICS, show_default="standard")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
 Bus = Annotated[
@@ -357,6 +355,25 @@ def open_target(drive: DriveOptions) -> Target:
         **options,
     )
     return replace(target, inputs=inputs)
+
+
+def asked_dynamics(dynamics: str | None, device: str, inertia_range: str | None = None) -> Dynamics:
+    """Return the dynamics that options ask for, standard ones by default.
+
+    Raises:
+        ValueError: For dynamics that do not exist, or any that are asked of a drive without a linear model.
+    """
+    from drive_env.devices import find_device
+    from drive_env.gains import has_linear_model
+    from drive_env.loops.dynamics import DEFAULT, find_dynamics
+
+    found = find_dynamics(DEFAULT if dynamics is None else dynamics, inertia_range)
+    if (dynamics or inertia_range) and not has_linear_model(find_device(device)):
+        option = "--dynamics" if dynamics else "--inertia-range"
+        raise ValueError(
+            f"{option} asks for margins of loops, and {device} has no linear model of its loops; leave {option} out"
+        )
+    return found
 
 
 def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:

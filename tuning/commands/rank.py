@@ -13,6 +13,7 @@ from drive_env.commands.tables import Column, print_lines, print_names, print_ta
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
+    DynamicsOption,
     Json,
     Resume,
     Workers,
@@ -52,6 +53,7 @@ def rank(
         int | None,
         typer.Option(help="Number of trials of the tuners that search by trials.", show_default="12 or 20, by tuner"),
     ] = None,
+    dynamics: DynamicsOption = None,
     workers: Workers = None,
     cluster: Cluster = None,
     slow: Annotated[bool, typer.Option("--slow", help="Compare the slow tuners, too.")] = False,
@@ -63,7 +65,8 @@ def rank(
 
     Robust performance counts speed, stiffness, noise and overshoot on the machine and its variants: the lower the
         better. It is given over that of the oracle, the best gains of that machine that keep the constraints. The share
-        of machines that keep them and the true margins of the loops are given, too.
+        of machines that keep them and the true margins of the loops are given, too. --dynamics says what the
+        constraints are, and auto is asked for them; oracles for other than standard ones are searched first.
         Writes tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml, and copies files of your own
         (suite, motors, loads) to inputs/. A stopped run continues with
         --out and --resume, with identical results; also with --workers and --cluster.
@@ -78,6 +81,7 @@ def rank(
 
         folder = provenance.run_folder("rank") if out is None else out
         try:
+            from drive_env.loops.dynamics import DEFAULT, find_dynamics
             from tuning.compare.comparison_files import save
             from tuning.compare.suite import load_suite, suite_input
 
@@ -85,9 +89,10 @@ def rank(
             if trials is not None and trials < 1:
                 raise ValueError(f"--trials must be 1 or more, not {trials}")
             provenance.check_folder(folder)
+            asked = find_dynamics(DEFAULT if dynamics is None else dynamics).name
             machines = load_suite(suite, seed if drawn else None, count)
             suite = suite_input(suite)
-            compared, left_out = _find_tuners(tuners, trials, slow)
+            compared, left_out = _find_tuners(tuners, trials, asked, slow)
             settings: dict[str, Any] = {
                 "suite": suite,
                 "tuners": list(compared),
@@ -95,25 +100,28 @@ def rank(
                 "drawn": drawn,
                 "count": count,
                 "trials": trials,
+                "dynamics": asked,
             } | provenance.versions()
             with unfinished.telling_what_is_kept(folder):
                 comparison = _compare(machines, compared, settings, folder, resume, workers, cluster)
                 with provenance.new_folder(folder) as partial:
                     save(comparison, partial, settings)
             unfinished.discard(folder)
-            _report(comparison, folder, left_out, json)
+            _report(comparison, asked, folder, left_out, json)
         except KeyboardInterrupt:
             fail(what_an_interrupt_leaves(folder), INTERRUPTED)
 
 
-def _find_tuners(names: list[str] | None, trials: int | None, slow: bool) -> tuple[dict[str, Tuner], list[str]]:
+def _find_tuners(
+    names: list[str] | None, trials: int | None, dynamics: str, slow: bool
+) -> tuple[dict[str, Tuner], list[str]]:
     """Return the tuners that are compared, and which were left out since a package of theirs is not installed."""
     from tuning.compare.tuners import MissingTunerError, find_tuner, tuner_rows
 
     tuners, left_out = {}, []
     for name in names or [row.name for row in tuner_rows().values() if slow or not row.slow]:
         try:
-            tuners[name] = find_tuner(name, trials)
+            tuners[name] = find_tuner(name, trials, dynamics)
         except MissingTunerError as error:
             if names:  # asked for by name
                 raise
@@ -135,7 +143,7 @@ def _compare(
 
     from tuning.compare.comparison import compare, so_far
     from tuning.compare.comparison_files import settings_text
-    from tuning.compare.oracle import find_oracles
+    from tuning.compare.oracle import are_kept, find_oracles
     from tuning.compare.suite import groups
     from tuning.runs import unfinished
     from tuning.runs.inputs import inputs_in
@@ -151,35 +159,40 @@ def _compare(
             for line in pool.differences():
                 print(f"note: {line}", file=sys.stderr)
             elsewhere = workers is not None or cluster is not None
+            dynamics = settings["dynamics"]
+            if not are_kept(dynamics):
+                print(f"note: no oracles for {dynamics} dynamics are kept; they are searched first: 10 to 40 s for "
+                      "each machine, longer for robots", file=sys.stderr)  # fmt: skip
             with progress_bar(f"oracles of {len(machines)} machines") as show:
-                oracles = find_oracles(machines, progress=show)
+                oracles = find_oracles(machines, progress=show, dynamics=dynamics)
             try:
                 with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
                     return compare(
                         machines, tuners, seed=settings["seed"], log=log, progress=lambda what, share: show(share),
-                        pool=pool if elsewhere else None, trials=settings["trials"], oracles=oracles,
+                        pool=pool if elsewhere else None, trials=settings["trials"], oracles=oracles, dynamics=dynamics,
                     )  # fmt: skip
             except KeyboardInterrupt:
                 if (done := so_far(machines, list(tuners), log)) is not None:
                     print_lines([f"interrupted: of {len(machines)} machines these are done"])
-                    _print_figures(done)
+                    _print_figures(done, dynamics)
                 raise
 
 
-def _report(comparison: Comparison, folder: Path, left_out: list[str], json: bool) -> None:
+def _report(comparison: Comparison, dynamics: str, folder: Path, left_out: list[str], json: bool) -> None:
     from dataclasses import asdict
 
     from tuning.compare.against_best import all_rivals
 
     if not json:
-        _print(comparison, folder, left_out)
+        _print(comparison, dynamics, folder, left_out)
         return
     rivals = [asdict(row) for row in all_rivals(comparison)]
-    print_json({"tuners": [asdict(row) for row in comparison.tuners], "rivals": rivals, "folder": str(folder)})
+    tuners = [asdict(row) for row in comparison.tuners]
+    print_json({"dynamics": dynamics, "tuners": tuners, "rivals": rivals, "folder": str(folder)})
 
 
-def _print(comparison: Comparison, folder: Path, left_out: list[str]) -> None:
-    _print_figures(comparison)
+def _print(comparison: Comparison, dynamics: str, folder: Path, left_out: list[str]) -> None:
+    _print_figures(comparison, dynamics)
     lines = [f"left out: {text}" for text in left_out]
     failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}
     lines += [f"{tuner} failed: {note}" for tuner, note in sorted(failures)]
@@ -187,7 +200,7 @@ def _print(comparison: Comparison, folder: Path, left_out: list[str]) -> None:
     print_lines(lines)
 
 
-def _print_figures(comparison: Comparison) -> None:
+def _print_figures(comparison: Comparison, dynamics: str) -> None:
     """Print the table of tuners, and what they are worth machine by machine."""
     from tuning.compare.against_best import all_rivals
 
@@ -201,7 +214,7 @@ def _print_figures(comparison: Comparison) -> None:
          str(row.violations), str(row.failed))
         for row in comparison.tuners
     ]  # fmt: skip
-    title = f"Robust performance over the constrained oracle's on {machines} machines"
+    title = f"Robust performance over the constrained oracle's on {machines} machines, {dynamics} dynamics"
     print_table([Column("tuner", "name"), *map(Column, titles)], rows, title)
     lines = [
         "keep all: machines on which the gains keep every constraint (margins, variants, csp step, rest). near: true "

@@ -13,9 +13,11 @@ import typer
 from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
+    DynamicsOption,
     Json,
     TargetOptions,
     ask,
+    asked_dynamics,
     before_as_json,
     errors_as_exit_codes,
     fail,
@@ -28,6 +30,7 @@ from tuning.commands.options import (
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
+    from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from tuning.rules.side_by_side import AxisRules
     from tuning.snapshot import Transaction
@@ -43,6 +46,7 @@ def rules(
     relay: Annotated[
         bool, typer.Option("--relay", help="Also make the axis swing by relay feedback, and show the gains from that.")
     ] = (False),
+    dynamics: DynamicsOption = None,
     apply: Annotated[str | None, typer.Option("--apply", help="Write this rule's gains to the drive.")] = None,
     store: Annotated[
         bool, typer.Option("--store", help="Store them in the drive, so that they survive a power cycle.")
@@ -58,8 +62,10 @@ def rules(
 ) -> None:
     """Identify an axis and show the gains that each rule proposes, with the margins they would have.
 
-    Margins are those of the velocity loop, computed by the identified model. Notes name limits of the integer gains. On
-    a bus the parameters before are saved to --snapshot first and restored at the end, except what --apply writes.
+    Margins of the velocity and the position loop are computed by the identified model. Gains keep the --dynamics if
+    this axis keeps them, with the overshoot of a csp step, and its variants (load inertia x 0.5 and x 2, stiffness x
+    0.8, velocity P x 0.67 and x 1.5) keep weaker margins. Notes name limits of the integer gains. On a bus the
+    parameters before are saved to --snapshot first and restored at the end, except what --apply writes.
     """
     with errors_as_exit_codes():
         from tuning.rules.rules_by_name import RULES
@@ -77,6 +83,7 @@ def rules(
             raise ValueError("--snapshot is the file for the state before --apply; add --apply RULE, or leave it out")
         drive.check()
         drive.check_linear_model()
+        asked = asked_dynamics(dynamics, drive.device)
         file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
         if drive.bus:
             check_place(file)  # written before the motor turns; of emulated drives, before their gains change
@@ -96,10 +103,10 @@ def rules(
                     axis.rows[MEASURED] = measured
             if json:
                 named = zip(target.axis_numbers, axes, strict=True)
-                print_json([{"axis": k} | _as_json(target, axis) | before_as_json(before) for k, axis in named])
+                print_json([{"axis": k} | _as_json(target, axis, asked) | before_as_json(before) for k, axis in named])
             else:
                 for k, axis in zip(target.axis_numbers, axes, strict=True):
-                    _print(target, axis, k if drive.axis or len(plants) > 1 else None)
+                    _print(target, axis, asked, k if drive.axis or len(plants) > 1 else None)
             if not known or (apply and len(known) < len(plants)):
                 fail("nothing was written: a rule needs the inertia of every axis" if known else
                      "no axis has an identified inertia, which every rule needs", REFUSED)  # fmt: skip
@@ -109,44 +116,52 @@ def rules(
             tell_before(before)
 
 
-def _as_json(target: Target, axis: AxisRules) -> dict[str, Any]:
+def _as_json(target: Target, axis: AxisRules, dynamics: Dynamics) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tuning.rules.side_by_side import velocity_margins
+    from tuning.rules.side_by_side import outer_margins, slacks
 
     plant, rows = axis.plant, axis.rows
     if isinstance(plant, str):
         return {"no_plant": plant}
+    slack = slacks(target, plant, rows, dynamics)
     return {
         "plant": asdict(plant),
+        "dynamics": dynamics.name,
         "proposals": {
             name: {
                 "gains": dict(zip(target.device.gains.names, proposal.gains, strict=True)),
                 "wanted": dict(proposal.wanted),
                 "notes": list(proposal.notes),
-                "velocity_margins": velocity_margins(target.device, plant, proposal.gains)._asdict(),
+                "margins": {
+                    loop: found._asdict() for loop, found in outer_margins(target.device, plant, proposal.gains).items()
+                },
+                "slack": slack[name],
+                "keeps": slack[name] >= 0.0,
             }
             for name, proposal in rows.items()
         },
     } | ({"no_relay": axis.unswung} if axis.unswung else {})
 
 
-def _print(target: Target, shown: AxisRules, axis: int | None) -> None:
-    from tuning.rules.side_by_side import velocity_margins
+def _print(target: Target, shown: AxisRules, dynamics: Dynamics, axis: int | None) -> None:
+    from tuning.rules.side_by_side import outer_margins, slacks
 
     head, plant, rows = "" if axis is None else f"axis {axis}: ", shown.plant, shown.rows
     if isinstance(plant, str):
         print_lines([f"{head}{plant}"])
         return
     pair = f", resonances at {plant.anti_resonance:.0f} and {plant.resonance:.0f} Hz" if plant.is_elastic else ", rigid"
-    title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}"
-    titles = (*_gain_titles(target.device.gains), "cross\nHz", "phase\ndeg", "gain\ndB")
-    cells = []
+    title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}; kept: by {dynamics.name} dynamics"
+    titles = (*_gain_titles(target.device.gains), "velocity\n°/dB/Ms", "position\n°/dB/Ms", "kept")
+    cells, slack = [], slacks(target, plant, rows, dynamics)
     for name, proposal in rows.items():
-        found = velocity_margins(target.device, plant, proposal.gains)
-        figures = (found.crossover_hz, found.phase_deg, found.gain_db)
-        shown_figures = (f"{figure:.0f}" if math.isfinite(figure) else "-" for figure in figures)
-        cells.append((name, *map(str, proposal.gains), *shown_figures))
+        found = outer_margins(target.device, plant, proposal.gains)
+        cells.append(
+            (name, *map(str, proposal.gains),
+             *(f"{_figure(one.phase_deg)}/{_figure(one.gain_db)}/{one.ms:.1f}" for one in found.values()),
+             "yes" if slack[name] >= 0.0 else "no")
+        )  # fmt: skip
     print_table([Column("rule", "name"), *map(Column, titles)], cells, title)
     lines = []
     if plant.is_elastic and plant.damping == type(plant).damping:
@@ -158,6 +173,10 @@ def _print(target: Target, shown: AxisRules, axis: int | None) -> None:
     if shown.unswung:
         lines.append(f"{MEASURED}: no gains: {shown.unswung}")
     print_lines(lines)
+
+
+def _figure(value: float) -> str:
+    return f"{value:.0f}" if math.isfinite(value) else "-"
 
 
 def _gain_titles(known: GainSet) -> list[str]:

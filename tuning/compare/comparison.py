@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
+from drive_env.loops.dynamics import DEFAULT
 from mechanics.untrusted import parse_json
 from tuning.compare.oracle import Oracle, find_oracles
 from tuning.compare.suite import SuiteMachine, groups, open_group
@@ -138,6 +139,7 @@ def compare(
     pool: Pool | None = None,
     trials: int | None = None,
     oracles: Mapping[str, Oracle] | None = None,
+    dynamics: str = DEFAULT,
 ) -> Comparison:
     """Have every tuner tune every machine.
 
@@ -148,11 +150,13 @@ def compare(
         num_threads: As `EmulatedDrives` takes it.
         log: What tuners made of machines already, and where what is to come is kept.
         progress: Called with what is under way and the share that is done.
-        pool: Where else it runs, which changes no digit; there the tuners are found by their names and `trials`.
+        pool: Where else it runs, which changes no digit; there the tuners are found by their names, `trials` and
+            `dynamics`.
         trials: As `find_tuner` takes it.
         oracles: Of the machines, by name; found by default.
+        dynamics: What the loops must keep, by which gains are judged.
     """
-    best = find_oracles(machines, num_threads) if oracles is None else oracles
+    best = find_oracles(machines, num_threads, dynamics=dynamics) if oracles is None else oracles
     tasks = [(indices, name) for indices in groups(machines) for name in tuners]
     done = {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
     left = [k for k in range(len(tasks)) if k not in done]
@@ -162,9 +166,9 @@ def compare(
         progress(f"{tasks[k][1]} on {machine.load}, {machine.motor}", len(done) / len(tasks))
 
     if pool is None:
-        fresh = _here(machines, tuners, tasks, left, best, seed, num_threads, say)
+        fresh = _here(machines, tuners, tasks, left, best, seed, num_threads, dynamics, say)
     else:
-        fresh = _elsewhere(machines, tasks, left, best, seed, trials, pool, say)
+        fresh = _elsewhere(machines, tasks, left, best, seed, trials, dynamics, pool, say)
     for k, rows in fresh:
         done[k] = rows
         if log is not None:
@@ -202,12 +206,13 @@ class _GroupTask(NamedTuple):
     oracles: list[Oracle]
     trials: int | None
     seed: int
+    dynamics: str
 
 
 def _run(task: _GroupTask) -> str:
     """Return what a tuner makes of the machines of a group, as text."""
-    with closing(Yardstick(task.group, 1)) as yardstick:
-        tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials))
+    with closing(Yardstick(task.group, 1, dynamics=task.dynamics)) as yardstick:
+        tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics))
         return _text_of(_rows(task.tuner, task.group, tuned, yardstick, task.oracles))
 
 
@@ -219,6 +224,7 @@ def _here(
     oracles: Mapping[str, Oracle],
     seed: int,
     num_threads: int | None,
+    dynamics: str,
     say: Callable[[int], None],
 ) -> Iterator[tuple[int, list[MachineRow]]]:
     """Give the number and the rows of each task as it is done, group by group: what a group needs is made once."""
@@ -229,7 +235,8 @@ def _here(
                 open_now.close()
                 indices = tasks[k][0]
                 group = [machines[index] for index in indices]
-                yardstick, bench = Yardstick(group, num_threads), _Bench(group, seed, num_threads)
+                yardstick = Yardstick(group, num_threads, dynamics=dynamics)
+                bench = _Bench(group, seed, num_threads)
                 open_now.callback(yardstick.close)
             name = tasks[k][1]
             say(k)
@@ -244,6 +251,7 @@ def _elsewhere(
     oracles: Mapping[str, Oracle],
     seed: int,
     trials: int | None,
+    dynamics: str,
     pool: Pool,
     say: Callable[[int], None],
 ) -> Iterator[tuple[int, list[MachineRow]]]:
@@ -253,7 +261,7 @@ def _elsewhere(
         replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor})) for one in machines
     ]
     items = [
-        _GroupTask([machines[i] for i in where], name, [found[i] for i in where], trials, seed)
+        _GroupTask([machines[i] for i in where], name, [found[i] for i in where], trials, seed, dynamics)
         for where, name in (tasks[k] for k in left)
     ]
     for place, text in pool.unordered(_run, items, fits=_is_of):

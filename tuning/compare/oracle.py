@@ -6,8 +6,8 @@ of JADE, doi:10.1109/TEVC.2009.2014613). All axes of a machine get their gains t
 searched beyond the crossover that leaves it 60 degrees, nor below 0.3 of that, since the constraints are those of the
 outer loops.
 
-The gains of the suites' machines are kept in oracles.csv; what they are worth is scored anew whenever they are used, so
-that a row that no longer fits its machine or the score is noticed, and searched anew.
+The gains of the suites' machines for standard dynamics are kept in oracles.csv; what they are worth is scored anew
+whenever they are used, so that a row that no longer fits its machine or the score is noticed, and searched anew.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import has_linear_model, integers_per_si
+from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.whole_file import write_table
 from mechanics.untrusted import read_rows
 from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG, LEAST_TORQUE
@@ -59,16 +61,20 @@ def find_oracles(
     num_threads: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
     kept: Path | None = KEPT,
+    dynamics: str | Dynamics = DEFAULT,
 ) -> dict[str, Oracle]:
     """Return the oracles of machines by name: those that are kept and still true, and those that are searched.
+
+    For other than standard dynamics none are kept.
 
     Args:
         machines: Of a suite, or of your own.
         num_threads: As `EmulatedDrives` takes it.
         progress: Called with the share that is done.
         kept: The file of those that are kept; None searches all.
+        dynamics: What the loops must keep.
     """
-    rows = {} if kept is None else read_oracles(kept)
+    rows = {} if kept is None or not are_kept(dynamics) else read_oracles(kept)
     found: dict[str, Oracle] = {}
     known = [machine for machine in machines if digest(machine) in rows]
     for indices in groups(known):
@@ -83,17 +89,24 @@ def find_oracles(
     left = [machine for machine in machines if machine.name not in found]
     for number, machine in enumerate(left):
         progress(number / len(left))
-        found[machine.name] = search_oracle(machine, num_threads)
+        found[machine.name] = search_oracle(machine, num_threads, dynamics=dynamics)
     progress(1.0)
     return found
 
 
-def search_oracle(machine: SuiteMachine, num_threads: int | None = None, seed: int = 0) -> Oracle:
+def are_kept(dynamics: str | Dynamics) -> bool:
+    """Return whether the file has oracles for these dynamics."""
+    return replace(find_dynamics(dynamics), name=DEFAULT) == find_dynamics(DEFAULT)
+
+
+def search_oracle(
+    machine: SuiteMachine, num_threads: int | None = None, seed: int = 0, dynamics: str | Dynamics = DEFAULT
+) -> Oracle:
     """Return the oracle of a machine; the seed draws what is tried."""
     rng = np.random.default_rng(seed)
-    with closing(Yardstick([machine], num_threads, REPEATED, POPULATION)) as yardstick:
+    with closing(Yardstick([machine], num_threads, REPEATED, POPULATION, dynamics)) as yardstick:
         last = _evolved(yardstick, _Box.of(yardstick), rng)
-    with closing(Yardstick([machine], num_threads, copies=FINALISTS)) as yardstick:
+    with closing(Yardstick([machine], num_threads, copies=FINALISTS, dynamics=dynamics)) as yardstick:
         scores = yardstick.score(last[:FINALISTS].reshape(-1, last.shape[-1]))
     best = int(scores.robust_cost.argmin())
     return Oracle(last[best], float(scores.performance[best]), float(scores.slack[best]))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
+from drive_env.loops.dynamics import DEFAULT
 from tuning.outcome import Outcome, Tuner
 from tuning.search.optimise import Settings, optimise
 from tuning.search.samplers import check_installed
@@ -23,6 +24,7 @@ from tuning.search.trial_bench import TrialBench, read_gains
 from tuning.target import Target, timed
 
 if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
     from tuning.identify.estimate import Identification
 
 Floats = NDArray[np.float64]
@@ -32,13 +34,17 @@ ENTRY_POINTS = "drive_env.tuners"
 
 
 class TunerKind(NamedTuple):
-    """A tuner of the registry: a line of description, and whether it is slow, so that it runs only if named."""
+    """A tuner of the registry: a line of description, and whether it is slow, so that it runs only if named.
+
+    searches: `make` takes the number of trials. asked: It takes the dynamics.
+    """
 
     name: str
     meaning: str
     make: Callable[..., Tuner]
     slow: bool = False
-    searches: bool = False  # then `make` takes the number of trials
+    searches: bool = False
+    asked: bool = False
 
 
 class MissingTunerError(ValueError):
@@ -61,12 +67,13 @@ def tuner_rows() -> dict[str, TunerKind]:
     return rows
 
 
-def find_tuner(name: str, trials: int | None = None) -> Tuner:
+def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = DEFAULT) -> Tuner:
     """Return a tuner by name.
 
     Args:
         name: Its name.
         trials: How many a search makes; its own number by default. What does not search has none.
+        dynamics: What the loops must keep, for tuners that can be asked.
 
     Raises:
         MissingTunerError: For a name that is none, listing those there are, or a package that is missing.
@@ -75,6 +82,8 @@ def find_tuner(name: str, trials: int | None = None) -> Tuner:
     if name not in rows:
         raise MissingTunerError(f"no tuner is named {name!r}; there are {', '.join(rows)}")
     row = rows[name]
+    if row.asked:
+        return row.make(dynamics)
     return row.make(trials=trials) if row.searches and trials is not None else row.make()
 
 
@@ -143,10 +152,9 @@ def _rule_names() -> tuple[str, ...]:
     return tuple(importlib.import_module("tuning.rules.rules_by_name").RULES)
 
 
-def _auto() -> Tuner:
+def _auto(dynamics: str | Dynamics) -> Tuner:
     """Return the tuner of `tuning.auto.one_button`."""
-    found: Tuner = importlib.import_module("tuning.auto.one_button").tune
-    return found
+    return partial(importlib.import_module("tuning.auto.one_button").tune, dynamics=dynamics)
 
 
 # --- searches ---------------------------------------------------------------------------------------------------------
@@ -181,7 +189,7 @@ _OWN = (
     TunerKind("baseline", "the baseline rule, with the inertia measured in two moves", lambda: _baseline),
 )
 _AFTER = (
-    TunerKind("auto", "drive-tune auto: identify, design on twins, try, verify, correct", _auto),
+    TunerKind("auto", "drive-tune auto: identify, design on twins, try, verify, correct", _auto, asked=True),
     TunerKind("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
     TunerKind("grid", "the baseline rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
     TunerKind("tpe", "20 trials by tree-structured Parzen estimators",

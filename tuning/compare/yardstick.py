@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.gains import has_linear_model, rule_gains
+from drive_env.loops.dynamics import DEFAULT, Dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines
 from drive_env.loops.worst_margins import WorstMargins, worst_margins
@@ -35,15 +36,21 @@ class Yardstick:
         num_threads: As `EmulatedDrives` takes it.
         repeats: As `RobustScore` takes it.
         copies: Copies of each machine, which follow each other; each may have gains of its own.
+        dynamics: What the loops must keep.
     """
 
     def __init__(
-        self, group: Sequence[SuiteMachine], num_threads: int | None, repeats: int = REPEATS, copies: int = 1
+        self,
+        group: Sequence[SuiteMachine],
+        num_threads: int | None,
+        repeats: int = REPEATS,
+        copies: int = 1,
+        dynamics: str | Dynamics = DEFAULT,
     ) -> None:
         device, load, motor, friction = group[0].kind
         count = len(group) * copies
         self._score = RobustScore(
-            device, load, motor, count, num_threads=num_threads, friction=friction, repeats=repeats
+            device, load, motor, count, num_threads=num_threads, friction=friction, repeats=repeats, dynamics=dynamics
         )
         self.dynamics = self._score.dynamics
         with open_group(group, num_threads) as target:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drive_env.gains import write_gains
-from drive_env.loops.linear_model import Plant, velocity_open_loop
+from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
 from drive_env.safety.envelope import swinging_allowed
 from tuning.rules.rules_by_name import propose
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.margins import Margins
     from tuning.rules.proposal import Proposal
     from tuning.target import Target
@@ -79,7 +80,16 @@ def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | 
     return found
 
 
-def velocity_margins(device: Device, plant: Plant, gains: Sequence[int]) -> Margins:
-    """Return the margins of the velocity loop, as the model has them with gains."""
+def outer_margins(device: Device, plant: Plant, gains: Sequence[int]) -> dict[str, Margins]:
+    """Return the margins of the velocity and of the position loop, as the model has them with gains."""
     f = np.geomspace(0.5, 0.49 * device.velocity_rate, POINTS)
-    return margins(f, velocity_open_loop(device, plant, gains, f))
+    return {loop: margins(f, OPEN_LOOPS[loop](device, plant, gains, f)) for loop in ("velocity", "position")}
+
+
+def slacks(target: Target, plant: Plant, rows: Mapping[str, Proposal], dynamics: Dynamics) -> dict[str, float]:
+    """Return how far proposals keep the dynamics by the model of the axis and its variants, relative, by name."""
+    from tuning.auto.loop_model import model_of
+
+    gains = np.array([row.gains for row in rows.values()], np.int64)
+    slack = model_of(target.device, target.motor, plant, dynamics).slack(dynamics, gains[:, None])
+    return dict(zip(rows, slack.tolist(), strict=True))

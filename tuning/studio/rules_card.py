@@ -81,7 +81,7 @@ class RulesCard:
             self._show_rules(desk.rules[axis])
 
     def _show_rules(self, rules: AxisRules) -> None:
-        from tuning.rules.side_by_side import velocity_margins
+        from tuning.rules.side_by_side import outer_margins
 
         plant = rules.plant
         if isinstance(plant, str):
@@ -99,7 +99,7 @@ class RulesCard:
                         ui.label(text)
             with ui.element("tbody"):
                 for name, proposal in rules.rows.items():
-                    found = velocity_margins(known, plant, proposal.gains)
+                    found = outer_margins(known, plant, proposal.gains)["velocity"]
                     figures = [
                         f"{x:.0f}" if math.isfinite(x) else "-"
                         for x in (found.crossover_hz, found.phase_deg, found.gain_db)

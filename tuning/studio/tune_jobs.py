@@ -13,6 +13,7 @@ from drive_env import cia402
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives, device_of
 from drive_env.gains import read_gains, write_gains
+from drive_env.loops.dynamics import DEFAULT
 from drive_env.studio.motion_jobs import disable, only, select_mode
 from drive_env.studio.scope_view import channel_of
 from drive_env.studio.sentences import sentence
@@ -390,7 +391,7 @@ def _integers(gains: Any) -> tuple[int, ...]:
     return tuple(int(value) for value in values)
 
 
-def auto(store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
+def auto(store: bool, dynamics: str = DEFAULT) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
     """Return auto's work: that of `drive-tune auto`, its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
@@ -398,6 +399,6 @@ def auto(store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], 
 
         if target.device.gains.is_open_loop:
             return commission_to_files(target, run.folder, progress, keep=store)
-        return auto_to_files(target, run.folder, progress, keep=store)
+        return auto_to_files(target, run.folder, progress, keep=store, dynamics=dynamics)
 
     return work

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
+from drive_env.gains import has_linear_model
+from drive_env.loops.dynamics import DEFAULT, known_dynamics
 from drive_env.studio.parts import studio_parts
 from drive_env.studio.runs_folder import RUNS, url_of
 from tuning.runs.provenance import run_folder
@@ -56,6 +58,9 @@ class TunerCard:
                 ui.button("Stop and roll back", icon="stop", on_click=self._stop).props(
                     "outline no-caps color=negative data-test=stop-run"
                 )
+                self._dynamics = ui.select(list(known_dynamics()), value=DEFAULT, label="Dynamics")
+                self._dynamics.props("dense outlined data-test=dynamics")
+                self._dynamics.set_visibility(has_linear_model(panel.device))
                 self._store = ui.checkbox("Store the gains in the drive", value=not panel.desk.is_emulated)
                 self._store.set_visibility(not panel.desk.is_emulated)
             for part in studio_parts("/tune"):
@@ -73,7 +78,9 @@ class TunerCard:
 
     async def _auto(self) -> None:
         store = bool(self._store.value)
-        await self.start("auto", "auto", tune_jobs.auto(store))
+        dynamics = str(self._dynamics.value)
+        title = f"auto, {dynamics} dynamics" if has_linear_model(self._panel.device) else "auto"
+        await self.start(title, "auto", tune_jobs.auto(store, dynamics))
 
     async def start(self, title: str, kind: str, work: Work, columns: tuple[str, ...] = ()) -> None:
         """Run a tuner: `kind` names its folder, `columns` are those of its trials."""
