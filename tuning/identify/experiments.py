@@ -320,7 +320,7 @@ class Experiments:
                     target.device,
                     known,
                     float(inertia[k]),
-                    current_hz=_current_bandwidth(target, k),
+                    current_hz=current_bandwidth(target, k),
                     velocity_hz=cautious_bandwidth(motor, float(inertia[k]), FREQUENCY_VELOCITY_HZ),
                     position_hz=5.0,
                     supply=float(target.supply[k]),
@@ -339,7 +339,7 @@ class Experiments:
                 self.found[k][name] = refused(UNITS[name], reason)
 
 
-def _current_bandwidth(target: Target, k: int) -> float:
+def current_bandwidth(target: Target, k: int) -> float:
     """Return the bandwidth of the current loop [Hz] in which the response of an axis is measured.
 
     Dead time looks like resistance to a current near zero, on mains many times the winding's, and to none where it is

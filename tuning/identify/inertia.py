@@ -29,7 +29,7 @@ from drive_env.motors import Motor
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.momentum_balance import Motion, Rows, Solved, balance_rows, motion, solve, step
-from tuning.identify.transmission_loss import CLEAR, find_losses, friction_of_whole_ways
+from tuning.identify.transmission_loss import find_losses, friction_of_whole_ways
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
 from tuning.lateness import late_first
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
@@ -55,6 +55,7 @@ LEAST_COUNTS = 40.0  # that a cruise must pass
 WIDEST, WIDEST_FRICTION = 0.25, 0.2  # half of an interval over its value: what is wider is no identification
 SLOPE, DRAG = 4, 5  # columns of the balance
 FEWEST_MOVES = 5  # with which more than the four is looked for
+CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
 # Times what cogging and the sensors' offsets can make of it, at least, where a load changes with position: both repeat
 # from move to move, so that no deviation shows them, and on a short way they look like a slope.
 OVER_RIPPLE = 3.0
@@ -468,7 +469,9 @@ def _with_losses(
         for one, found in zip(losses, fits, strict=True)
     ]
     ways = friction_of_whole_ways(did, cruises, losses[0], float(fits[0].mean[0]))
-    unseen = np.concatenate([[0.5 * np.ptp(inertias) / K], np.abs(ways.mean - fits[0].mean[1:])])
+    unseen = np.concatenate(
+        [[np.abs(np.array(inertias) - inertias[0]).max() / K], np.abs(ways.mean - fits[0].mean[1:])]
+    )
     mean = np.concatenate([fits[0].mean[:1], 0.5 * (ways.mean + fits[0].mean[1:])])
     return inertias[0], fits[0]._replace(mean=mean), unseen
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Cruises = tuple[tuple[int, int, int], ...]
 
-CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
+CLEAR = 3.0  # times its deviation: from here on it is taken out; where there is none, the interval becomes wider
 BEFORE = (0.5, 0.0, 1.0)  # share of friction that lies before the transmission: the middle, and both ends
 TURNING = 0.15  # of a ramp, about standstill: there friction breaks away, and play is passed
 STEEP = 0.5  # of a ramp, on which a weight fades
