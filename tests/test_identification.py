@@ -25,6 +25,7 @@ from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group, open_machines
 from tuning.identify.estimate import NAMES, refused
+from tuning.identify.experiments import current_bandwidth
 from tuning.identify.identification import identify
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
@@ -132,6 +133,74 @@ def test_the_suite_is_identified_and_the_intervals_hold(seed):
         if known < told * axes - 1.0 or near < 0.9 * known - 1.0 or inside < 0.9 * known - 1.0:
             missed.append((name, tally[name].tolist()))
     assert not missed, "axes, told, near, inside"
+
+
+# --- screws and gears -------------------------------------------------------------------------------------------------
+def drawn(device, load, seed, count, motor=None):
+    """Return machines of a seed whose motor, load and stage are drawn."""
+    return emulated(device, load, motor, num_machines=count, seed=seed, randomise=["motor", "load", "stage"],
+                    num_threads=1)  # fmt: skip
+
+
+def told_and_inside(target, axes, names):
+    """Return of how many axes each value is told, and inside its interval."""
+    counts = {name: np.zeros(2, int) for name in names}
+    for axis, found in enumerate(axes):
+        true = truth(target.drives, axis, np.nan_to_num(found.value("offset")))
+        for name in names:
+            told = (found.told or found.estimates)[name]
+            counts[name] += [told.is_known, told.is_known and told.low <= true[name] <= told.high]
+    return {name: tuple(map(int, row)) for name, row in counts.items()}
+
+
+@pytest.mark.parametrize(("load", "seed", "least"), [("vertical_screw", 3, 3), ("ball_screw", 2, 4)])
+def test_what_a_screw_loses_is_no_inertia_of_its_load(monkeypatch, load, seed, least):
+    """Of four machines: a loss is not taken for inertia, nor what repeats on a short way for a load that changes."""
+    monkeypatch.setattr("tuning.identify.experiments.Experiments.respond", lambda *_: None)
+    with drawn("tmcm1636", load, seed, 4) as target:
+        told, inside = told_and_inside(target, identify(target), ["inertia"])["inertia"]
+    assert told == 4
+    assert inside >= least
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("load", "motor"), [
+    ("vertical_screw", "qbl4208"), ("ball_screw", "qbl4208"), ("geared_joint", "qbl4208"),
+    ("geared_joint", "ec_45_flat"),
+])  # fmt: skip
+def test_intervals_hold_behind_screws_and_gears(monkeypatch, load, motor):
+    """Twenty machines: what a load hides that glides in its play is in the intervals of friction, or refused."""
+    monkeypatch.setattr("tuning.identify.experiments.Experiments.respond", lambda *_: None)
+    with drawn("tmcm1636", load, 41, 20, motor) as target:
+        counts = told_and_inside(target, identify(target), ["inertia", "coulomb", "viscous"])
+    assert counts["inertia"][0] == 20
+    for name, (told, inside) in counts.items():
+        assert inside >= math.floor(0.9 * told), (name, told, inside)
+
+
+# --- mains ------------------------------------------------------------------------------------------------------------
+def test_the_loops_of_a_response_overcome_dead_time():
+    """On mains, dead time of 2 us is 22 V: in a slow current loop an open phase, or a resonance that moves."""
+    with drawn("tgz_d", "two_mass", 1, 1) as target:
+        counts = told_and_inside(target, identify_briefly(target), ["anti_resonance", "resonance"])
+    assert counts["resonance"] == counts["anti_resonance"] == (1, 1)
+    with drawn("tgz_d", "two_mass", 9106, 1) as target:
+        found = identify_briefly(target)[0]
+        assert found.told["inertia"].is_known, found.told["inertia"].reason
+        assert current_bandwidth(target, 0) == pytest.approx(20e3 / 12.0)
+    with emulated(load="inertia", num_threads=1) as target:
+        assert current_bandwidth(target, 0) == 800.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [identify, identify_briefly])
+def test_one_spring_is_told_on_mains(how):
+    """Rotors of eight times the load's inertia: resonance and anti-resonance lie within a few Hz."""
+    with drawn("tgz_d", "two_mass", 42, 20) as target:
+        counts = told_and_inside(target, how(target), ["anti_resonance", "resonance"])
+    for name, (told, inside) in counts.items():
+        assert told >= 17, (name, told)
+        assert inside >= told - 1, (name, told, inside)
 
 
 # --- values, briefly --------------------------------------------------------------------------------------------------

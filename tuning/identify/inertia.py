@@ -6,7 +6,8 @@ Between two moments the charge that flowed is what the speed gained, and what fr
 
 Every equation is weighted by a smooth window, over a cruise or from the middle of one to the middle of the next, the
 other way; an elastic load's swinging averages out in them. From one speed to its opposite, what a transmission loses in
-proportion to what it carries cancels: half of the time it brakes, half of the time it helps the motor to brake.
+proportion to what it carries cancels in part, half of the time it helps the motor to brake; where it is clear, the rest
+is taken out (`transmission_loss.py`).
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ from drive_env.dictionary.units import RPM
 from drive_env.drives.currents import ampere_per_count
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import as_chip, write_gains
+from drive_env.motors import Motor
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused
+from tuning.identify.momentum_balance import Motion, Rows, Solved, balance_rows, motion, solve, step
+from tuning.identify.transmission_loss import find_losses, friction_of_whole_ways
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
 from tuning.lateness import late_first
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
@@ -52,6 +56,9 @@ WIDEST, WIDEST_FRICTION = 0.25, 0.2  # half of an interval over its value: what 
 SLOPE, DRAG = 4, 5  # columns of the balance
 FEWEST_MOVES = 5  # with which more than the four is looked for
 CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
+# Times what cogging and the sensors' offsets can make of it, at least, where a load changes with position: both repeat
+# from move to move, so that no deviation shows them, and on a short way they look like a slope.
+OVER_RIPPLE = 3.0
 # Of what is over K_t, 95 %: commutation, temperature, the ripple that samples hide, a transmission's losses.
 TORQUE_MODEL = 0.018
 VISCOUS_MODEL = 0.02  # the same, of viscous friction besides: a transmission loses some of what lies behind it
@@ -394,11 +401,14 @@ def _balance(
     target = working.target
     motor, K = target.motor, target.motor.torque_constant
     cruises = plan.cruises[k]
-    columns, charge, duration, moves = _windows(angle, current, k, plan)
+    did = motion(angle, current, plan.speed[: len(angle), k])
+    rows = balance_rows(did, *_weights(len(angle), cruises))
     passed = abs(angle[cruises[0][1]] - angle[cruises[0][0]]) * motor.encoder_counts / (2.0 * np.pi)
-    fit = _fit(columns, charge, duration, moves)
-    J = float(fit.mean[0] * K)
-    J *= hidden_ripple(target, k, gains, max(J, 0.5 * motor.inertia))
+    way = max(float(np.ptp(angle)), 1e-9)
+    least = 2.0 * OVER_RIPPLE / way * _ripple(target) / math.sqrt(max(way / (2.0 * np.pi), 1.0))
+    fit = _fit(rows, least)
+    hidden = hidden_ripple(target, k, gains, max(float(fit.mean[0] * K), 0.5 * motor.inertia))
+    J, fit, unseen = _with_losses(did, cruises, motor, rows, fit, least, hidden)
     t = t_quantile(fit.freedom)
     offset, spread = float(fit.mean[3]), t * float(fit.spread[3])
     rough = Rough(J, offset + math.copysign(spread, offset), max(float(fit.mean[1] - t * fit.spread[1]), 0.0))
@@ -412,16 +422,17 @@ def _balance(
         )
         return _none(reason), rough
     scale = float(np.hypot(gain_error(target.device, motor), TORQUE_MODEL))
-    half = t * fit.spread
+    half = np.hypot(t * fit.spread, unseen)
+    half[0] *= K
     if MOST_RATIO * motor.inertia < J:
         inertia = refused("kg*m^2", (
             f"inertia ratio above {MOST_RATIO:.0f}: the moves give about {J / motor.inertia:.0f} rotor inertias, which "
             "cannot be separated from friction in so slow a motion; take a gear or a larger motor, or enter the inertia"
         ))  # fmt: skip
-    elif not J > 0.0 or half[0] * K > WIDEST * J:
-        inertia = refused("kg*m^2", f"{why}: the interval would be {half[0] * K:.2g} around {J:.2g} kg*m^2")
+    elif not J > 0.0 or half[0] > WIDEST * J:
+        inertia = refused("kg*m^2", f"{why}: the interval would be {half[0]:.2g} around {J:.2g} kg*m^2")
     else:
-        inertia = interval(J, float(half[0] * K), float(np.hypot(scale, _periodic(working, k, J, plan))), "kg*m^2")
+        inertia = interval(J, float(half[0]), float(np.hypot(scale, _periodic(working, k, J, plan))), "kg*m^2")
     coulomb = _friction(float(fit.mean[1]), float(half[1]), scale, "A", why)
     viscous = _friction(float(fit.mean[2]), float(half[2]), float(np.hypot(scale, VISCOUS_MODEL)), "A*s/rad", why)
     # Offsets of the sensors turn with the field and average out; those of a brushed motor's one channel do not.
@@ -430,22 +441,62 @@ def _balance(
     return Mechanics(inertia, coulomb, viscous, holding), rough
 
 
+def _with_losses(
+    did: Motion, cruises: tuple[tuple[int, int, int], ...], motor: Motor, rows: Rows, fit: Solved, least: float,
+    hidden: float,
+) -> tuple[float, Solved, Floats]:  # fmt: skip
+    """Return inertia [kg*m^2], the fit, and half of what else is open of its unknowns, for what a transmission loses.
+
+    Args:
+        did: What the axis did.
+        cruises: First and last sample of every cruise, and its move.
+        motor: Its motor.
+        rows: The balance.
+        fit: What it says without losses.
+        least: As `_fit` takes it.
+        hidden: As `hidden_ripple` returns it.
+    """
+    K = motor.torque_constant
+    losses = find_losses(did, cruises, motor, fit.mean[1:3]) if len(np.unique(rows.moves)) >= FEWEST_MOVES else ()
+    if not losses:
+        return float(fit.mean[0] * K) * hidden, fit, np.zeros(4)
+    fits = [
+        _fit(rows._replace(charge=rows.charge - one.share * (rows.weights @ one.while_braking) * CYCLE), least)
+        for one in losses
+    ]
+    inertias = [
+        one.load_alone(float(found.mean[0] * K) * hidden, motor.inertia)
+        for one, found in zip(losses, fits, strict=True)
+    ]
+    ways = friction_of_whole_ways(did, cruises, losses[0], float(fits[0].mean[0]))
+    unseen = np.concatenate(
+        [[np.abs(np.array(inertias) - inertias[0]).max() / K], np.abs(ways.mean - fits[0].mean[1:])]
+    )
+    mean = np.concatenate([fits[0].mean[:1], 0.5 * (ways.mean + fits[0].mean[1:])])
+    return inertias[0], fits[0]._replace(mean=mean), unseen
+
+
 def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
     """Return what cogging and the sensors' offsets leave of the inertia's error, 95 %, as a share of it.
 
     Both repeat with the angle: over many turns they average out, over a short way every move has the same of them.
     """
-    target, motor = working.target, working.target.motor
-    offsets = [target.device.stage[name] for name in ("adc_offset_a", "adc_offset_b")]
-    # Uniform between their limits; a cosine of the angle.
-    sensors = np.hypot(*((row.high - row.low) / 12.0**0.5 for row in offsets)) / 2.0**0.5
-    ripple = np.hypot(motor.cogging_torque / motor.torque_constant, sensors) / 2.0**0.5
+    motor = working.target.motor
     way = np.cumsum(plan.speed[:, k]) * CYCLE
     turns = float(np.ptp(way)) * motor.n_p / (2.0 * np.pi)
     steepest = float(np.abs(np.diff(plan.speed[:, k])).max()) / CYCLE
     accelerating = 2.0 / np.pi * steepest * inertia / motor.torque_constant
     averaged = np.sqrt(max(turns, 1.0) * len(SHARES))
-    return float(1.96 * ripple / max(accelerating, 1e-9) / averaged)
+    return float(1.96 * _ripple(working.target) / max(accelerating, 1e-9) / averaged)
+
+
+def _ripple(target: Target) -> float:
+    """Return what repeats with the angle, cogging and the sensors' offsets, as an RMS current [A]."""
+    motor = target.motor
+    offsets = [target.device.stage[name] for name in ("adc_offset_a", "adc_offset_b")]
+    # Uniform between their limits; a cosine of the angle.
+    sensors = np.hypot(*((row.high - row.low) / 12.0**0.5 for row in offsets)) / 2.0**0.5
+    return float(np.hypot(motor.cogging_torque / motor.torque_constant, sensors) / 2.0**0.5)
 
 
 def _friction(value: float, half: float, scale: float, unit: str, why: str) -> Estimate:
@@ -457,88 +508,48 @@ def _friction(value: float, half: float, scale: float, unit: str, why: str) -> E
     return found
 
 
-def _windows(angle: Floats, current: Floats, k: int, plan: Plan) -> tuple[Floats, Floats, Floats, Integers]:
-    """Return the balance's columns (n, 6), charges and durations (n,), and moves (n,).
+def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[list[Floats], list[int]]:
+    """Return smooth weights, shape (samples,) each, and their moves.
 
-    Each row is the equation of motion under a smooth weight: one over every cruise, one over every change between two
-    cruises, which add up to 1. Smooth edges let an elastic load's swinging average out, which sharp ones do not.
+    One over every cruise, one over every change between two cruises, which add up to 1. Smooth edges let an elastic
+    load's swinging average out, which sharp ones do not.
     """
-    t = np.arange(len(angle), dtype=float)
-    speed = np.gradient(angle) / CYCLE
-    smooth = np.convolve(np.pad(speed, 4, mode="edge"), np.ones(9) / 9.0, mode="valid")
-    demand = plan.speed[: len(angle), k]
-    # Where friction acts: the demand tells the sign, except about standstill.
-    sign = np.clip(smooth / max(0.02 * float(np.abs(demand).max()), 0.5), -1.0, 1.0)
-    rows, charges, durations, moves = [], [], [], []
-    middle = float(angle.mean())
-
-    def add(weight: Floats, number: int) -> None:
-        slope = np.gradient(weight) / CYCLE
-        rows.append((
-            -float(slope @ speed) * CYCLE, float(weight @ sign) * CYCLE, float(weight @ speed) * CYCLE,
-            float(weight.sum()) * CYCLE, float(weight @ (angle - middle)) * CYCLE,
-            float(weight @ (np.abs(speed) * speed)) * CYCLE,
-        ))  # fmt: skip
-        charges.append(float(weight @ current) * CYCLE)
-        durations.append(float(weight.sum()) * CYCLE)
-        moves.append(number)
-
-    cruises = plan.cruises[k]
+    t = np.arange(samples, dtype=float)
+    weights, moves = [], []
     for j, (first, last, number) in enumerate(cruises):
         begin = first + (last - first) // 5  # the loop swings in
         centre = 0.5 * (begin + last)
-        rise = _step(t, begin, centre)
-        fall = 1.0 - _step(t, centre, last)
-        add(np.minimum(rise, fall), number)
+        weights.append(np.minimum(step(t, begin, centre), 1.0 - step(t, centre, last)))
+        moves.append(number)
         if j + 1 < len(cruises) and cruises[j + 1][2] == number:
             a, b, _ = cruises[j + 1]
             a += (b - a) // 5
-            add(_step(t, centre, last) * (1.0 - _step(t, a, 0.5 * (a + b))), number)
-    return np.array(rows), np.array(charges), np.array(durations), np.array(moves)
+            weights.append(step(t, centre, last) * (1.0 - step(t, a, 0.5 * (a + b))))
+            moves.append(number)
+    return weights, moves
 
 
-def _step(t: Floats, begin: float, end: float) -> Floats:
-    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip((t - begin) / (end - begin), 0.0, 1.0)))
+def _fit(rows: Rows, least: float) -> Solved:
+    """Return J/K, dry and viscous friction and offset, fitted with what the data ask for.
 
+    A fan's drag or a load that changes with position only if it is clear. What is not clear may be there all the same:
+    by what it would change, the intervals are wider.
 
-class _Balance(NamedTuple):
-    mean: Floats  # J/K, coulomb, viscous, offset
-    spread: Floats
-    freedom: int
-
-
-def _fit(columns: Floats, charge: Floats, duration: Floats, moves: Integers) -> _Balance:
-    """Fit with what the data ask for: a fan's drag or a load that changes with position only if it is clear.
-
-    What is not clear may be there all the same: by what it would change, the intervals are wider.
+    Args:
+        rows: The balance.
+        least: The least slope that cogging and offsets do not make [A/rad].
     """
+    X, y, duration, moves = rows.columns, rows.charge, rows.duration, rows.moves
     chosen = [0, 1, 2, 3]
-    result = _solve(columns[:, chosen], charge, duration, moves)
+    result = solve(X[:, chosen], y, duration, moves)
     doubts = np.zeros(4)
     for extra in (DRAG, SLOPE) if len(np.unique(moves)) >= FEWEST_MOVES else ():
-        tried = _solve(columns[:, [*chosen, extra]], charge, duration, moves)
+        tried = solve(X[:, [*chosen, extra]], y, duration, moves)
         clearness = abs(tried.mean[-1]) / max(tried.spread[-1], 1e-30)
-        if clearness > CLEAR:
+        if clearness > CLEAR and (extra != SLOPE or abs(tried.mean[-1]) > least):
             chosen.append(extra)
             result = tried
         else:
             doubts += (np.clip(clearness - 1.0, 0.0, 1.0) * (tried.mean[:4] - result.mean[:4])) ** 2
     t = t_quantile(result.freedom)
-    return _Balance(result.mean[:4], np.sqrt(result.spread[:4] ** 2 + doubts / t**2), result.freedom)
-
-
-def _solve(X: Floats, y: Floats, duration: Floats, moves: Integers) -> _Balance:
-    """Least squares, weighted by duration, with deviations for errors that are alike within a move."""
-    weight = 1.0 / np.sqrt(duration)
-    scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
-    A, b = X / scale * weight[:, None], y * weight
-    inverse = np.linalg.pinv(A.T @ A)
-    mean = inverse @ A.T @ b
-    rest = b - A @ mean
-    names = np.unique(moves)
-    scores = np.array([A[moves == k].T @ rest[moves == k] for k in names])
-    freedom = max(len(y) - len(scale), 1)
-    robust = inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
-    plain = inverse * float(rest @ rest) / freedom
-    spread = np.sqrt(np.maximum(np.diag(robust), np.diag(plain)))
-    return _Balance(mean / scale, spread / scale, max(min(len(names) - 1, freedom), 1))
+    return Solved(result.mean[:4], np.sqrt(result.spread[:4] ** 2 + doubts / t**2), result.freedom)

@@ -39,7 +39,10 @@ Mask = NDArray[np.bool_]
 # inductance, long ones the resistance, and those of little current what dead time loses.
 PULSES = ((0.95, 3), (0.95, 1), (0.95, 1), (0.7, 3), (0.7, 1), (0.45, 3), (0.25, 3))
 REPEATS, BRIEFLY = 8, 6
-LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, or this bandwidth if that is less
+LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, up to this bandwidth
+# Of the current limit: from here on the loop overcomes what dead time takes. On mains that is more than R times the
+# current, and a loop of a few R lets nothing flow, which a drive takes for an open phase.
+OVERCOMES = 0.25
 INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: an instrument, not a controller
 LEAST_INTEGRAL = 8  # of 65536, a share of P e per tick: below it the sum over a millisecond says too little
 HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
@@ -86,7 +89,10 @@ def loop_gains(working: Working) -> tuple[Floats, float]:
     target, motor = working.target, working.target.motor
     known, per = target.device.gains, per_chip(target.device)
     top_p, top_i = (known.rows[k].highest for k in _columns(target))
-    volts_per_ampere = min(LOOP_GAIN * motor.R_s, 2.0 * np.pi * LOOP_HZ * motor.L_q)
+    stage = target.device.stage
+    lost = target.supply * stage["dead_time"].high * target.device.current_rate
+    volts_per_ampere = np.maximum(LOOP_GAIN * motor.R_s, lost / (OVERCOMES * working.current))
+    volts_per_ampere = np.minimum(volts_per_ampere, 2.0 * np.pi * LOOP_HZ * motor.L_q)
     P = np.rint(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply * per["current", "P"])
     cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate * per["current", "I"]
     least = max(LEAST_INTEGRAL * per["current", "I"], 1.0)

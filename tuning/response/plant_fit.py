@@ -54,6 +54,7 @@ LEVEL = 0.03  # by which a resonance may move with the strength of the shaking, 
 DISTORTED = 0.13  # share by which passes may differ beyond noise
 PAIR = ("anti_resonance", "resonance", "damping")
 DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping that may move a pair
+ABOUT = 1.1  # of a pair: how far the lines go that tell it when it lies close together
 SECONDS, SPACING = 6, 0.25  # beginnings that are tried for a second pair, and their distance, a logarithm
 RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where the search begins
 RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
@@ -244,7 +245,10 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
         return _with_resonance(_pack(_solve(part, found.model).model))
 
     passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
-    quiet = spread <= np.median(spread)
+    plant, quiet = found.model.plant, spread <= np.median(spread)
+    if plant.is_elastic:
+        # A pair that lies close together is told by the few lines about it; without these the fit takes any other one.
+        quiet |= (loop.f > plant.anti_resonance / ABOUT) & (loop.f < plant.resonance * ABOUT)
     fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
     return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - p))
 
