@@ -39,9 +39,9 @@ CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
-# Velocity P passes the encoder's noise and counts on to the current: what it is lowered to where an axis does not rest.
+# Velocity P passes the encoder's noise and counts on to the current: what it is lowered to where an axis does not rest;
+# position P likewise where a step overshoots.
 CALMER, LEAST_CALMER, MOST_CALMER = 0.9, 0.5, 0.85
-YIELDING = 0.5  # what position P is lowered to where a step overshoots and no loop was measured
 # Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
@@ -130,27 +130,30 @@ def correct(
     recorded, changed = RecordedGains.of(tried), bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
+    refused: list[Integers] = []  # by their trial
     most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest, kept or not
     for number in range(CORRECTIONS + 1):
-        say("verifying gains on the drives", 0.72 + 0.08 * number)
-        recorded = step(bench, show(bench, recorded, changed), changed)
-        recorded = measure(bench, basis, recorded, changed)
-        recorded = load(bench, basis, recorded, target, changed)
-        shown = [_most_velocity_p(bench.target.device, recorded, k) for k in range(len(most))]
-        most = np.where(changed, np.minimum(most, shown), most)
-        if best is not None:
-            # What is no better than what it was to correct goes.
-            recorded = recorded.mixed(
-                best, changed & bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
-            )
-        best = recorded
+        if changed.any():
+            say("verifying gains on the drives", 0.72 + 0.08 * number)
+            recorded = step(bench, show(bench, recorded, changed), changed)
+            recorded = measure(bench, basis, recorded, changed)
+            recorded = load(bench, basis, recorded, target, changed)
+            shown = [_most_velocity_p(bench.target.device, recorded, k) for k in range(len(most))]
+            most = np.where(changed, np.minimum(most, shown), most)
+            if best is not None:
+                # What is no better than what it was to correct goes.
+                no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
+                recorded = recorded.mixed(best, changed & no_better)
+            best = recorded
         if number == CORRECTIONS:
             break
         say("correcting the design", 0.76 + 0.08 * number)
         gains, why = _corrected(bench, basis, recorded, most)
         tried_before.append(recorded.gains)
         for k in map(int, np.flatnonzero(bench.going)):
-            if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
+            if why[k] and _is_among(gains[k], refused, k):
+                gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
+            if _is_among(gains[k], tried_before, k):
                 gains[k] = recorded.gains[k]
         changed = bench.whole_machines((gains != recorded.gains).any(axis=1) | _others(bench, gains, recorded))
         changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
@@ -159,12 +162,17 @@ def correct(
         tried_before.append(gains.copy())
         recorded, changed = _try(bench, recorded, gains, changed, why)
         if not changed.any():
-            break
+            refused.append(gains)
     final = recorded if best is None else best
     for k in map(int, np.flatnonzero(bench.going)):
         if final.failed[k]:
             bench.journals[k].stop(final.failed[k])
     return final
+
+
+def _is_among(gains: Integers, rows: Sequence[Integers], k: int) -> bool:
+    """Return whether an axis has had such gains, (count,), among those of all axes, (num_axes, count) each."""
+    return any(np.array_equal(gains, row[k]) for row in rows)
 
 
 def _others(bench: AutoBench, gains: Integers, recorded: RecordedGains) -> Mask:
@@ -207,9 +215,10 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
         why[k] = _short(bench, recorded, k) or (UNSEEN if blind[k] else "")
         if not why[k] and cost[k] < WORTH * present[k]:
             why[k] = f"its twins, as measured, have a robust cost of {cost[k]:.2f} for {present[k]:.2f}"
-        if blind[k] and recorded.overshoot[k] > bench.dynamics.overshoot:
-            # Nothing but the step tells how far the twin is from the axis: position P gives way first.
-            gains[k] = known.scaled(gains[k], YIELDING, [cascade_columns(bench.target.device)[4]])
+        if not recorded.failed[k] and not recorded.slack[k] < 0.0 and recorded.overshoot[k] > bench.dynamics.overshoot:
+            # Nothing but the step tells of what makes it overshoot: position P gives way first.
+            share = np.clip(CALMER * bench.dynamics.overshoot / recorded.overshoot[k], LEAST_CALMER, CALMER)
+            gains[k] = known.scaled(gains[k], float(share), [cascade_columns(bench.target.device)[4]])
         elif why[k]:
             gains[k] = designed[k]
     return known.clipped(gains), why
