@@ -142,7 +142,7 @@ def test_gains_that_keep_everything_stay_and_are_verified_once(monkeypatch):
 def test_loops_that_break_the_constraints_as_measured_get_other_gains(monkeypatch):
     found, bench, verified = corrected(monkeypatch, [800, 800], slack=lambda p: 0.9 - p / 1000.0)
     assert found.gains[0, VELOCITY_P] == 800 and verified == [[1000], [800]] and bench.ground.tried == [[800]]
-    (note,) = bench.journals[0].notes
+    note, *_ = bench.journals[0].notes
     assert note == (
         "gains designed again from what was measured: its measured loops keep 90 % of the margins asked for"
     )
@@ -261,7 +261,7 @@ def test_a_step_that_overshoots_lowers_position_p_by_as_much_and_a_tenth(measure
     found, bench, _ = corrected(monkeypatch, [800] * 4, slack=lambda p: 0.5, **far)
     assert bench.ground.tried[0] == [1000], "velocity P stays"
     assert found.gains[0, POSITION_P] == round(0.9 * 2.0 / 3.0 * FIRST[POSITION_P])
-    (note,) = bench.journals[0].notes
+    note, *_ = bench.journals[0].notes
     assert note == "gains designed again from what was measured: a step of its set-point in csp overshoots by 30 %"
 
 
