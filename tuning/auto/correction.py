@@ -39,9 +39,10 @@ CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
-# Velocity P passes the encoder's noise and counts on to the current: what it is lowered to where an axis does not rest;
-# position P likewise where a step overshoots.
-CALMER, LEAST_CALMER, MOST_CALMER = 0.9, 0.5, 0.85
+# Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
+# lowered to where an axis does not rest; position P likewise where a step overshoots.
+CALMER, LEAST_CALMER = 0.9, 0.5
+STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
 # Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
@@ -71,7 +72,8 @@ def design_axes(
     gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
     if not axes:
         return gains, cost, present
-    known = [_known(bench, basis, recorded, k) for k in axes]
+    most = np.full(target.num_axes, np.inf) if most is None else most
+    known = [_known(bench, basis, recorded, k, restless=bool(np.isfinite(most[k]))) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
     # The response of a linked axis was measured without the other one; what both say is in their model.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
@@ -92,8 +94,11 @@ def design_axes(
     return gains, cost, present
 
 
-def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
-    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured."""
+def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
+    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
+
+    What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
+    """
     plant, found = basis.identified.known(k)
     reach = float(basis.trial_reach(bench)[k])
     if bench.target.linked:
@@ -101,14 +106,16 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
         rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
         return known_of(rigid, found, reach)
     plant, found = fitted_plant(basis, recorded, k)
-    return known_of(plant, found, reach)
+    known = known_of(plant, found, reach)
+    still = STILL_FRICTION if restless else 1.0
+    return known._replace(friction=known.friction._replace(coulomb=still * known.friction.coulomb))
 
 
 def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:
     """Return the greatest velocity P of an axis, less than the present where it does not rest; else infinite."""
     if recorded is None or recorded.swing[k] <= RESTLESS:
         return np.inf
-    factor = np.clip(CALMER * RESTLESS / recorded.swing[k], LEAST_CALMER, MOST_CALMER)
+    factor = np.clip(CALMER * np.sqrt(RESTLESS / recorded.swing[k]), LEAST_CALMER, CALMER)
     return float(max(np.floor(factor * recorded.gains[k, cascade_columns(device)[2]]), 1.0))
 
 
@@ -204,7 +211,9 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
             if why[k]:
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
-    blind = bench.going & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
+    # Of what failed its move no loop was looked at yet; what was looked at and not seen asks for more margin.
+    looked_at = bench.going & np.array([not text for text in recorded.failed])
+    blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
         asked = find_dynamics("soft", bench.dynamics.inertia_range)
