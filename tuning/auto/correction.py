@@ -78,7 +78,8 @@ def design_axes(
     # The response of a linked axis was measured without the other one; what both say is in their model.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
     models = [
-        (model, np.searchsorted(axes, of)) for model, of in loop_models(target, basis, recorded, where, bench.dynamics)
+        (model, np.searchsorted(axes, of))
+        for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
     ]
     most = np.full(target.num_axes, np.inf) if most is None else most
 
@@ -105,7 +106,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
         # The ends of one part move it together, each its share, and then nothing twists.
         rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
         return known_of(rigid, found, reach)
-    plant, found = fitted_plant(basis, recorded, k)
+    plant, found = fitted_plant(basis.identified, recorded, k)
     known = known_of(plant, found, reach)
     still = STILL_FRICTION if restless else 1.0
     return known._replace(friction=known.friction._replace(coulomb=still * known.friction.coulomb))

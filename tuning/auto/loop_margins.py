@@ -125,7 +125,7 @@ def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: in
         fits = [None if (found := basis.identified.found[j]) is None else found.fit for j in axes]
         if any(fit is None or fit.reason or fit.misfit > GOOD_MISFIT for fit in fits):
             return None
-        models = loop_models(target, basis, recorded, whole, bench.dynamics)
+        models = loop_models(target, basis.identified, recorded, whole, bench.dynamics)
         return LinkedAxis(models[0][0], k - int(axes[0]), recorded.gains[axes]) if len(models) == 1 else None
     if response is None or recorded.unseen[k] or not np.isfinite(response.open_loop[:, k]).any():
         return None
@@ -158,7 +158,7 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
     """Return what the final gains are worth: their margins as measured, or a lower bound."""
     response, n = recorded.response, bench.target.num_axes
     margins: list[dict[str, Margins]] = [{} for _ in range(n)]
-    for model, axes in loop_models(bench.target, basis, recorded, bench.going, bench.dynamics):
+    for model, axes in loop_models(bench.target, basis.identified, recorded, bench.going, bench.dynamics):
         for k in map(int, axes):
             known = measured_axis(bench, basis, recorded, k) is not None
             _tell_variants(bench, bench.journals[k], model, recorded.gains[axes], known)

@@ -157,6 +157,11 @@ class TrialBench:
         if self.method.measures_current:
             self._fallback.calm = self.safe
 
+    @property
+    def worst(self) -> tuple[float, ...]:
+        """The objectives of gains of which it is known only that they are no good."""
+        return math.log(1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0), math.log(TRIP), 100.0
+
     def _moved(self, gains: Integers) -> tuple[Identified, Integers]:
         """Move there and back for identification; an axis that oscillates is switched off, and moves with softer gains.
 
@@ -248,11 +253,10 @@ class TrialBench:
         self.moves[axes] += 1
         self.aborts[axes] += 1
         shape = (self.num_machines, self.target.axes_per_machine)
-        worst = np.array([np.log(1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0), np.log(TRIP), 100.0])
         machines = np.any(axes.reshape(shape), axis=1)
         return Tried(
             np.full(shape[0], np.log(TRIP)),
-            np.tile(worst, (shape[0], 1)),
+            np.tile(self.worst, (shape[0], 1)),
             machines,
             np.zeros(shape[0], bool),
             self._causes(),
@@ -271,8 +275,7 @@ class TrialBench:
         """Return the objectives of every axis, (num_axes, 3)."""
         terms, moves = tried.terms, tried.aborted[:2].any(axis=0)
         # Of a move that was stopped it is known only that it is no good: the slowest there is.
-        slowest = 1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0
-        speed = np.log(np.where(moves, slowest, terms.settling[:2].max(axis=0)))
+        speed = np.where(moves, self.worst[0], np.log(terms.settling[:2].max(axis=0)))
         # Without E_d/E_0, of which a probe with 1.5 times the gain has less in any case.
         j = self.method.cost(terms._replace(tripped=tried.aborted))
         worse = np.log(np.where(tried.aborted.any(axis=0), TRIP, j.max(axis=0) / j[:2].mean(axis=0)))
