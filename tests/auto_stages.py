@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tuning.auto import correction, design, one_button
-from tuning.auto.stages import Basis, IdentifiedAxes, RecordedGains, TriedGains
+from tuning.auto.stages import Basis, IdentifiedAxes, RecordedGains, TriedGains, Verdict
 
 
 def basis(reference, *, before=None, plant=None, found=None):
@@ -48,3 +48,4 @@ def skip_stages(replace, gains):
     replace(one_button, "on_twins", lambda bench, basis, say: TriedGains.only(gains.copy()))
     replace(one_button, "correct", lambda bench, basis, tried, target, say: RecordedGains.of(tried))
     replace(one_button, "look_back", lambda bench, basis, recorded: recorded)
+    replace(one_button, "judge", lambda bench, basis, recorded: Verdict(({},) * n, ({},) * n, recorded.verified))

@@ -92,7 +92,7 @@ VALUES: dict[str, str] = {
     "drive-agent tune agent": "gain_tuning", "drive-env lss bit-rate new": "500000", "file": "state.toml",
     "drive-env backup file": "new.toml", "drive-env export file": "new.eds", "drive-env log file": "new.log",
     "drive-env replay file": "frames.log", "drive-tune undo file": "before.toml", "other": "state.toml",
-    "dynamics": "soft",
+    "dynamics": "soft", "inertia_range": "0.8/4",
     "replay": "move.csv", "out": "new", "drive-env scope out": "new.csv", "drive-env jog out": "new.csv",
     "eds": "own.eds", "config": "config.toml", "journal": "new.journal", "snapshot": "new.toml", "store": "new",
     "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env replay speed": "2", "max_current": "1 A",

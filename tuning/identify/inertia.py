@@ -28,7 +28,7 @@ from drive_env.gains import as_chip, write_gains
 from drive_env.motors import Motor
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused
-from tuning.identify.momentum_balance import Motion, Rows, Solved, balance_rows, motion, solve, step
+from tuning.identify.momentum_balance import Motion, BalanceRows, Solved, balance_rows, motion, solve, step
 from tuning.identify.transmission_loss import find_losses, friction_of_whole_ways
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
 from tuning.lateness import late_first
@@ -442,7 +442,7 @@ def _balance(
 
 
 def _with_losses(
-    did: Motion, cruises: tuple[tuple[int, int, int], ...], motor: Motor, rows: Rows, fit: Solved, least: float,
+    did: Motion, cruises: tuple[tuple[int, int, int], ...], motor: Motor, rows: BalanceRows, fit: Solved, least: float,
     hidden: float,
 ) -> tuple[float, Solved, Floats]:  # fmt: skip
     """Return inertia [kg*m^2], the fit, and half of what else is open of its unknowns, for what a transmission loses.
@@ -529,7 +529,7 @@ def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[l
     return weights, moves
 
 
-def _fit(rows: Rows, least: float) -> Solved:
+def _fit(rows: BalanceRows, least: float) -> Solved:
     """Return J/K, dry and viscous friction and offset, fitted with what the data ask for.
 
     A fan's drag or a load that changes with position only if it is clear. What is not clear may be there all the same:

@@ -27,7 +27,7 @@ class Motion(NamedTuple):
     sign: Floats  # -1...1: the direction of dry friction
 
 
-class Rows(NamedTuple):
+class BalanceRows(NamedTuple):
     """The balance under n weights.
 
     columns: Of J/K, dry friction, viscous friction, offset, slope over the angle, drag; shape (n, 6).
@@ -70,13 +70,13 @@ def step(t: Floats, begin: float, end: float) -> Floats:
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip((t - begin) / (end - begin), 0.0, 1.0)))
 
 
-def balance_rows(did: Motion, weights: Sequence[Floats], moves: Sequence[int]) -> Rows:
+def balance_rows(did: Motion, weights: Sequence[Floats], moves: Sequence[int]) -> BalanceRows:
     """Return the balance under weights, shape (samples,) each, of the moves they belong to."""
     w = np.array(weights)
     away = did.angle - float(did.angle.mean())
     signals = np.stack([did.sign, did.speed, np.ones_like(away), away, np.abs(did.speed) * did.speed], axis=1)
     momentum = -np.gradient(w, axis=1) / CYCLE @ did.speed
-    return Rows(
+    return BalanceRows(
         np.column_stack([momentum, w @ signals]) * CYCLE,
         w @ did.current * CYCLE,
         w.sum(axis=1) * CYCLE,

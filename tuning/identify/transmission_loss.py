@@ -7,11 +7,11 @@ With i_L the current behind the rotor and behind the friction before the transmi
 
 An axis that always drives shows (1 + loss) times its load's inertia, and so does each part of a braking in which
 friction brakes more than is needed; the balance of a whole move cancels only the rest. How much of the friction lies
-before the transmission is not seen: the inertia is that of the middle, and the interval holds those of both ends.
+before the transmission is not known: the inertia is that of the middle, and the interval holds those of both ends.
 
 A load behind play glides: after a change of speed it runs along by itself, in the gap, for as long as a cruise lasts,
 and the motor then shows less friction than there is. From standstill to standstill nothing hides so, but the loss
-matters there. So friction is told twice, from cruises and from whole ways, and the interval holds both.
+matters there. So friction is estimated twice, from cruises and from whole ways, and the interval holds both.
 """
 
 from __future__ import annotations
