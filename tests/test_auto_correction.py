@@ -181,13 +181,12 @@ def test_corrected_gains_that_fail_their_trial_leave_those_before(monkeypatch):
     assert bench.journals[0].notes == ["corrected gains failed their trial: it shook"] * 2
 
 
-def test_a_design_that_failed_its_trial_and_is_made_again_is_lowered(monkeypatch):
-    """To the liveliest whose measured loops keep the dynamics."""
+def test_a_design_that_failed_its_trial_bounds_the_next_one(monkeypatch):
     found, bench, verified = corrected(
-        monkeypatch, [1100, 1100], slack=lambda p: 0.5 - p / 1000.0, fails=lambda p: p > 1000
+        monkeypatch, [1100, 980], slack=lambda p: -0.1 if p == 1000 else 0.1, fails=lambda p: p > 1000
     )
-    assert bench.ground.tried == [[1100], [400]] and verified == [[1000], [400]]
-    assert found.gains[0, VELOCITY_P] == 400
+    assert bench.ground.tried == [[1100], [980]] and verified == [[1000], [980]]
+    assert bench.most == [[np.inf], [0.9 * 1100]] and found.gains[0, VELOCITY_P] == 980
 
 
 def test_a_correction_that_does_not_rest_bounds_the_next_one_although_it_is_not_kept(monkeypatch):

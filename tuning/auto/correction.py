@@ -138,8 +138,8 @@ def correct(
     recorded, changed = RecordedGains.of(tried), bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
-    refused: list[Integers] = []  # by their trial
-    most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest, kept or not
+    column = cascade_columns(bench.target.device)[2]
+    most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest or pass, kept or not
     for number in range(CORRECTIONS + 1):
         if changed.any():
             say("verifying gains on the drives", 0.72 + 0.08 * number)
@@ -159,28 +159,21 @@ def correct(
         gains, why = _corrected(bench, basis, recorded, most)
         tried_before.append(recorded.gains)
         for k in map(int, np.flatnonzero(bench.going)):
-            if why[k] and _is_among(gains[k], refused, k):
-                gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
-            if _is_among(gains[k], tried_before, k):
+            if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
                 gains[k] = recorded.gains[k]
         changed = bench.whole_machines((gains != recorded.gains).any(axis=1) | _others(bench, gains, recorded))
         changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
         if not changed.any():
             break
         tried_before.append(gains.copy())
-        recorded, changed = _try(bench, recorded, gains, changed, why)
-        if not changed.any():
-            refused.append(gains)
+        recorded, passed = _try(bench, recorded, gains, changed, why)
+        most = np.where(changed & ~passed, np.minimum(most, np.floor(CALMER * gains[:, column])), most)
+        changed = passed
     final = recorded if best is None else best
     for k in map(int, np.flatnonzero(bench.going)):
         if final.failed[k]:
             bench.journals[k].stop(final.failed[k])
     return final
-
-
-def _is_among(gains: Integers, rows: Sequence[Integers], k: int) -> bool:
-    """Return whether an axis has had such gains, (count,), among those of all axes, (num_axes, count) each."""
-    return any(np.array_equal(gains, row[k]) for row in rows)
 
 
 def _others(bench: AutoBench, gains: Integers, recorded: RecordedGains) -> Mask:
