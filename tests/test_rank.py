@@ -201,7 +201,7 @@ def test_gains_that_are_none_are_the_tuners_mistake(gains):
 
 def test_a_comparison_follows_from_its_seed_and_from_nothing_else():
     def tuner(target, rng):
-        return search_tuner(target, rng, sampler="random", trials=2)
+        return search_tuner(target, rng, sampler="random", trials=6)
 
     alone, again, other = (compare(RIGID, {"search": tuner}, seed=seed).rows for seed in (0, 0, 1))
     beside = compare(RIGID, {"factory": find_tuner("factory"), "search": tuner}).of("search")

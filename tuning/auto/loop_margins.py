@@ -52,11 +52,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     """Measure the velocity loop's response of axes with their gains, and how far their loops keep the dynamics."""
     going = where & bench.going & np.array([not why for why in recorded.failed])
     if bench.target.linked:
-        slack = recorded.slack.copy()
-        for k in map(int, np.flatnonzero(going)):
-            one = measured_axis(bench, basis, recorded, k)
-            slack[k] = np.nan if one is None else one.slack(bench.dynamics, recorded.gains[k][None])[0]
-        return replace(recorded, slack=slack)
+        return _with_slack(bench, basis, recorded, going)
     late = going & ~bench.affordable(bench.response_time)
     recorded = _without_response(recorded, late, "the drive time of the run was used up")
     going = bench.whole_machines(going & ~late)
@@ -89,7 +85,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         watch_following(bench, going)
     assert bench.ground is not None, "trying makes it"
     bench.ground.begin_here(going)
-    unseen, slack = list(recorded.unseen), recorded.slack.copy()
+    unseen = list(recorded.unseen)
     whole = response if recorded.response is None else recorded.response.replaced(response, going)
     recorded, faults = replace(recorded, response=whole), bench.faults()
     for k in map(int, np.flatnonzero(going)):
@@ -100,15 +96,21 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         elif seen < LEAST_LINES:
             why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
             unseen[k] = "; ".join([why, *response.notes[k]])
-    recorded = replace(recorded, unseen=tuple(unseen))
-    for k in map(int, np.flatnonzero(going)):
-        measured = measured_axis(bench, basis, recorded, k)
-        slack[k] = np.nan if measured is None else measured.slack(bench.dynamics, recorded.gains[k][None])[0]
+    recorded = _with_slack(bench, basis, replace(recorded, unseen=tuple(unseen)), going)
     faulted = np.isin(np.arange(bench.target.num_axes), list(faults))
     if faulted.any():
         with bench.spending(bench.target.together(faulted)):
             bench.ground.recover(faulted)
         bench.drop_faults("its frequency response was measured, and the fault cannot be reset")
+    return recorded
+
+
+def _with_slack(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
+    """Return it with how far the loops of axes keep the dynamics, nan where they were not measured."""
+    slack = recorded.slack.copy()
+    for k in map(int, np.flatnonzero(where)):
+        one = measured_axis(bench, basis, recorded, k)
+        slack[k] = np.nan if one is None else one.slack(bench.dynamics, recorded.gains[k][None])[0]
     return replace(recorded, slack=slack)
 
 

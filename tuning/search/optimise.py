@@ -5,7 +5,7 @@ machines are copies of one machine, in one search whose generation they try at t
 gains that are slow and proved, goes on from what has been proved in small steps, and never beyond what oscillated.
 
 Where dynamics are asked for, the axes are identified first, and a drive gets no gains that break them by the model of
-its axes: the sampler is told their robust cost (drive_env/trials/score.py) by how far they are from keeping them.
+its axes: the sampler gets their robust cost (drive_env/trials/score.py) by how far they are from keeping them.
 """
 
 from __future__ import annotations
