@@ -113,7 +113,10 @@ def test_it_comes_to_the_border_of_the_constraints_and_not_across():
     found = design(coarse, fine, [plant])
     assert 0.0 < found.slack[0, 0] < 0.1
     assert 0.9 * 900 < found.gains[0, 0, VELOCITY_P] < 900
-    assert coarse.asked <= 20 * module.EACH and fine.asked <= module.FINALISTS + len(module.STEPS) * module.PROMISING
+    assert (
+        coarse.asked <= 20 * len(module.TORQUES) * module.EACH
+        and fine.asked <= module.FINALISTS + len(module.STEPS) * module.PROMISING
+    )
 
 
 def test_where_no_gains_keep_the_constraints_the_nearest_are_found_and_that_is_said():
@@ -124,6 +127,7 @@ def test_where_no_gains_keep_the_constraints_the_nearest_are_found_and_that_is_s
 
 def test_of_every_bandwidth_the_most_promising_that_keep_the_constraints_are_looked_at(monkeypatch):
     monkeypatch.setattr(module, "BANDWIDTHS", np.array([1.0, 2.0]))
+    monkeypatch.setattr(module, "TORQUES", (1.0,))
     slack = np.array([[0.1, 0.2, -0.1, 0.3, -0.3, -0.1, -0.2, -0.4]])
     promise = np.array([[3.0, 2.0, 1.0, 4.0, 1.0, 2.0, 3.0, 4.0]])
     assert _of_each(slack, promise, 2).tolist() == [[1, 0, 5, 6]], "of the second one those that come nearest"

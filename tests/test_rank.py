@@ -505,7 +505,7 @@ def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their
 def test_the_picture_shows_the_trials_of_every_search():
     rows = [row(search, number, cost) for search, cost in ((0, 2.0), (1, 1.0)) for number in range(3)]
     found = Optimised(np.ones((2, 5), int), np.ones((2, 5), int), np.array([2.0, 1.0]), tuple(rows), 0.0,
-                      np.zeros(2, int), np.zeros(2, int), ("", ""), 0.01)  # fmt: skip
+                      np.zeros(2, int), np.zeros(2, int), ("", ""), 0.01, 0, np.zeros((2, 2, 3)))  # fmt: skip
     axes = trials_figure(found, Settings(), "tmcm1636").axes[0]
     assert len(axes.collections[0].get_offsets()) == 6
     assert [line.get_ydata().tolist() for line in axes.lines] == pytest.approx(np.exp([[2.0] * 3, [1.0] * 3]))
@@ -541,7 +541,19 @@ def test_the_front_is_of_accepted_trials_and_its_axes_have_units():
 def searched(rows):
     """Return what a search of one machine has found, with a t_0 of 10 ms."""
     none = np.zeros(1, int)
-    return Optimised(np.ones((1, 5), int), np.ones((1, 5), int), np.ones(1), rows, 0.0, none, none, ("",), 0.01)
+    return Optimised(
+        np.ones((1, 5), int),
+        np.ones((1, 5), int),
+        np.ones(1),
+        rows,
+        0.0,
+        none,
+        none,
+        ("",),
+        0.01,
+        0,
+        np.zeros((1, 2, 3)),
+    )
 
 
 def row(search, number, cost, *, objectives=(0.0, 0.0, 0.0), aborted=False, fragile=False):

@@ -27,7 +27,7 @@ def search_of(*, shared=False, safe=True, caution=1, **settings):
     """A search of two machines of two axes, whose trials are what a test says."""
     made = _Search.__new__(_Search)
     made.rows, made.notes, made._axes = [], [""] * 2, 2
-    made._columns = COLUMNS
+    made._columns, made._known = COLUMNS, None
     made._settings = Settings(**({"sampler": "random", "trials": 4, "safe": safe} | settings))
     made._bench = SimpleNamespace(
         rule=RULE.copy(), safe=RULE // 2, incumbent=RULE // 2, num_machines=2, highest=np.full(5, 32767),
@@ -38,6 +38,7 @@ def search_of(*, shared=False, safe=True, caution=1, **settings):
     count = len(made._members)
     made._proved, made._refuted = [[] for _ in range(count)], [[] for _ in range(count)]
     made._fragile, made._least, made._halted = [set() for _ in range(count)], np.full(2, np.inf), [False] * count
+    made.untried = [0] * count
     made._proposers = [
         SimpleNamespace(told=0, tell=lambda values, facts, k=k: told.append((k, values, facts))) for k in range(count)
     ]
@@ -134,7 +135,9 @@ def test_a_sampler_is_told_what_was_tried_and_how_far_it_was_held_back(safe, abo
     search = search_of(safe=safe)
     search._proposers[0].told = 5
     point, own = np.array([1.0, 0.0, 0.0]), np.array([0.5, 0.0, 0.0])
-    search._tell(0, [point], [own], tried(aborted=(aborted, False), causes=("undervoltage (3220h)", "")), RULE)
+    search._tell(
+        0, [point], [own], [math.inf], (tried(aborted=(aborted, False), causes=("undervoltage (3220h)", "")), RULE)
+    )
     (k, values, facts) = search.told[0]
     pulled = PULLED * 0.5 + SHUNNED * shunned
     assert k == 0 and values == [[pytest.approx(1.0 + pulled)]]
@@ -201,9 +204,9 @@ def test_a_safe_search_begins_with_gains_that_are_not_stopped_or_not_at_all(stop
     search._members, search._proposers = [np.array([0])], [SimpleNamespace(ask=lambda count: None)]
     search._proved, search._refuted, search._halted = [[]], [[]], [False]
     search._start = np.zeros((1, 3))
-    search._run = lambda held: (points.append(held[0][0].copy()), None)
+    search._run = lambda held, slack: (points.append(held[0][0].copy()), None)
 
-    def tell(k, asked, held, found, gains):
+    def tell(k, asked, held, slack, run):
         (search._refuted if len(points) <= stopped else search._proved)[k].append(held[0])
 
     search._tell = tell
@@ -229,8 +232,8 @@ def test_where_no_safe_start_is_found_it_is_said_why(caution, told):
     for proposer in search._proposers:
         proposer.ask = asked.append
     search._start = np.zeros((2, 3))
-    search._run = lambda held: (points.append({k: at[0].tolist() for k, at in held.items()}), None)
-    search._tell = lambda k, points, held, tried, gains: search._refuted[k].append(held[0])
+    search._run = lambda held, slack: (points.append({k: at[0].tolist() for k, at in held.items()}), None)
+    search._tell = lambda k, points, held, slack, run: search._refuted[k].append(held[0])
     search._prove()
     assert points == [{0: [pytest.approx(-caution * k * math.log(2.0))] * 3} for k in range(3)]
     assert asked == [1, 1, 1] and search._halted == [True, False] and search.notes == [told, ""]
@@ -240,8 +243,8 @@ def test_copies_of_a_machine_start_where_the_first_of_them_does():
     search, points = search_of(shared=True), []
     search._proposers = [SimpleNamespace(ask=lambda count: None)]
     search._start = np.array([[-1.0] * 3, [-2.0] * 3])
-    search._run = lambda held: (points.append(held[0][0].tolist()), None)
-    search._tell = lambda k, asked, held, tried, gains: search._proved[k].append(held[0])
+    search._run = lambda held, slack: (points.append(held[0][0].tolist()), None)
+    search._tell = lambda k, asked, held, slack, run: search._proved[k].append(held[0])
     search._prove()
     assert points == [[-1.0] * 3]
 
@@ -364,7 +367,7 @@ def test_the_front_of_a_search_is_of_its_own_accepted_trials():
         row(0.0, objectives=(0.5, 0.5, 0.0), number=3)._replace(fragile=True),
         row(0.0, objectives=(2.0, 0.0, 0.0), number=4),
     )  # fmt: skip
-    found = Optimised(RULE, RULE, np.zeros(2), rows, 1.0, RULE, RULE, ("", ""), 0.01)
+    found = Optimised(RULE, RULE, np.zeros(2), rows, 1.0, RULE, RULE, ("", ""), 0.01, 0, np.zeros((4, 2, 3)))
     assert [one.number for one in found.front(OBJECTIVES[:2])] == [1, 4]
     assert [one.search for one in found.front(OBJECTIVES[:2], 1)] == [1]
     assert found.front(OBJECTIVES[:2], 2) == []
@@ -384,7 +387,7 @@ def test_a_search_of_several_objectives_ends_with_the_cheapest_of_its_front():
 def test_objectives_are_told_in_their_order_each_with_what_it_was_held_back_by():
     search = search_of(objectives=("current", "cost"))
     search._proposers[1].told = 0
-    search._tell(1, [np.array([0.0, -1.0, 0.0])], [np.array([0.0, -0.5, 0.1])], tried(), RULE)
+    search._tell(1, [np.array([0.0, -1.0, 0.0])], [np.array([0.0, -0.5, 0.1])], [math.inf], (tried(), RULE))
     (k, values, facts) = search.told[0]
     assert k == 1 and values == [[pytest.approx(5.0 + 0.1), pytest.approx(2.0 + 0.1)]]
     assert facts[0]["gains"] == RULE[2:].tolist() and facts[0]["cost"] == 2.0 and facts[0]["search"] == 1

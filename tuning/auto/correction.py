@@ -39,9 +39,10 @@ CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
-# Velocity P passes the encoder's noise and counts on to the current: what it is lowered to where an axis does not rest.
-CALMER, LEAST_CALMER, MOST_CALMER = 0.9, 0.5, 0.85
-YIELDING = 0.5  # what position P is lowered to where a step overshoots and no loop was measured
+# Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
+# lowered to where an axis does not rest; position P likewise where a step overshoots.
+CALMER, LEAST_CALMER = 0.9, 0.5
+STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
 # Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
@@ -71,12 +72,14 @@ def design_axes(
     gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
     if not axes:
         return gains, cost, present
-    known = [_known(bench, basis, recorded, k) for k in axes]
+    most = np.full(target.num_axes, np.inf) if most is None else most
+    known = [_known(bench, basis, recorded, k, restless=bool(np.isfinite(most[k]))) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
     # The response of a linked axis was measured without the other one; what both say is in their model.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
     models = [
-        (model, np.searchsorted(axes, of)) for model, of in loop_models(target, basis, recorded, where, bench.dynamics)
+        (model, np.searchsorted(axes, of))
+        for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
     ]
     most = np.full(target.num_axes, np.inf) if most is None else most
 
@@ -92,23 +95,28 @@ def design_axes(
     return gains, cost, present
 
 
-def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
-    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured."""
+def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
+    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
+
+    What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
+    """
     plant, found = basis.identified.known(k)
     reach = float(basis.trial_reach(bench)[k])
     if bench.target.linked:
         # The ends of one part move it together, each its share, and then nothing twists.
         rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
         return known_of(rigid, found, reach)
-    plant, found = fitted_plant(basis, recorded, k)
-    return known_of(plant, found, reach)
+    plant, found = fitted_plant(basis.identified, recorded, k)
+    known = known_of(plant, found, reach)
+    still = STILL_FRICTION if restless else 1.0
+    return known._replace(friction=known.friction._replace(coulomb=still * known.friction.coulomb))
 
 
 def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:
     """Return the greatest velocity P of an axis, less than the present where it does not rest; else infinite."""
     if recorded is None or recorded.swing[k] <= RESTLESS:
         return np.inf
-    factor = np.clip(CALMER * RESTLESS / recorded.swing[k], LEAST_CALMER, MOST_CALMER)
+    factor = np.clip(CALMER * np.sqrt(RESTLESS / recorded.swing[k]), LEAST_CALMER, CALMER)
     return float(max(np.floor(factor * recorded.gains[k, cascade_columns(device)[2]]), 1.0))
 
 
@@ -130,20 +138,21 @@ def correct(
     recorded, changed = RecordedGains.of(tried), bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
-    most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest, kept or not
+    column = cascade_columns(bench.target.device)[2]
+    most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest or pass, kept or not
     for number in range(CORRECTIONS + 1):
-        say("verifying gains on the drives", 0.72 + 0.08 * number)
-        recorded = step(bench, show(bench, recorded, changed), changed)
-        recorded = measure(bench, basis, recorded, changed)
-        recorded = load(bench, basis, recorded, target, changed)
-        shown = [_most_velocity_p(bench.target.device, recorded, k) for k in range(len(most))]
-        most = np.where(changed, np.minimum(most, shown), most)
-        if best is not None:
-            # What is no better than what it was to correct goes.
-            recorded = recorded.mixed(
-                best, changed & bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
-            )
-        best = recorded
+        if changed.any():
+            say("verifying gains on the drives", 0.72 + 0.08 * number)
+            recorded = step(bench, show(bench, recorded, changed), changed)
+            recorded = measure(bench, basis, recorded, changed)
+            recorded = load(bench, basis, recorded, target, changed)
+            shown = [_most_velocity_p(bench.target.device, recorded, k) for k in range(len(most))]
+            most = np.where(changed, np.minimum(most, shown), most)
+            if best is not None:
+                # What is no better than what it was to correct goes.
+                no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
+                recorded = recorded.mixed(best, changed & no_better)
+            best = recorded
         if number == CORRECTIONS:
             break
         say("correcting the design", 0.76 + 0.08 * number)
@@ -157,9 +166,9 @@ def correct(
         if not changed.any():
             break
         tried_before.append(gains.copy())
-        recorded, changed = _try(bench, recorded, gains, changed, why)
-        if not changed.any():
-            break
+        recorded, passed = _try(bench, recorded, gains, changed, why)
+        most = np.where(changed & ~passed, np.minimum(most, np.floor(CALMER * gains[:, column])), most)
+        changed = passed
     final = recorded if best is None else best
     for k in map(int, np.flatnonzero(bench.going)):
         if final.failed[k]:
@@ -196,7 +205,9 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
             if why[k]:
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
-    blind = bench.going & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
+    # Of what failed its move no loop was looked at yet; what was looked at and not seen asks for more margin.
+    looked_at = bench.going & np.array([not text for text in recorded.failed])
+    blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
         asked = find_dynamics("soft", bench.dynamics.inertia_range)
@@ -207,9 +218,10 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
         why[k] = _short(bench, recorded, k) or (UNSEEN if blind[k] else "")
         if not why[k] and cost[k] < WORTH * present[k]:
             why[k] = f"its twins, as measured, have a robust cost of {cost[k]:.2f} for {present[k]:.2f}"
-        if blind[k] and recorded.overshoot[k] > bench.dynamics.overshoot:
-            # Nothing but the step tells how far the twin is from the axis: position P gives way first.
-            gains[k] = known.scaled(gains[k], YIELDING, [cascade_columns(bench.target.device)[4]])
+        if not recorded.failed[k] and not recorded.slack[k] < 0.0 and recorded.overshoot[k] > bench.dynamics.overshoot:
+            # Nothing but the step tells of what makes it overshoot: position P gives way first.
+            share = np.clip(CALMER * bench.dynamics.overshoot / recorded.overshoot[k], LEAST_CALMER, CALMER)
+            gains[k] = known.scaled(gains[k], float(share), [cascade_columns(bench.target.device)[4]])
         elif why[k]:
             gains[k] = designed[k]
     return known.clipped(gains), why

@@ -38,7 +38,9 @@ TORQUES = (1.0, 0.6, 0.36)
 LEAST_TORQUE = 0.3  # below it the current loop is a low-pass of the velocity loop, which no engineer signs
 # The current loop: its crossover times its own lag, one and a half periods; 60 degrees of phase margin.
 CURRENT_CROSSOVER, CURRENT_LAG = 0.52, 1.5
-EACH_NOMINAL, EACH = 24, 6  # of every bandwidth: whose variants are looked at, and that are tried on the twin
+# Of every bandwidth and torque P: whose variants are looked at, and that are tried on the twin. A slow current loop
+# promises nothing by itself, but passes on less of what an encoder's counts make of the velocity.
+EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
 STEPS = (1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
@@ -189,12 +191,13 @@ def _promise(device: Device, gains: Integers) -> Floats:
 
 
 def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:
-    """Return the most promising of every bandwidth that keep the constraints, (n, bandwidths * each).
+    """Return the most promising of every bandwidth and torque P that keep the constraints, (n, those * each).
 
     Where they are fewer, those that come nearest to keeping them.
     """
     n, sets = slack.shape
-    group = (n, len(BANDWIDTHS), sets // len(BANDWIDTHS))
+    count = len(BANDWIDTHS) * len(TORQUES)
+    group = (n, count, sets // count)
     order = np.argsort(np.where(slack > 0.0, promise, 1e9 - slack).reshape(group), axis=2, kind="stable")[:, :, :each]
     first = group[2] * np.arange(group[1])[:, None]
     return np.asarray((order + first).reshape(n, -1))

@@ -89,18 +89,8 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         watch_following(bench, going)
     assert bench.ground is not None, "trying makes it"
     bench.ground.begin_here(going)
-    unseen, slack = list(recorded.unseen), recorded.slack.copy()
-    whole = response if recorded.response is None else recorded.response.replaced(response, going)
-    recorded, faults = replace(recorded, response=whole), bench.faults()
-    for k in map(int, np.flatnonzero(going)):
-        seen = _seen(response, k)
-        unseen[k] = ""
-        if k in faults:
-            unseen[k] = f"the drive went into fault during the measurement ({faults[k]})"
-        elif seen < LEAST_LINES:
-            why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
-            unseen[k] = "; ".join([why, *response.notes[k]])
-    recorded = replace(recorded, unseen=tuple(unseen))
+    faults = bench.faults()
+    recorded, slack = _with_response(recorded, response, going, faults), recorded.slack.copy()
     for k in map(int, np.flatnonzero(going)):
         measured = measured_axis(bench, basis, recorded, k)
         slack[k] = np.nan if measured is None else measured.slack(bench.dynamics, recorded.gains[k][None])[0]
@@ -125,7 +115,7 @@ def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: in
         fits = [None if (found := basis.identified.found[j]) is None else found.fit for j in axes]
         if any(fit is None or fit.reason or fit.misfit > GOOD_MISFIT for fit in fits):
             return None
-        models = loop_models(target, basis, recorded, whole, bench.dynamics)
+        models = loop_models(target, basis.identified, recorded, whole, bench.dynamics)
         return LinkedAxis(models[0][0], k - int(axes[0]), recorded.gains[axes]) if len(models) == 1 else None
     if response is None or recorded.unseen[k] or not np.isfinite(response.open_loop[:, k]).any():
         return None
@@ -149,6 +139,23 @@ def _seen(response: MeasuredLoop, k: int) -> int:
     return round(float(response.refined(k)[2].mean()) * len(response.f))
 
 
+def _with_response(
+    recorded: RecordedGains, response: MeasuredLoop, going: Mask, faults: Mapping[int, str]
+) -> RecordedGains:
+    """Return gains with the responses of axes, and why one says too little; faults: by axis, during the measurement."""
+    unseen = list(recorded.unseen)
+    whole = response if recorded.response is None else recorded.response.replaced(response, going)
+    for k in map(int, np.flatnonzero(going)):
+        seen = _seen(response, k)
+        unseen[k] = ""
+        if k in faults:
+            unseen[k] = f"the drive went into fault during the measurement ({faults[k]})"
+        elif seen < LEAST_LINES:
+            why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
+            unseen[k] = "; ".join([why, *response.notes[k]])
+    return replace(recorded, response=whole, unseen=tuple(unseen))
+
+
 def _without_response(recorded: RecordedGains, where: Mask, why: str) -> RecordedGains:
     unseen = tuple(why if late else told for late, told in zip(where, recorded.unseen, strict=True))
     return replace(recorded, unseen=unseen, slack=np.where(where, np.nan, recorded.slack))
@@ -158,7 +165,7 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
     """Return what the final gains are worth: their margins as measured, or a lower bound."""
     response, n = recorded.response, bench.target.num_axes
     margins: list[dict[str, Margins]] = [{} for _ in range(n)]
-    for model, axes in loop_models(bench.target, basis, recorded, bench.going, bench.dynamics):
+    for model, axes in loop_models(bench.target, basis.identified, recorded, bench.going, bench.dynamics):
         for k in map(int, axes):
             known = measured_axis(bench, basis, recorded, k) is not None
             _tell_variants(bench, bench.journals[k], model, recorded.gains[axes], known)

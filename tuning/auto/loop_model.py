@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from drive_env.loops.margins import Margins
     from drive_env.loops.sampled import OuterLoops
     from drive_env.motors import Motor
-    from tuning.auto.stages import Basis, RecordedGains
+    from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.identify.estimate import Identification
     from tuning.target import Target
 
@@ -173,6 +173,15 @@ class LoopModel:
         clearance, overshoot = loop_clearance(dynamics, LoopRates.of(self.device), machines, cascade)
         return clearance.reshape(sets, count), overshoot.reshape(sets, count)[:, 0]
 
+    def margins(self, gains: Integers) -> list[dict[str, Margins]]:
+        """Return the margins of the outer loops of each axis as the machine is, with gains, raw, (axes, count)."""
+        f = np.geomspace(LOWEST, HIGHEST * self.device.velocity_rate, POINTS)
+        loops = self.open_loops(gains, f)
+        return [
+            {name: margins(f, loop[axis]) for name, loop in zip(loops._fields, loops, strict=True)}
+            for axis in range(self.axes)
+        ]
+
     def open_loops(self, gains: Integers, f: Floats) -> OuterLoops:
         """Return the open loops of the machine as it is, each with the others closed, (axes, n).
 
@@ -221,18 +230,16 @@ class LinkedAxis:
 
     def margins(self, gains: Integers) -> dict[str, Margins]:
         """Return the margins of the outer loops with gains, (count,)."""
-        f = np.geomspace(LOWEST, HIGHEST * self._model.device.velocity_rate, POINTS)
-        loops = self._model.open_loops(self._whole(gains[None])[0], f)
-        return {name: margins(f, loop[self._axis]) for name, loop in zip(loops._fields, loops, strict=True)}
+        return self._model.margins(self._whole(gains[None])[0])[self._axis]
 
     def slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
         """Return how far the machine keeps the dynamics with gains of this axis, raw, (sets, count): (sets,)."""
         return self._model.slack(dynamics, self._whole(gains))
 
 
-def fitted_plant(basis: Basis, recorded: RecordedGains | None, k: int) -> tuple[Plant, Identification]:
+def fitted_plant(identified: IdentifiedAxes, recorded: RecordedGains | None, k: int) -> tuple[Plant, Identification]:
     """Return the plant of an axis and what is known of it: as identified, and as its response was fitted last."""
-    plant, found = basis.identified.known(k)
+    plant, found = identified.known(k)
     if np.isfinite(found.together):
         plant = replace(plant, inertia=found.together)  # what all axes move, each its share
     fit = None if recorded is None or recorded.response is None or recorded.unseen[k] else recorded.response.fits[k]
@@ -244,13 +251,13 @@ def fitted_plant(basis: Basis, recorded: RecordedGains | None, k: int) -> tuple[
 
 
 def loop_models(
-    target: Target, basis: Basis, recorded: RecordedGains | None, where: Mask, dynamics: Dynamics
+    target: Target, identified: IdentifiedAxes, recorded: RecordedGains | None, where: Mask, dynamics: Dynamics
 ) -> list[tuple[LoopModel, Integers]]:
     """Return the models of chosen axes: of each machine of two linked ones, of every other axis alone, and its axes."""
     models = []
     for axes in np.flatnonzero(where).reshape(-1, 2) if is_pair(target) else np.flatnonzero(where)[:, None]:
-        plants = [fitted_plant(basis, recorded, int(k))[0] for k in axes]
-        moved = two_ends(*(alone(basis, recorded, int(k)) for k in axes)) if is_pair(target) else None
+        plants = [fitted_plant(identified, recorded, int(k))[0] for k in axes]
+        moved = two_ends(*(alone(identified, recorded, int(k)) for k in axes)) if is_pair(target) else None
         if moved is not None:
             models.append((LoopModel(target.device, target.motor, plants, moved, dynamics.inertia_range), axes))
             continue
@@ -265,9 +272,9 @@ def is_pair(target: Target) -> bool:
     return target.linked and target.axes_per_machine == 2
 
 
-def alone(basis: Basis, recorded: RecordedGains | None, k: int) -> Plant:
+def alone(identified: IdentifiedAxes, recorded: RecordedGains | None, k: int) -> Plant:
     """Return the plant of one of two linked axes while the other one is off: it moves the whole part."""
-    plant, found = basis.identified.known(k)
+    plant, found = identified.known(k)
     fits = [found.fit]
     if recorded is not None and recorded.response is not None and not recorded.unseen[k]:
         fits.append(recorded.response.fits[k])

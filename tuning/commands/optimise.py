@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +15,11 @@ from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
     DriveOptions,
+    DynamicsOption,
     Json,
     Resume,
     Workers,
+    asked_dynamics,
     check_machines,
     check_seed,
     errors_as_exit_codes,
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     from tuning.search.optimise import Settings
 
 MOST_SEARCHES = 10_000
+OUTER_LOOPS, MARGINS = ("velocity", "position"), ("phase_deg", "gain_db", "ms")  # of `Optimised.margins`
 
 
 def _from_file(context: typer.Context, path: Path | None) -> Path | None:
@@ -54,6 +58,7 @@ def optimise(
             help="settings.toml of a search, which is repeated; other options replace what it says.",
         ),
     ] = None,
+    dynamics: DynamicsOption = None,
     sampler: Annotated[str, typer.Option(help="random, grid, tpe, cmaes or gp.")] = "tpe",
     trials: Annotated[int, typer.Option(help="Trials of the search; each takes 0.75 s of drive time.")] = 30,
     objectives: Annotated[
@@ -107,6 +112,8 @@ def optimise(
 ) -> None:
     """Search gains by trials: a move, its reversal, and the move with more gain, with a cost from the drive's signals.
 
+    The axes are identified first. Gains that break the dynamics by the model of their axis are not tried.
+
     An axis that oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best
     gains. Writes trials.csv, trials.png and settings.toml, with which `drive-tune optimise --config settings.toml`
     repeats the search (files of your own are copied to inputs/ beside it), and on a bus OUT-before.toml, with which
@@ -134,11 +141,13 @@ def optimise(
         if resume:
             _check_unfinished(folder, journal)
         provenance.check_folder(folder)
+        from drive_env.gains import has_linear_model
         from drive_env.trials.method import check_tried
 
         device = find_device(drive.device)
         searched = tuple(gains) if gains else device.gains.outer
         check_tried(device, searched)  # before anything moves
+        asked = asked_dynamics(dynamics, drive.device)
         settings = Settings(
             sampler=sampler,
             trials=trials,
@@ -148,6 +157,7 @@ def optimise(
             seed=drive.seed,
             journal=journal,
             subject=_subject(drive),
+            dynamics=asked.name if has_linear_model(device) else None,
             **({} if width is None else {"width": width}),
         )
         if drive.bus:
@@ -320,6 +330,7 @@ def _report(
         print_json(
             {
                 "gains": found.gains.tolist(), "rule": found.rule.tolist(), "cost": found.cost.tolist(),
+                "margins": [_as_dicts(axis) for axis in found.margins.tolist()], "untried": found.untried,
                 "drive_seconds": found.drive_seconds, "aborts": int(found.aborts.sum()), "notes": list(found.notes),
                 "settings": asdict(settings), "machine": as_kept(options), "folder": str(folder),
                 "before": str(before) if before else None,
@@ -352,7 +363,9 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         own = [row for row in found.rows if row.search == search]
         rows = []
         if own:
+            rule = found.rule[search * axes : (search + 1) * axes]
             first = "safe start" if settings.safe else "the rule"
+            first = first if settings.safe or np.array_equal(own[0].gains, rule) else "slower rule"
             rows += _cells(first, numbers, own[0].gains, _told(own[0], shown, found.t_0))
         for row in found.front(settings.objectives, search)[:10] if several else []:
             rows += _cells(f"trial {row.number}", numbers, row.gains, _told(row, shown, found.t_0))
@@ -364,18 +377,49 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         print_table(columns, rows, title + ", with the Pareto front of the trials" * several)
     stopped = sum(row.aborted for row in found.rows)
     lines = [f"{len(found.rows)} trials, {stopped} of them stopped, in {found.drive_seconds:.1f} s of drive time."]
+    if settings.dynamics is not None:
+        lines.append(
+            f"{found.untried} more gains were not tried: they break {settings.dynamics} dynamics by the model."
+        )
+        axes_told = (
+            [f"axis {k}" for k in axis_numbers(options, len(found.gains))]
+            if before is not None or len(searches) == 1
+            else [f"search {search}, axis {k}" for search in searches for k in numbers]
+        )
+        lines += _margins_by_model(found, axes_told)
     for row in found.rows:
         if row.cause:
             which = f"search {row.search}, trial" if len(searches) > 1 else "trial"
             lines.append(f"{which} {row.number} was stopped: the drive reported {row.cause}")
     lines += sorted({note for note in found.notes if note})
     lines += _what_counts(device, settings.gains)
-    if before is None and len(searches) > 1 and np.isfinite(found.cost).any():
-        lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")
+    accepted = [row for row in found.rows if row.accepted]
+    if before is None and len(searches) > 1 and accepted:
+        lines.append(f"search {min(accepted, key=lambda row: row.robust_cost).search} found the best gains")
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")
     if before is not None:
         lines.append(f"drive-tune undo {before} restores the drives' state before")
     print_lines(lines)
+
+
+def _margins_by_model(found: Any, axes: Sequence[str]) -> list[str]:
+    """Return the margins of the outer loops with the best gains, for people; `axes` is what each axis is called."""
+    lines = []
+    for where, axis in zip(axes, found.margins.tolist(), strict=True):
+        told = [
+            f"{name} loop {phase:.0f}°, {gain:.1f} dB, Ms {ms:.1f}"
+            for name, (phase, gain, ms) in zip(OUTER_LOOPS, axis, strict=True)
+        ]
+        lines.append(f"{where}: by the identified model, not measured: {'; '.join(told)}")
+    return lines
+
+
+def _as_dicts(axis: list[list[float]]) -> dict[str, dict[str, float | None]]:
+    """Return the margins of an axis by the model, for JSON."""
+    return {
+        loop: {name: value if math.isfinite(value) else None for name, value in zip(MARGINS, values, strict=True)}
+        for loop, values in zip(OUTER_LOOPS, axis, strict=True)
+    }
 
 
 def _what_counts(device: str, gains: tuple[str, ...] | None) -> list[str]:

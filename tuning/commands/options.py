@@ -361,7 +361,8 @@ def asked_dynamics(dynamics: str | None, device: str, inertia_range: str | None 
     """Return the dynamics that options ask for, standard ones by default.
 
     Raises:
-        ValueError: For dynamics that do not exist, or any that are asked of a drive without a linear model.
+        ValueError: For dynamics that do not exist, or any that are asked of a drive without a linear model, as of a
+            stepper.
     """
     from drive_env.devices import find_device
     from drive_env.gains import has_linear_model

@@ -3,6 +3,9 @@
 Optimisers search the logarithms of gains around the baseline rule's, each machine separately or, where the emulated
 machines are copies of one machine, in one search whose generation they try at the same time. The safe search starts at
 gains that are slow and proved, goes on from what has been proved in small steps, and never beyond what oscillated.
+
+Where dynamics are asked for, the axes are identified first, and a drive gets no gains that break them by the model of
+its axes: the sampler is told their robust cost (drive_env/trials/score.py) by how far they are from keeping them.
 """
 
 from __future__ import annotations
@@ -17,11 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.gains import RAW_MAX, write_gains
+from drive_env.gains import RAW_MAX, check_linear_model, write_gains
+from drive_env.loops.dynamics import find_dynamics
 from drive_env.trials.method import check_tried
 from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
 from drive_env.trials.positioning import wrapped
+from drive_env.trials.score import TRIP, robust_cost
 from tuning.runs.shard_log import ShardLog
+from tuning.search.model_margins import ModelMargins, here
 from tuning.search.samplers import SAMPLERS, Proposer, Study, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
 from tuning.search.trial_log import LoggedTrials
@@ -37,6 +43,8 @@ SAFE_STARTS = 3  # times that the safe gains are halved before the search gives 
 SAFE_HALVINGS = 3  # of a step that would lead to what oscillated, before it is not taken at all
 PULLED = 0.2  # what a point costs per unit of the way that the safe search held it back
 SHUNNED = 1.0  # and what a stopped trial costs the safe search besides
+UNTRIED = 20  # proposals for each trial that may break the dynamics before the search ends
+SLOWER = 6  # times that gains to start from are halved until they keep the dynamics
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class Settings:
         seed: Of everything random.
         journal: File of Optuna's journal, in which the search is kept and from which it goes on.
         subject: What is searched, as text: a journal of something else is refused.
+        dynamics: What the outer loops must keep by their model, as `find_dynamics` takes it; None asks for nothing.
     """
 
     sampler: str = "tpe"
@@ -65,10 +74,13 @@ class Settings:
     seed: int = 0
     journal: Path | None = None
     subject: str = ""
+    dynamics: str | None = None
 
     def __post_init__(self) -> None:
         _check("sampler", [self.sampler], SAMPLERS)
         _check("objective", self.objectives, (COST, *OBJECTIVES))
+        if self.dynamics is not None:
+            find_dynamics(self.dynamics)
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.width <= math.log(RAW_MAX):
@@ -85,6 +97,8 @@ class TrialRow(NamedTuple):
     aborted: Stopped, since it oscillated or went into fault. fragile: Not kept, since with these gains the axis did not
         stop oscillating after a disturbance.
     cause: Emergencies of the drives in a trial that was stopped; "" if there were none.
+    slack: How far the gains keep the dynamics by the model, relative, 0 where they just do; infinite if none were
+        asked for.
     """
 
     search: int
@@ -95,6 +109,15 @@ class TrialRow(NamedTuple):
     aborted: bool
     fragile: bool = False
     cause: str = ""
+    slack: float = math.inf
+
+    @property
+    def robust_cost(self) -> float:
+        """The logarithm of the robust cost by J and slack, which goes on where J comes to its end."""
+        if math.isinf(self.slack):
+            return self.cost
+        judged = robust_cost(np.exp(self.cost), np.array(self.slack))
+        return math.log(float(judged)) + max(self.cost - math.log(TRIP), 0.0)
 
     @property
     def accepted(self) -> bool:
@@ -108,6 +131,7 @@ class Optimised:
 
     Attributes:
         gains: The best of every machine, raw integers, (num_axes, count); that of the safe search was never stopped.
+            Where dynamics were asked for and no trial was accepted, those of before.
         rule: The baseline rule's, from what was identified, (num_axes, count).
         cost: ln J by measured terms of the best, (num_machines,).
         rows: Every trial, in order.
@@ -115,6 +139,9 @@ class Optimised:
         moves, aborts: Of every axis, (num_axes,).
         notes: What was in the way, of every machine; "" for nothing.
         t_0: What the objective speed tells settling times over [s].
+        untried: Proposals that broke the dynamics by the model, which no drive got.
+        margins: Of the gains by the model: phase margin [degrees], gain margin [dB] and Ms of velocity and position
+            loop, (num_axes, 2, 3); nan where no dynamics were asked for.
     """
 
     gains: Integers
@@ -126,6 +153,8 @@ class Optimised:
     aborts: Integers
     notes: tuple[str, ...]
     t_0: float
+    untried: int
+    margins: Floats
 
     def front(self, objectives: Sequence[str], search: int = 0) -> list[TrialRow]:
         """Return the accepted trials of a search that no other of them beats in every objective."""
@@ -153,7 +182,8 @@ def optimise(
 
     Raises:
         ValueError: For a gain that the device does not have, or a sampler that lacks a package or does not take several
-            objectives.
+            objectives; or if dynamics are asked of a drive without a linear model.
+        RuntimeError: If dynamics are asked for, and an axis cannot be identified.
         ShardLogError: If the log is of another search.
     """
     if log is not None and (not anew or settings.journal is not None):
@@ -163,20 +193,31 @@ def optimise(
     chosen = target.device.gains.outer if settings.gains is None else settings.gains
     check_tried(target.device, chosen)  # before anything moves
     columns = target.device.gains.columns(chosen)
+    if settings.dynamics is not None:
+        check_linear_model(target.device)
     with timed(target) as (watched, clock):
+        known = None
+        if settings.dynamics is not None:
+            began = target.drives.read(cia402.POSITION_ACTUAL)
+            # Copies of one machine are known by the first one.
+            where = np.arange(target.num_axes) < (target.axes_per_machine if shared else target.num_axes)
+            known = ModelMargins(watched, find_dynamics(settings.dynamics), where)
+            watched = watched if anew else here(watched, began)
         bench = TrialBench(watched, anew=anew, gains=chosen)
         load(settings.sampler)
         bench.identify()
-        search = _Search(bench, settings, columns, shared, bench if log is None else LoggedTrials(bench, clock, log))
+        trials = bench if log is None else LoggedTrials(bench, clock, log)
+        search = _Search(bench, settings, columns, shared, trials, known)
         while search.generation():
             progress(search.share())
         gains, cost = search.best()
         if isinstance(bench.trials, PidTrials):
             search.tell_of_swings(gains)
         bench.leave(gains)
+    margins = np.full((len(gains), 2, 3), np.nan) if known is None else known.margins(gains)
     return Optimised(
         gains, bench.rule, cost, search.judged(), clock.seconds, bench.moves, bench.aborts, tuple(search.notes),
-        bench.t_0,
+        bench.t_0, sum(search.untried), margins,
     )  # fmt: skip
 
 
@@ -194,15 +235,18 @@ class _Search:
         columns: Integers,
         shared: bool,
         trials: TrialBench | LoggedTrials,
+        known: ModelMargins | None = None,
     ) -> None:
         machines, axes = bench.num_machines, bench.target.axes_per_machine
         self.rows: list[TrialRow] = []
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
-        self._columns = columns
+        self._columns, self._known = columns, known
         # Machines of a search: they are its generation.
         self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
-        self._start = self._points(bench.safe if settings.safe else bench.rule)
+        self.untried = [0] * len(self._members)
+        start = self._points(bench.safe if settings.safe else bench.rule)
+        self._start = [self._slowed(k, start[members[0]]) for k, members in enumerate(self._members)]
         self._proved: list[list[Floats]] = [[] for _ in self._members]
         self._refuted: list[list[Floats]] = [[] for _ in self._members]
         self._fragile: list[set[bytes]] = [set() for _ in self._members]
@@ -211,41 +255,63 @@ class _Search:
         self._proposers = [self._proposer(k) for k in range(len(self._members))]
         for k, proposer in enumerate(self._proposers):
             for fact in proposer.history():
-                self._take(k, np.array(fact["point"]), _row(k, fact))
+                row = _row(k, fact)
+                if row.slack > 0.0:
+                    self._take(k, np.array(fact["point"]), row)
+                else:
+                    self.untried[k] += 1
         if settings.safe:
             self._prove()
 
     def generation(self) -> bool:
         """Try a generation; return whether there was anything left to try."""
-        asked = {}
+        asked, held, slack = {}, {}, {}
         for k, members in enumerate(self._members):
-            left = self._settings.trials - self._proposers[k].told
-            if left > 0 and not self._halted[k] and (points := self._proposers[k].ask(min(len(members), left))):
-                asked[k] = points
+            while (left := self._settings.trials - self._made(k)) > 0 and not self._halted[k]:
+                points = self._proposers[k].ask(min(len(members), left))
+                own = [self._held_back(k, point) for point in points]
+                kept = [self._slack(k, place, point) for place, point in enumerate(own)]
+                if any(value > 0.0 for value in kept):
+                    asked[k], held[k], slack[k] = points, own, kept
+                    break
+                if not points:
+                    break
+                self._tell(k, points, own, kept)
+                if self.untried[k] >= UNTRIED * self._settings.trials:
+                    self._halted[k] = True
+                    self._note(
+                        k,
+                        f"the search ended after {self._made(k)} trials: {self.untried[k]} proposals broke "
+                        f"{self._settings.dynamics} dynamics by the model; give less width, or ask for less",
+                    )
         if not asked:
             return False
-        held = {k: [self._held_back(k, point) for point in points] for k, points in asked.items()}
-        tried, gains = self._run(held)
+        tried, gains = self._run(held, slack)
         self._drop_fragile(tried)
         for k, points in asked.items():
-            self._tell(k, points, held[k], tried, gains)
+            self._tell(k, points, held[k], slack[k], (tried, gains))
         return True
 
     def share(self) -> float:
         """Return the share of the trials that is done."""
-        told = [proposer.told for proposer, halted in zip(self._proposers, self._halted, strict=True) if not halted]
-        return min(told) / self._settings.trials if told else 1.0
+        made = [self._made(k) for k, halted in enumerate(self._halted) if not halted]
+        return min(made) / self._settings.trials if made else 1.0
 
     def best(self) -> tuple[Integers, Floats]:
         """Return the best gains of every machine, (num_axes, count), and what they cost, (num_machines,)."""
         bench = self._bench
-        gains = (bench.safe if self._settings.safe else bench.rule).copy()
+        start = bench.safe if self._settings.safe else bench.rule
+        gains = (start if self._known is None else self._known.before).copy()
         cost = np.full(bench.num_machines, np.nan)
         for k, members in enumerate(self._members):
             row = self._best_row(k)
             for machine in members:
                 if row is not None:
                     gains[self._axes_of(machine)], cost[machine] = row.gains, row.cost
+            if row is None and self._known is not None:
+                asked = f"{self._settings.dynamics} dynamics"
+                none = f"no gains keep {asked} and pass a trial: the drives keep those of before"
+                self._note(k, "; ".join(filter(None, (self.notes[members[0]], none))))
         return gains, cost
 
     def tell_of_swings(self, gains: Integers) -> None:
@@ -279,40 +345,63 @@ class _Search:
         unstopped = self._unstopped(k)
         if not unstopped:
             rows = [row for row in self.rows if row.search == k]
-            if rows and not self._settings.safe:
+            if rows and not self._settings.safe and self._known is None:
                 self._note(k, "every trial was stopped; these are the gains of least cost")
-                return min(rows, key=lambda row: row.cost)
+                return min(rows, key=lambda row: row.robust_cost)
             return None
-        return min(pareto(unstopped, self._settings.objectives), key=lambda row: row.cost)
+        return min(pareto(unstopped, self._settings.objectives), key=lambda row: row.robust_cost)
 
     # --- a generation -------------------------------------------------------------------------------------------------
-    def _run(self, held: dict[int, list[Floats]]) -> tuple[Tried, Integers]:
-        """Try points of the searches, each in a machine of its own."""
+    def _run(self, held: dict[int, list[Floats]], slack: dict[int, list[float]]) -> tuple[Tried, Integers]:
+        """Try points of the searches that keep the dynamics, each in a machine of its own."""
         gains, where = self._bench.incumbent.copy(), np.zeros(self._bench.num_machines, bool)
         for k, points in held.items():
-            for machine, point in zip(self._members[k], points, strict=False):
-                gains[self._axes_of(machine)] = self._gains(machine, point)
-                where[machine] = True
+            for machine, point, kept in zip(self._members[k], points, slack[k], strict=False):
+                if kept > 0.0:
+                    gains[self._axes_of(machine)] = self._gains(machine, point)
+                    where[machine] = True
         return self._trials.run(gains, where), gains
 
-    def _tell(self, k: int, asked: list[Floats], held: list[Floats], tried: Tried, gains: Integers) -> None:
-        values, facts = [], []
-        for place, (point, own) in enumerate(zip(asked, held, strict=True)):
+    def _tell(
+        self,
+        k: int,
+        asked: list[Floats],
+        held: list[Floats],
+        slack: list[float],
+        run: tuple[Tried, Integers] | None = None,
+    ) -> None:
+        """Tell a sampler what its proposals are worth; only what keeps the dynamics was run."""
+        values, facts, made, untried = [], [], self._made(k), 0
+        for place, (point, own, kept) in enumerate(zip(asked, held, slack, strict=True)):
             machine = int(self._members[k][place])
-            row = TrialRow(
-                k,
-                self._proposers[k].told + place,
-                gains[self._axes_of(machine)].copy(),
-                float(tried.cost[machine]),
-                tuple(map(float, tried.objectives[machine])),
-                bool(tried.aborted[machine]),
-                cause=str(tried.causes[machine]) if tried.aborted[machine] else "",
-            )
-            self._take(k, own, row)
+            if kept > 0.0:
+                assert run is not None, "what keeps the dynamics is tried"
+                tried, gains = run
+                row = TrialRow(
+                    k,
+                    made + place - untried,
+                    gains[self._axes_of(machine)].copy(),
+                    float(tried.cost[machine]),
+                    tuple(map(float, tried.objectives[machine])),
+                    bool(tried.aborted[machine]),
+                    cause=str(tried.causes[machine]) if tried.aborted[machine] else "",
+                    slack=kept,
+                )
+                self._take(k, own, row)
+            else:
+                row = TrialRow(
+                    k, -1, self._gains(machine, own), math.log(TRIP), self._bench.worst, aborted=False, slack=kept
+                )
+                untried += 1
             pulled = PULLED * float(np.abs(point - own).max()) + SHUNNED * (self._settings.safe and row.aborted)
             values.append([value + pulled for value in objective_values(row, self._settings.objectives)])
             facts.append({"point": own.tolist()} | {**row._asdict(), "gains": row.gains.tolist()})
         self._proposers[k].tell(values, facts)
+        self.untried[k] += untried
+
+    def _made(self, k: int) -> int:
+        """Return how many trials of a search were made."""
+        return self._proposers[k].told - self.untried[k]
 
     def _drop_fragile(self, tried: Tried) -> None:
         """Forget the last good gains where they could not end an oscillation; those before them are the last good."""
@@ -320,9 +409,9 @@ class _Search:
             for machine in map(int, members[tried.fragile[members]]):
                 axes = self._axes_of(machine)
                 self._fragile[k].add(self._bench.incumbent[axes].tobytes())
-                left = min(self._unstopped(k), key=lambda row: row.cost, default=None)
+                left = min(self._unstopped(k), key=lambda row: row.robust_cost, default=None)
                 self._bench.incumbent[axes] = self._bench.safe[axes] if left is None else left.gains
-                self._least[machine] = np.inf if left is None else left.cost
+                self._least[machine] = np.inf if left is None else left.robust_cost
                 self._note(
                     k,
                     "gains that passed a trial were not kept: the axis did not stop oscillating with them "
@@ -342,23 +431,28 @@ class _Search:
         self.rows.append(row)
         (self._refuted if row.aborted else self._proved)[k].append(point)
         for machine in map(int, self._members[k]):
-            if not row.aborted and row.cost < self._least[machine]:
-                self._least[machine] = row.cost
+            if not row.aborted and row.robust_cost < self._least[machine]:
+                self._least[machine] = row.robust_cost
                 self._bench.incumbent[self._axes_of(machine)] = row.gains
 
     # --- the safe search ----------------------------------------------------------------------------------------------
     def _prove(self) -> None:
         """Try the safe gains first, slower ones where they are not, and give a machine up that shakes with those."""
         searches = [k for k in range(len(self._members)) if not self._proved[k]]
-        point = {k: self._start[self._members[k][0]] for k in searches}
+        point = {k: self._start[k] for k in searches}
         for _ in range(SAFE_STARTS):
+            slack = {k: [self._slack(k, 0, point[k])] for k in searches}
+            for k in [k for k in searches if slack[k][0] <= 0.0]:
+                self._halted[k] = True
+                searches.remove(k)
+                self._note(k, f"no slow gains keep {self._settings.dynamics} dynamics by the model: no safe start")
             if not searches:
                 return
             for k in searches:
                 self._proposers[k].ask(1)
-            tried, gains = self._run({k: [point[k]] for k in searches})
+            run = self._run({k: [point[k]] for k in searches}, slack)
             for k in searches:
-                self._tell(k, [point[k]], [point[k]], tried, gains)
+                self._tell(k, [point[k]], [point[k]], slack[k], run)
             searches = [k for k in searches if not self._proved[k]]
             for k in searches:
                 point[k] = point[k] - self._bench.method.caution * math.log(2.0)
@@ -391,7 +485,7 @@ class _Search:
 
     # --- points and gains ---------------------------------------------------------------------------------------------
     def _proposer(self, k: int) -> Proposer:
-        settings, start = self._settings, self._start[self._members[k][0]]
+        settings, start = self._settings, self._start[k]
         low = np.minimum(np.full(start.shape, -settings.width), start)
         return new_proposer(
             settings.sampler,
@@ -403,8 +497,22 @@ class _Search:
             first=[start],
             generation=len(self._members[k]),
             journal=settings.journal,
-            study=Study(f"machine {k}", f"{settings.subject}\n{settings.gains} {settings.objectives}"),
+            study=Study(
+                f"machine {k}", f"{settings.subject}\n{settings.gains} {settings.objectives} {settings.dynamics}"
+            ),
         )
+
+    def _slack(self, k: int, place: int, point: Floats) -> float:
+        """Return how far gains at a point, of a machine of a search by its place, keep the dynamics by the model."""
+        if self._known is None:
+            return math.inf
+        members = self._members[k]
+        return self._known.slack(self._gains(int(members[place]), point), self._axes_of(members[0]))
+
+    def _slowed(self, k: int, point: Floats) -> Floats:
+        """Return a point to start from: with gains halved until they keep the dynamics, or as it is if none do."""
+        slower = (point - step * math.log(2.0) for step in range(SLOWER))
+        return next((one for one in slower if self._slack(k, 0, one) > 0.0), point)
 
     def _points(self, gains: Integers) -> Floats:
         """Return gains as points of the machines, (num_machines, dimensions)."""
@@ -436,7 +544,10 @@ def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow
 
 def objective_values(row: TrialRow, objectives: Sequence[str]) -> tuple[float, ...]:
     """Return what a trial is worth in each objective, less is better."""
-    return tuple(row.cost if name == COST else row.objectives[OBJECTIVES.index(name)] for name in objectives)
+    broken = math.log(2.0 - math.exp(min(row.slack, 0.0)))  # as the robust cost counts it
+    return tuple(
+        row.robust_cost if name == COST else row.objectives[OBJECTIVES.index(name)] + broken for name in objectives
+    )
 
 
 def _row(search: int, fact: Mapping[str, Any]) -> TrialRow:
@@ -449,6 +560,7 @@ def _row(search: int, fact: Mapping[str, Any]) -> TrialRow:
         tuple(fact["objectives"]),
         bool(fact["aborted"]),
         cause=str(fact.get("cause", "")),
+        slack=float(fact.get("slack", math.inf)),
     )
 
 

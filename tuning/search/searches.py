@@ -123,6 +123,8 @@ def joined(found: list[Optimised]) -> Optimised:
         np.concatenate([one.aborts for one in found]),
         tuple(note for one in found for note in one.notes),
         found[0].t_0,
+        sum(one.untried for one in found),
+        np.concatenate([one.margins for one in found]),
     )
 
 
@@ -145,11 +147,14 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
         "aborted": np.array([row.aborted for row in rows], bool),
         "fragile": np.array([row.fragile for row in rows], bool),
         "cause": np.array([row.cause for row in rows], np.str_),
+        "slack": np.array([row.slack for row in rows], float),
         "drive_seconds": np.array(found.drive_seconds),
         "moves": found.moves,
         "aborts": found.aborts,
         "notes": np.array(found.notes[:1]),
         "t_0": np.array(found.t_0),
+        "untried": np.array(found.untried),
+        "margins": found.margins[:axes],
     }
 
 
@@ -171,9 +176,13 @@ def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
             bool(aborted),
             bool(fragile),
             str(cause),
+            float(slack),
         )
-        for number, gains, cost, objectives, aborted, fragile, cause in zip(
-            *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted", "fragile", "cause")),
+        for number, gains, cost, objectives, aborted, fragile, cause, slack in zip(
+            *(
+                arrays[name]
+                for name in ("number", "tried", "costs", "objectives", "aborted", "fragile", "cause", "slack")
+            ),
             strict=True,
         )
     )
@@ -187,6 +196,8 @@ def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
         arrays["aborts"],
         tuple(map(str, arrays["notes"])),
         float(arrays["t_0"]),
+        int(arrays["untried"]),
+        arrays["margins"],
     )
 
 

@@ -16,7 +16,7 @@ from drive_env.devices import find_device
 from drive_env.whole_file import write_picture, write_whole
 from mechanics.untrusted import read_toml
 from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, write_inputs
-from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
+from tuning.search.optimise import COST, Optimised, Settings, TrialRow, pareto
 from tuning.search.trial_bench import OBJECTIVES
 from tuning.toml_tables import check_keys, toml
 
@@ -48,7 +48,7 @@ PID_MEANINGS = MEANINGS | {
 }
 
 HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
-_SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
+_SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed", "dynamics")
 _MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "copies", "searches", "interface", "channel",
             "nodes", "bitrate", "lockstep", "pace")  # fmt: skip
 
@@ -82,12 +82,14 @@ def save(
             "stopped",
             "fragile",
             "cause",
+            "slack",
         ]
     )
     for row in found.rows:
         values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
         for axis, gains in zip(axis_numbers(machine, len(row.gains)), row.gains.tolist(), strict=True):
-            writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile, row.cause])
+            writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile, row.cause,
+                             "" if math.isinf(row.slack) else f"{row.slack:.4g}"])  # fmt: skip
     write_whole(folder / "trials.csv", table.getvalue())
     lines = _lines({name: getattr(settings, name) for name in _SEARCH})
     if settings.journal is not None:
@@ -122,8 +124,8 @@ def is_tried_by_pid(device: str, gains: tuple[str, ...] | None) -> bool:
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
     """Return what a trial reached in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
     scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
-    values = zip(objectives, objective_values(row, objectives), strict=True)
-    return [scales[name] * math.exp(value) if name in scales else value for name, value in values]
+    told = dict(zip((COST, *OBJECTIVES), (row.cost, *row.objectives), strict=True))
+    return [scales[name] * math.exp(told[name]) if name in scales else told[name] for name in objectives]
 
 
 def load_options(path: str | Path) -> dict[str, Any]:
@@ -237,7 +239,10 @@ def _scale(axis: Any, set_scale: Any, name: str) -> None:
 
 def _draw_best(axes: Any, rows: list[TrialRow], values: list[float], label: str | None) -> None:
     """Draw what a search had found by each of its trials, of those that were accepted."""
-    accepted = [value if row.accepted else np.inf for row, value in zip(rows, values, strict=True)]
-    best = np.minimum.accumulate(accepted)
-    axes.step([row.number for row in rows], np.where(np.isfinite(best), best, np.nan), where="post", color=FRONT,
+    least, best, shown = math.inf, [], math.nan
+    for row, value in zip(rows, values, strict=True):
+        if row.accepted and row.robust_cost < least:
+            least, shown = row.robust_cost, value
+        best.append(shown)
+    axes.step([row.number for row in rows], best, where="post", color=FRONT,
               linewidth=1.2, alpha=0.8, label=label)  # fmt: skip

@@ -1,0 +1,99 @@
+"""What a search knows of margins: models of identified axes, by which gains are judged before a drive has them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.drives.interface import axis_number
+from drive_env.gains import read_gains
+from drive_env.loops.linear_model import Plant
+from drive_env.safety.envelope import swinging_allowed
+from drive_env.trials.positioning import wrapped
+from tuning.auto.checks import wrong_wiring
+from tuning.auto.loop_model import loop_models
+from tuning.auto.stages import IdentifiedAxes
+from tuning.identify.quick_identification import identify_briefly
+
+if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+class ModelMargins:
+    """The loops of machines, by the models of their axes.
+
+    Args:
+        target: Its drives; they are identified here, which takes about four seconds of drive time for each axis of a
+            machine.
+        dynamics: What the loops must keep.
+        where: Axes of whole machines, (num_axes,); the others are not known.
+
+    Attributes:
+        before: Raw gains that the drives had, (num_axes, count).
+
+    Raises:
+        RuntimeError: If an axis cannot be identified, or is not wired as it should be.
+    """
+
+    def __init__(self, target: Target, dynamics: Dynamics, where: Mask) -> None:
+        self.dynamics = dynamics
+        self.before = read_gains(target.drives)
+        with swinging_allowed(target.drives):
+            found = identify_briefly(target, where)
+        plants: list[Plant | None] = [None] * target.num_axes
+        for k in map(int, np.flatnonzero(where)):
+            wrong = wrong_wiring(target, found[k])
+            try:
+                plants[k] = Plant.from_identification(target.device, target.motor, float(target.supply[k]), found[k])
+            except ValueError as error:
+                wrong = wrong or str(error)
+            if wrong:
+                number = axis_number(target.drives, k)
+                raise RuntimeError(f"axis {number}: no margins can be kept without a model of its loops: {wrong}")
+        identified = IdentifiedAxes(tuple(found), tuple(plants))
+        self._models = loop_models(target, identified, None, where, dynamics)
+
+    def slack(self, gains: Integers, axes: slice) -> float:
+        """Return how far a machine keeps the dynamics, relative: 0 where a constraint is just kept.
+
+        Args:
+            gains: Raw, of its axes, (axes_per_machine, count).
+            axes: Which they are.
+        """
+        return min(float(model.slack(self.dynamics, gains[None, own - axes.start])[0])
+                   for model, own in self._models if axes.start <= own[0] < axes.stop)  # fmt: skip
+
+    def margins(self, gains: Integers) -> Floats:
+        """Return phase margin [degrees], gain margin [dB] and Ms of the velocity and of the position loop.
+
+        Args:
+            gains: Raw, (num_axes, count).
+
+        Returns:
+            Shape (num_axes, 2, 3); nan for an axis that is not known.
+        """
+        found = np.full((len(gains), 2, 3), np.nan)
+        for model, own in self._models:
+            for k, loops in zip(own, model.margins(gains[own]), strict=True):
+                found[k] = [(one.phase_deg, one.gain_db, one.ms) for one in loops.values()]
+        return found
+
+
+def here(target: Target, began: Integers) -> Target:
+    """Return the target with the travel that is left where the rotors are now.
+
+    Args:
+        target: Its travel counts from where the rotors began.
+        began: Where that was [inc], (num_axes,).
+    """
+    gone = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - began) / target.increments()
+    return replace(target, low=np.minimum(target.low - gone, 0.0), high=np.maximum(target.high - gone, 0.0))
