@@ -54,7 +54,7 @@ def test_figures_of_the_worked_example_are_those_of_the_page():
     rows = {row[0]: row[1:] for row in cells if len(row) == 4}
     found = PICTURES.worked_example()
     digits = {
-        "t_s / t_0": ("settling", "{:.2f}"), "E_d / E_0": ("disturbance", "{:.2f}"), "n": ("noise", "{:.2%}"),
+        "t_s / t_0": ("settling", "{:.2f}"), "E_d / E_0": ("disturbance", "{:.4f}"), "n": ("noise", "{:.2%}"),
         "os": ("overshoot", "{:.2%}"), "J of the machine": ("nominal", "{:.2f}"), "robust cost": ("robust", "{:.2f}"),
         "J, load inertia x 2": ("load inertia x 2", "{:.2f}"),
         "J, load inertia x 0.5": ("load inertia x 0.5", "{:.2f}"),

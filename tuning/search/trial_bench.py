@@ -40,6 +40,7 @@ Mask = NDArray[np.bool_]
 MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
 CALM = 0.1  # s until what an axis did before has died away
 ASTRAY = 0.2  # of the move: an axis farther than that from where a trial starts is brought back first
+MOST_WAITING = 8  # times as long as a trial, at most, until it is back
 SOFTENINGS = 3  # of gains from the data sheet, with which an axis may oscillate
 MOST_STOPS = 3  # by the safety envelope, one trial after the other, before the search ends
 BEYOND = 0.1  # how fast the cost grows where J has come to its end
@@ -301,18 +302,27 @@ class TrialBench:
     def _return(self, axes: Mask) -> None:
         """Bring axes back with the incumbent that are not where the next trial starts: one tripped, and fell or ran."""
         drives = self.target.drives
-        way = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
-        astray = axes & (way > ASTRAY * np.maximum(np.abs(self.move.distance), 1))
+        astray = self._astray(axes)
         if not astray.any():
             return
         write_gains(drives, self.incumbent, astray)
         write_profile(drives, self.move, astray)
         self._trials.go(self._origin, astray)
-        # The ramp takes at most as long as the farthest way at the profile's speed, and a trial's time.
+        # The ramp takes at most as long as the farthest way at its speed; slow gains then creep against friction.
+        way = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
         longest = np.max(way / self.move.velocity, where=astray, initial=0.0)
-        drives.advance((TRIAL + math.ceil(longest / CYCLE)) * CYCLE)
+        drives.advance(math.ceil(longest / CYCLE) * CYCLE)
+        for _ in range(MOST_WAITING):
+            drives.advance(TRIAL * CYCLE)
+            if not self._astray(astray).any():
+                break
         self.moves[astray] += 1
         self._trials.recover(astray)
+
+    def _astray(self, axes: Mask) -> Mask:
+        """Return which of the axes are too far from where the next trial starts, (num_axes,)."""
+        way = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin))
+        return np.asarray(axes & (way > ASTRAY * np.maximum(np.abs(self.move.distance), 1)))
 
 
 def first_gains(target: Target) -> Integers:
