@@ -57,7 +57,7 @@ def lines(text):
 def test_it_is_short_and_begins_with_the_two_commands_and_a_picture():
     assert len(README.splitlines()) <= 150
     first, second = SHELLS[:2]
-    assert "pip install" in first and "drive-agent tune" in first
+    assert "pip install" in first and "drive-tune auto" in first
     assert "pip install" in second and "pytest" in second
     (picture,) = re.findall(r"!\[.+\]\((.+)\)", README)
     assert (ROOT / picture).is_file()
