@@ -56,7 +56,7 @@ def on_drawn_machines(device, motor, load="inertia", count=6, velocity_filter=SH
         )
         score = RobustScore(device, load, motor, count, num_threads=1)
         score.set_machines(machine.parameters, machine.supply)
-    slack = score.loop_slack(raw, np.ones(count, bool))
+    slack = score.loop_slack(raw)
     score.close()
     return Found(*margins, clearance, overshoot, slack)
 

@@ -211,7 +211,7 @@ FOUND = SimpleNamespace(
     t_0=0.01,
     rows=[
         trial(0, math.log(2.0), objectives=(math.log(3.0), 0.0, 0.125)),
-        TrialRow(1, 4, np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]]), 0.0, (0.0, 0.0, 0.0), True, False, "stall"),
+        TrialRow(1, 4, np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]]), 0.0, (0.0, 0.0, 0.0), True, False, "stall", 0.25),
         trial(2, 0.0, fragile=True),
     ],
 )
@@ -230,11 +230,11 @@ def test_the_table_has_a_row_for_each_axis_of_each_trial(written):
     rows = list(csv.reader((written / "trials.csv").read_text(encoding="utf-8").splitlines()))
     assert rows == [
         ["search", "trial", "axis", "torque_p", "torque_i", "velocity_p", "velocity_i", "position_p", "J",
-         "settles [ms]", "worst J over J", "ripple [%]", "stopped", "fragile", "cause"],
-        ["0", "0", "0", *["100"] * 5, "2", "30", "1", "0.125", "False", "False", ""],
-        ["1", "4", "0", "1", "2", "3", "4", "5", "1", "10", "1", "0", "True", "False", "stall"],
-        ["1", "4", "1", "6", "7", "8", "9", "10", "1", "10", "1", "0", "True", "False", "stall"],
-        ["0", "2", "0", *["100"] * 5, "1", "10", "1", "0", "False", "True", ""],
+         "settles [ms]", "worst J over J", "ripple [%]", "stopped", "fragile", "cause", "slack"],
+        ["0", "0", "0", *["100"] * 5, "2", "30", "1", "0.125", "False", "False", "", ""],
+        ["1", "4", "0", "1", "2", "3", "4", "5", "1", "10", "1", "0", "True", "False", "stall", "0.25"],
+        ["1", "4", "1", "6", "7", "8", "9", "10", "1", "10", "1", "0", "True", "False", "stall", "0.25"],
+        ["0", "2", "0", *["100"] * 5, "1", "10", "1", "0", "False", "True", "", ""],
     ]  # fmt: skip
 
 

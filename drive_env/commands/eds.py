@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from drive_env.commands.options import errors_as_exit_codes
+from drive_env.commands.tables import print_text
 
 
 def print_eds(
@@ -17,4 +18,4 @@ def print_eds(
     from drive_env.dictionary.entries import eds_text
 
     with errors_as_exit_codes():
-        print(eds_text(find_device(device).eds), end="")
+        print_text(eds_text(find_device(device).eds))

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from drive_env.commands.options import errors_as_exit_codes
+from drive_env.commands.tables import print_text
 
 
 def print_esi(
@@ -17,4 +18,4 @@ def print_esi(
     from drive_env.ethercat.esi import esi_text
 
     with errors_as_exit_codes():
-        print(esi_text(find_device(device)), end="")
+        print_text(esi_text(find_device(device)))

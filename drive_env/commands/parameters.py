@@ -36,7 +36,7 @@ from drive_env.commands.options import (
     scales_of,
     told_if_interrupted,
 )
-from drive_env.commands.tables import Column, print_table
+from drive_env.commands.tables import Column, print_table, print_text
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def backup(
             values = read_parameters(drives, axis)
             text = sealed(parameters_text(drives, axis, values))
         if str(file) == "-":
-            print(text, end="")
+            print_text(text)
             return
         write_whole(file, text)
         if json:

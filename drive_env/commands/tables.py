@@ -72,6 +72,20 @@ def print_names(lists: Mapping[str, Mapping[str, str]]) -> None:
         console.print()
 
 
+def print_text(text: str) -> None:
+    """Print the text of a file as it is.
+
+    Raises:
+        OSError: If it cannot be written, with the name of the output and the remedy.
+    """
+    try:
+        print(text, end="", flush=True)
+    except BrokenPipeError:  # nobody reads on, which is no mistake
+        raise
+    except OSError as error:
+        raise OSError(error.errno, f"{error.strerror}; print to where there is room", "standard output") from error
+
+
 def print_lines(lines: Iterable[str]) -> None:
     """Print lines; a terminal gets long ones broken between words, a file or another program gets them whole."""
     width = terminal_width()

@@ -348,7 +348,7 @@ class RobustScore:
         """Return scores with what the constraints make of their performance."""
         if not self._has_loops:
             return scores
-        clearance, overshoot = self._clearance(gains, np.ones(self.num_machines, bool), len(self.variants))
+        clearance, overshoot = self._clearance(gains, len(self.variants))
         slack = self.dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
         slack = np.minimum(slack, 1.0 - scores.rest[:, 0] / RESTING)
         slack = np.where(scores.terms.tripped[:, 0], TRIPPED, np.maximum(slack, TRIPPED))
@@ -356,22 +356,21 @@ class RobustScore:
             robust_cost=robust_cost(scores.performance, slack), slack=slack, clearance=clearance, overshoot=overshoot
         )
 
-    def loop_slack(self, gains: Integers, where: Mask, nominal: bool = False) -> Floats:
-        """Return by how much the loops of machines keep the margins and the overshoot, relative, (chosen machines,).
+    def loop_slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
+        """Return by how much the loops of machines keep the margins and the overshoot, relative, (num_machines,).
 
         Args:
             gains: Raw integers, (num_machines * axes, count).
-            where: Which machines, (num_machines,).
             nominal: Whether to look at the machines as they are alone, not at their variants.
         """
-        clearance, overshoot = self._clearance(gains, where, 1 if nominal else len(self.variants))
+        clearance, overshoot = self._clearance(gains, 1 if nominal else len(self.variants))
         return self.dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
 
-    def _clearance(self, gains: Integers, where: Mask, variants: int) -> tuple[Floats, Floats]:
-        """Return the clearance of chosen machines' first variants, (chosen, variants), and overshoots, (chosen,)."""
+    def _clearance(self, gains: Integers, variants: int) -> tuple[Floats, Floats]:
+        """Return the clearance of machines' first variants, (machines, variants), and overshoots, (machines,)."""
         machines, runs, axes = self._axes
         # The variants of the first run are those of all.
-        chosen = (np.arange(machines * runs) % runs < variants) & np.repeat(where, runs)
+        chosen = np.arange(machines * runs) % runs < variants
         device = self._drives.device
         raw = device.gains.with_velocity_p(self._spread(np.asarray(gains, np.int64)), self._factors)
         raw = raw.reshape(machines * runs, axes, -1)[chosen]

@@ -82,7 +82,7 @@ class Yardstick:
         """Return how far the loops keep the constraints on the machines as they are alone; infinite without a model."""
         if self._linear is None:
             return np.full(len(gains) // self.axes, np.inf)
-        return self._score.loop_slack(gains, np.ones(len(gains) // self.axes, bool), nominal=True)
+        return self._score.loop_slack(gains, nominal=True)
 
     def margins(self, gains: Integers) -> WorstMargins:
         """Return the true margins of every machine of the group, without copies; nan without a linear model."""
