@@ -13,21 +13,22 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from agents.tuner.surrogate import CONTEXT, IDENTIFIED, KEY, LAYERS, LEAST, MOST, SHOWN, Normaliser
+from agents.tuner.surrogate import ASKED, CONTEXT, IDENTIFIED, KEY, LAYERS, LEAST, MOST, SHOWN, Normaliser
 
 Array = NDArray[np.float32]
 
 HEADS, VALUE, SUMMARY, HIDDEN, HIDDEN_OF_TRIAL = 4, 24, 64, 96, 128
 REACH = (0.8, 1.0, 1.0)  # of velocity P and I and position P: gains are normalised with it
-WORST = 2.0  # of ln of the robust cost over the rule's; how much worse bad gains are does not matter
+# Of the dynamics, over their standard deviation: exact ones would tell a set of machines, and with it their load.
+BLUR = 0.5
 EPOCHS, BATCH, RATE, DECAY = 30, 128, 4e-3, 2e-3  # BATCH is of machines
 
 
 class TrialData(NamedTuple):
     """Trials of machines.
 
-    context: Shape (n, 20). gains: ln over the rule's, (n, trials, gains). shown: What they showed, (n, trials, 16).
-    worth: ln of the robust cost over the rule's, (n, trials); NaN where a machine had fewer trials than others.
+    context: Shape (n, 21). gains: ln over the rule's, (n, trials, gains). shown: What they showed, (n, trials, 16).
+    worth: ln of the robust cost, (n, trials); NaN where a machine had fewer trials than others.
     """
 
     context: Array
@@ -129,11 +130,11 @@ def _fit_one(data: TrialData, normal: Normaliser, seed: int, progress: Callable[
     count, trials, gains = data.gains.shape
     net = SurrogateNetwork(gains)
     context, shown = torch.from_numpy(normal.context(data.context)), torch.from_numpy(normal.shown(data.shown))
-    of_rule = torch.from_numpy(normal.shown(data.context[:, IDENTIFIED:]))
+    of_rule = torch.from_numpy(normal.shown(data.context[:, IDENTIFIED : IDENTIFIED + SHOWN]))
     asked = torch.from_numpy(normal.gains(data.gains))
     tried = torch.cat([torch.zeros(count, 1, gains), asked], 1)
     showed = torch.cat([of_rule[:, None], shown], 1)
-    worth, real = torch.from_numpy(np.minimum(data.worth, np.float32(WORST))), torch.from_numpy(np.isfinite(data.worth))
+    worth, real = torch.from_numpy(data.worth), torch.from_numpy(np.isfinite(data.worth))
     optimiser = torch.optim.AdamW(net.parameters(), RATE / 2.0, weight_decay=DECAY)
     steps = EPOCHS * math.ceil(count / BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
@@ -143,7 +144,9 @@ def _fit_one(data: TrialData, normal: Normaliser, seed: int, progress: Callable[
             others = torch.rand(len(rows), trials, generator=generator).argsort(1) < number
             others &= real[rows]
             known = torch.cat([torch.ones(len(rows), 1, dtype=torch.bool), others], 1)
-            told = net(context[rows], asked[rows], tried[rows], showed[rows], known)
+            blur = BLUR * torch.randn(len(rows), ASKED, generator=generator)
+            blurred = torch.cat([context[rows, :-ASKED], context[rows, -ASKED:] + blur], 1)
+            told = net(blurred, asked[rows], tried[rows], showed[rows], known)
             loss = _surprise(told[real[rows]], worth[rows][real[rows]])
             optimiser.zero_grad()
             loss.backward()

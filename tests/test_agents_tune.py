@@ -6,6 +6,7 @@ import json
 import threading
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from agents.commands.tune import _emulated_node
 from agents.policies.guard import PolicyStoppedError
 from agents.policies.policy import PolicyError, load_policy
 from agents.shipped import shipped
+from agents.tuner.open_tuner import open_tuner
 from agents.tuner.tune_target import surrogate, tune_target
 from agents.tuner.tuning_run import run as run_agent
 from drive_env.cia402 import OPERATION_ENABLED
@@ -147,6 +149,7 @@ def test_json_for_programs(tmp_path):
     (["--trials", "0"], "--trials 0 must be 1 or more"),
     (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes axes one by one"),
     (["--load", "nothing"], "no load is named 'nothing'"),
+    (["--dynamics", "lively"], "dynamics 'lively': give soft, standard, stiff"),
 ])  # fmt: skip
 def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
@@ -223,29 +226,75 @@ def settings(target):
     return np.stack([target.drives.read(name) for name in names], axis=1)
 
 
-def test_gains_that_were_stopped_are_no_answer(tmp_path):
+def test_gains_that_were_stopped_are_no_answer():
     """However sure a tuner is of them: the best trial that was not stopped is kept, and that is said."""
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
-        done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
+        done = tune_target(target, Reckless(), trials=3)
         assert all(trial.aborted.all() for trial in done.trials[1:]) and not done.trials[0].aborted.any()
+        assert (done.answers.tolist(), done.overruled.tolist()) == ([0], [True])
+        assert np.array_equal(gains(target), done.trials[0].gains)
+
+
+def unstable(*_):
+    """Loops of an axis of which no gains keep anything."""
+    device = find_device("tmcm1636")
+    return [(SimpleNamespace(device=device, slack=lambda dynamics, sets: np.full(len(sets), -1.0)), np.array([0]))]
+
+
+def test_a_proposal_that_breaks_the_margins_is_not_tried_and_that_is_said(tmp_path):
+    """Margins are computed from the identified plant: a tuner that raises all gains tenfold moves none with them."""
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+        agent = Reckless()
+        agent.bundle.configuration["trials"] = 2
+        done = run_agent(target, agent, tmp_path / "before.toml", name="reckless", doubts=("of another kind",))
         (axis,) = done.result.axes
-        assert axis.accepted and any("own choice was stopped" in note for note in axis.notes)
+        rule, *others = done.trials
+        assert rule.kept.all() and not rule.lowered.any()
+        for trial in others:
+            assert trial.lowered.all() and trial.kept.all() and not trial.aborted.any()
+        assert any("2 of the agent's 2 proposals broke standard dynamics" in note for note in axis.notes)
+        assert axis.accepted and "of another kind" in axis.reservations
         assert tuple(axis.after) == tuple(gains(target)[0])
-        assert tuple(axis.after) not in [tuple(trial.gains[0]) for trial in done.trials[1:]]
-        assert done.result.aborts[0] >= len(done.trials) - 1
 
 
-def test_where_every_trial_was_stopped_the_drive_has_what_it_had(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("models", "reason"), [
+    (lambda *_: [], "every trial was stopped, the baseline rule's too"),
+    (unstable, "none of the trials keeps standard dynamics by the identified plant"),
+])  # fmt: skip
+def test_where_no_trial_can_be_the_answer_the_drive_has_what_it_had(tmp_path, monkeypatch, models, reason):
+    monkeypatch.setattr("agents.tuner.kept_margins.loop_models", models)
     monkeypatch.setattr(
         "drive_env.trials.method.rule_gains", lambda *_, **__: np.array([[4021, 1573, 32767, 9, 32767]])
     )
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
         before, set_before = gains(target), settings(target)
         done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
-        assert done.result.axes[0].reason == "every trial was stopped, the baseline rule's too"
+        assert done.result.axes[0].reason == reason
         assert not done.result.kept and not done.certificate.axes[0].accepted
         assert np.array_equal(gains(target), before) and np.array_equal(settings(target), set_before)
         assert not is_enabled(target).any()
+
+
+def test_outside_its_card_it_says_so_before_anything_moves(tmp_path):
+    """A reservation of the certificate, and a sentence on stderr; in range there is none (below: error is empty)."""
+    code, out, error = command("--load", "winder", "--dry-run", "--dynamics", "soft", "--out", tmp_path / "run")
+    assert code == 0 and "Nothing was written." in out
+    assert error.startswith("drive-agent: the agent was not trained on this load: winder, and its card holds for ")
+
+
+def test_the_dynamics_asked_for_are_the_agents_and_the_verifications(tmp_path, monkeypatch):
+    asked = {}
+
+    def proven(*_, **options):
+        asked.update(options)
+        raise RuntimeError("as far as this test goes")
+
+    monkeypatch.setattr("tuning.auto.one_button.prove_found", proven)
+    policy = open_tuner("gain_tuning", "tmcm1636", None, "50/10/1.8")
+    assert policy.bundle.configuration["dynamics"] == "50/10/1.8"
+    with emulated("tmcm1636", "inertia", "qbl4208") as target, pytest.raises(RuntimeError, match="as far as"):
+        run_agent(target, policy, tmp_path / "before.toml", name="gain_tuning")
+    assert asked["dynamics"] == "50/10/1.8"
 
 
 def test_what_shakes_on_with_the_incumbent_is_calmed(monkeypatch):

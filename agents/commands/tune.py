@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import groupby
 from pathlib import Path
@@ -26,7 +27,16 @@ from agents.commands.options import (
 )
 from drive_env.commands.options import DeviceName, Yes, look_first, names_a_bus
 from drive_env.commands.tables import print_lines
-from tuning.commands.options import DriveOptions, MotorName, Supply, TravelRange, ask_to_turn, open_target
+from tuning.commands.options import (
+    DriveOptions,
+    DynamicsOption,
+    MotorName,
+    Supply,
+    TravelRange,
+    ask_to_turn,
+    asked_dynamics,
+    open_target,
+)
 
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
 
@@ -57,6 +67,7 @@ def tune(
     ] = None,
     supply: Supply = None,
     travel: TravelRange = None,
+    dynamics: DynamicsOption = None,
     trials: Annotated[int | None, typer.Option(help="Trials.", show_default="the agent's own, 10")] = None,
     store: Annotated[
         bool,
@@ -78,10 +89,12 @@ def tune(
         bus = names_a_bus(context)
         if bus and seed is not None:
             raise ValueError("--seed draws an emulated machine; leave it out on a bus")
+        from agents.tuner.known_range import outside
         from agents.tuner.open_tuner import open_tuner
         from tuning.way_back import way_back
 
-        policy = open_tuner(agent, device, trials)
+        asked_dynamics(dynamics, device)  # a drive without a linear model has none
+        policy = open_tuner(agent, device, trials, dynamics)
         folder = new_folder(out, "agent-tune")
         with ExitStack() as stack:
             stack.enter_context(way_back(folder / "before.toml" if bus else None, "drive-agent"))
@@ -95,13 +108,16 @@ def tune(
                     bitrate=bitrate, lockstep=lockstep, supply=supply, travel=travel,
                 )  # fmt: skip
                 target = stack.enter_context(open_target(drive))
+            doubts = outside(policy.bundle, target, None if bus else load)
+            for doubt in doubts:
+                print(f"drive-agent: {doubt}", file=sys.stderr)
             if dry_run:
                 if not _tell_plan(target, policy, store, json):
                     fail("a run would not start: see the lines with 'no'", REFUSED)
                 return
             if bus:
                 ask_to_turn(node, yes, interface)
-            result = _run(target, policy, folder, agent, store, json)
+            result = _run(target, policy, folder, agent, doubts, store, json)
         _report(result, folder, json, bus)
 
 
@@ -191,7 +207,9 @@ def _what_is_written(group: list[Any]) -> str:
     return f"  {objects}: {first.why}; now {now}{to}{'; stays' if first.stays else ''}"
 
 
-def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> TunerRun:
+def _run(
+    target: Target, policy: Any, folder: Path, agent: str, doubts: Sequence[str], store: bool, json: bool
+) -> TunerRun:
     from agents.tuner.open_tuner import remark, titles_of_trials
     from agents.tuner.tuning_run import run
     from tuning.certificate.certificate_files import certificate_files
@@ -221,7 +239,7 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         print_lines([f"agent {agent} tunes {target.device.name} with {target.motor.name}: {target.machine}"])
     folder.mkdir(parents=True, exist_ok=True)
     return run(
-        target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say,
+        target, policy, folder / "before.toml", name=agent, doubts=doubts, keep=store, show=show, say=say,
         files=lambda certificate: certificate_files(certificate, folder, target.inputs),
     )  # fmt: skip
 
@@ -288,14 +306,14 @@ def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
 
 def _answer(done: TunerRun) -> str:
     """Return which trial the agent chooses, and why where another one measured better; "" if it is none of them."""
-    from agents.tuner.tune_target import best_unstopped
+    from agents.tuner.tune_target import best_good
 
     after = tuple(done.result.axes[0].after)
     own = next((trial for trial in done.trials if tuple(trial.gains[0]) == after), None)
     if own is None:
         return ""
     which = f"trial {own.number}" if own.number else "the baseline rule's gains"
-    best = best_unstopped(done.trials, 0)
+    best = best_good(done.trials, 0)
     if best is None or best.measured[0] >= own.measured[0]:
         return f"the agent chooses {which}, the best"
     return (

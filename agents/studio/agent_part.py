@@ -62,6 +62,7 @@ def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSessi
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
         from agents.tuner import tuning_run
+        from agents.tuner.known_range import outside
         from agents.tuner.open_tuner import remark
         from tuning.certificate.certificate_files import certificate_files
 
@@ -81,8 +82,11 @@ def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSessi
             progress("trials", share)
 
         run.folder.mkdir(parents=True, exist_ok=True)
+        doubts = outside(policy.bundle, target, None if target.bus else target.machine)
+        for doubt in doubts:
+            progress(doubt, 0.0)
         done = tuning_run.run(
-            target, policy, run.folder / "before.toml", name=name, keep=store, show=show, say=say,
+            target, policy, run.folder / "before.toml", name=name, doubts=doubts, keep=store, show=show, say=say,
             files=lambda certificate: certificate_files(certificate, run.folder),
         )  # fmt: skip
         return done.result

@@ -9,6 +9,7 @@ from agents.shipped import find_agent
 from agents.tuner.tune_target import gains_for
 from drive_env.devices import find_device
 from drive_env.gains import check_linear_model
+from drive_env.loops.dynamics import find_dynamics
 
 if TYPE_CHECKING:
     from agents.tuner.tune_target import TrialShown
@@ -18,8 +19,8 @@ MOST_TRIALS = 10_000
 ENVIRONMENT = "ServoDrive/GainTuning-v0"
 
 
-def open_tuner(agent: str, device: str, trials: int | None) -> Any:
-    """Return the agent's policy, with so many trials if they are given.
+def open_tuner(agent: str, device: str, trials: int | None, dynamics: str | None = None) -> Any:
+    """Return the agent's policy, with so many trials and asked for dynamics if they are given.
 
     Raises:
         ValueError: Unless it can tune the device, before anything moves.
@@ -32,6 +33,8 @@ def open_tuner(agent: str, device: str, trials: int | None) -> Any:
     known = find_device(device)
     gains_for(policy.bundle.configuration, known)
     check_linear_model(known)
+    if dynamics is not None:
+        policy.bundle.configuration["dynamics"] = find_dynamics(dynamics).name
     if trials is not None:
         policy.bundle.configuration["trials"] = trials
     return policy
@@ -45,8 +48,11 @@ def titles_of_trials(known: GainSet) -> list[str]:
 def remark(trial: TrialShown) -> str:
     """Return what there is to say of a trial of one machine."""
     mark = "better" if trial.better[0] else ""
+    if trial.lowered[0]:
+        mark = f"{mark}; " * bool(mark) + "lowered: the agent's proposal breaks the dynamics"
     if trial.number == 0:
-        mark = "the baseline rule's gains, where the agent starts"
+        broken = "" if trial.kept[0] else "; they break the dynamics"
+        mark = f"the baseline rule's gains, where the agent starts{broken}"
     if trial.aborted[0]:
         told = ", ".join(name.replace("_", " ") for name in trial.faults[0])
         rule = f"; {mark}" if trial.number == 0 else ""

@@ -1,9 +1,9 @@
 """A learnt tuner: a network predicts the robust cost of gains from all trials of the machine so far.
 
-It acts in `ServoDrive/GainTuning-v0`. Of every machine it keeps the context c (what was identified, and what the trial
-at the rule's gains showed) and its trials (log gains over the rule's x_i, what they showed y_i). A conditional neural
-process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines whose robust cost
-is known, predicts for any gains x the logarithm of the robust cost over the rule's, as a Laplace distribution:
+It acts in `ServoDrive/GainTuning-v0`. Of every machine it keeps the context c (what was identified, what the trial at
+the rule's gains showed, and the Ms that the dynamics ask for) and its trials (log gains over the rule's x_i, what
+they showed y_i). A conditional neural process with attention (Kim et al., "Attentive Neural Processes", 2019), trained
+on emulated machines whose robust cost is known, predicts for any gains x its logarithm, as a Laplace distribution:
 
     v_i, p_i, k_i = trial(c, x_i, y_i)                      value, share of the summary, keys
     u   = silu(mean of p_i)                                 what kind of machine this is
@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.policy import PolicyError, sigmoid
+from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -30,7 +31,8 @@ Mask = NDArray[np.bool_]
 # Of an axis's observation (the class docstring of GainTuning): what was identified, then gains, then two trials.
 IDENTIFIED, SHOWN = 4, 16
 STOPPED = (4, 9, 14)  # of what a trial showed: whether its move, its reversal, its probe was stopped
-CONTEXT = IDENTIFIED + SHOWN
+ASKED = 1  # ln of the Ms of the dynamics
+CONTEXT = IDENTIFIED + SHOWN + ASKED
 CLIP = 6.0  # of normalised inputs
 LEAST, MOST = -3.5, 1.0  # of ln of the scale
 KEY = 12  # entries of a head's key
@@ -46,8 +48,20 @@ def silu(x: Array) -> Array:
     return x * sigmoid(x)
 
 
+def context_of(identified: Array, shown: Array, dynamics: Dynamics) -> Array:
+    """Return the context of machines, (n, 21).
+
+    Args:
+        identified: The observation's entries of what was identified, (n, 4).
+        shown: Those of what the rule's trial showed, (n, 16).
+        dynamics: What the loops must keep.
+    """
+    asked = np.full((len(shown), ASKED), np.log(dynamics.ms))
+    return np.concatenate([identified, shown, asked], axis=1, dtype=np.float32)
+
+
 class Normaliser(NamedTuple):
-    """What inputs are normalised with: mean and 1/standard deviation, shapes (20,), (16,); 1/reach of gains."""
+    """What inputs are normalised with: mean and 1/standard deviation, shapes (21,), (16,); 1/reach of gains."""
 
     context_mean: Array
     context_scale: Array
@@ -98,7 +112,7 @@ class EnsembleMember:
         self._value = (rest - (total - keys)) // (self._heads - 1)
 
     def read(self, context: Array, tried: Array, showed: Array, known: Mask) -> Memory:
-        """Return the memory of normalised contexts (n, 20) and trials (n, trials, ...), where `known` is true."""
+        """Return the memory of normalised contexts (n, 21) and trials (n, trials, ...), where `known` is true."""
         w, (n, trials), value = self._w, known.shape, self._value
         each = np.concatenate([np.repeat(context[:, None], trials, axis=1), tried, showed], axis=2)
         told = silu(each @ w["trial_in_weight"] + w["trial_in_bias"]) @ w["trial_out_weight"] + w["trial_out_bias"]
@@ -219,7 +233,7 @@ class SurrogatePolicy:
         last, incumbent, shown = each[:, IDENTIFIED : IDENTIFIED + G], each[:, at - G : at], each[:, at : at + SHOWN]
         number = self._known.sum(axis=1)
         fresh = number == 0
-        self._context[fresh] = np.concatenate([each[:, :IDENTIFIED], shown], axis=1)[fresh]
+        self._context[fresh] = context_of(each[:, :IDENTIFIED], shown, self._asked_for())[fresh]
         if number.max() == self._known.shape[1]:
             room = ((0, 0), (0, 1))
             self._known = np.pad(self._known, room)
@@ -227,6 +241,9 @@ class SurrogatePolicy:
         every = np.arange(len(each))
         self._known[every, number], self._tried[every, number], self._showed[every, number] = True, last, shown
         return each, incumbent
+
+    def _asked_for(self) -> Dynamics:
+        return find_dynamics(self.bundle.configuration.get("dynamics", DEFAULT))
 
     # --- what the networks say ----------------------------------------------------------------------------------------
     def _read(self) -> list[Memory]:

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from agents.policies.policy import load_policy
 from agents.shipped import TUNER, shipped
+from agents.tuner.known_range import outside
+from drive_env.devices import find_device
 from drive_env.trials.positioning import longer_way
 
 if TYPE_CHECKING:
     from agents.policies.guard import GuardedPolicy, GuardLimits
+    from agents.tuner.kept_margins import KeptMargins
     from drive_env.devices import Device
     from drive_env.drives.interface import Drives
     from drive_env.envs.gain_tuning import GainTuning
@@ -25,6 +28,7 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 TRIAL_SECONDS = 0.75
+WIDEST = 10.4  # ln of the range of a gain
 PATIENCE = 2  # windows of 25 ms for which an axis may shake; what it does with the incumbent then decays or does not
 
 
@@ -36,6 +40,8 @@ class TrialShown(NamedTuple):
     measured: J by measured terms of the machine's worst axis, (num_machines,).
     aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
     faults: Names of emergencies, a tuple for each machine.
+    kept: Whether the gains keep the margins by the identified plant, as far as it is known, (num_machines,).
+    lowered: Whether the policy proposed higher gains, which do not, (num_machines,).
     """
 
     number: int
@@ -44,14 +50,21 @@ class TrialShown(NamedTuple):
     aborted: Mask
     better: Mask
     faults: tuple[tuple[str, ...], ...]
+    kept: Mask
+    lowered: Mask
+
+    @property
+    def good(self) -> Mask:
+        """Of which machines these gains can be the answer, (num_machines,)."""
+        return ~self.aborted & self.kept
 
 
 class Tuned(NamedTuple):
     """The result: the answer's gains, raw (num_axes, count), all trials, and each machine's answer among them.
 
-    The answer is the policy's own choice (`answer`) where it makes one that was not stopped, else the best trial by
-    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the baseline rule's.
-    overruled: Machines whose policy would have stayed with gains that were stopped.
+    The answer is the policy's own choice (`answer`) where it makes one that was not stopped and keeps the margins, else
+    the best such trial by measured terms; of a machine without any it is the first one, the baseline rule's.
+    overruled: Machines whose policy would have stayed with other gains.
     """
 
     gains: Integers
@@ -74,6 +87,7 @@ def tune_target(
     show: Callable[[TrialShown], None] = lambda trial: None,
     trials: int | None = None,
     calm: Integers | None = None,
+    margins: KeptMargins | None = None,
 ) -> Tuned:
     """Tune a target with a policy for GainTuning; the drives have the answer's gains and are disabled afterwards.
 
@@ -84,6 +98,8 @@ def tune_target(
         trials: How many; the agent's own number by default.
         calm: Gains for an axis that shakes on though its trial was stopped, (num_axes, count): the incumbent's, with
             which it goes on, may be so near to the edge. By default those of the data sheet.
+        margins: What gains must keep: a proposal that does not is lowered before it is tried. By default nothing is
+            known of it.
 
     Raises:
         ValueError: If the drive lacks a gain that the policy changes, or a rule for it.
@@ -107,7 +123,7 @@ def tune_target(
     try:
         watched.warm_up(np.zeros(env.observation_space.shape or (), np.float32))
         with stopping(drives):
-            shown, observation = _make_trials(env, watched, show)
+            shown, observation = _make_trials(env, watched, show, margins, _step_of(policy.bundle.configuration))
             answer = watched.answer(observation)
             wanted = None if answer is None else _flat(env.gains_of(answer))
             axes = target.axes_per_machine
@@ -138,6 +154,7 @@ def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], tri
 
     configuration = dict(trained) | ({} if trials is None else {"trials": trials})
     configuration["gains"] = gains_for(trained, target.device)
+    configuration["step"] = WIDEST  # lowered gains may lie farther from the incumbent than a policy may go
     write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
     return GainTuning(
         target.num_axes // target.axes_per_machine,
@@ -150,7 +167,11 @@ def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], tri
 
 
 def _make_trials(
-    env: GainTuning, policy: GuardedPolicy, show: Callable[[TrialShown], None]
+    env: GainTuning,
+    policy: GuardedPolicy,
+    show: Callable[[TrialShown], None],
+    margins: KeptMargins | None,
+    step: float,
 ) -> tuple[list[TrialShown], Floats]:
     """Return all trials of an episode, the baseline rule's first, and what the policy sees at its end.
 
@@ -159,21 +180,35 @@ def _make_trials(
     """
     observation, info = env.reset(seed=0)
     policy.reset()
-    shown = [TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], ~info["aborted"],
-                        tuple(info["faults"]))]  # fmt: skip
+    rule, machines = _flat(info["gains"]), env.num_envs
+
+    def of_machines(axes: Mask) -> Mask:
+        return np.asarray(axes.reshape(machines, -1).all(axis=1))
+
+    kept = np.ones(machines, bool) if margins is None else of_machines(margins.kept(rule))
+    shown = [TrialShown(0, rule, info["measured"], info["aborted"], ~info["aborted"], tuple(info["faults"]), kept,
+                        np.zeros(machines, bool))]  # fmt: skip
     show(shown[-1])
+    known = find_device(env.config.device).gains
     for number in range(1, env.config.trials + 1):
-        action = policy.act(observation)
+        action = np.clip(policy.act(observation), -step, step)
+        proposed = _flat(env.gains_of(action))
+        if margins is not None:
+            change = known.change(margins.lowered(proposed), _flat(info["gains"]), known.columns(env.config.chosen))
+            action = change.reshape(machines, -1)
         before = info["measured"]
         observation, _, terminated, _, info = env.step(action)
+        tried = _flat(info["trial_gains"])
         shown.append(
             TrialShown(
                 number,
-                _flat(info["trial_gains"]),
+                tried,
                 info["trial_measured"],
                 info["aborted"],
                 info["measured"] < before,
                 tuple(info["faults"]),
+                np.ones(machines, bool) if margins is None else of_machines(margins.kept(tried)),
+                ~of_machines((proposed == tried).all(axis=1)),
             )
         )
         show(shown[-1])
@@ -181,6 +216,13 @@ def _make_trials(
             names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
             raise RuntimeError(f"the drive's fault cannot be reset after trial {number}: {names}")
     return shown, observation
+
+
+def _step_of(trained: Mapping[str, Any]) -> float:
+    """Return how far an agent may go from the incumbent in a trial."""
+    from drive_env.envs.gain_tuning import GainTuningConfig
+
+    return float(trained.get("step", GainTuningConfig.step))
 
 
 def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ...]:
@@ -192,7 +234,6 @@ def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ..
     Raises:
         ValueError: If the device lacks such a gain, or names no cascade, and there is no rule for it.
     """
-    from drive_env.devices import find_device
     from drive_env.envs.gain_tuning import GainTuningConfig
     from drive_env.gains import per_chip
 
@@ -210,9 +251,9 @@ def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ..
     return tuple(device.gains.names[k] for k in columns if k is not None)
 
 
-def best_unstopped(trials: Sequence[TrialShown], machine: int) -> TrialShown | None:
-    """Return the trial of a machine that was best by measured terms, None if all were stopped."""
-    good = [trial for trial in trials if not trial.aborted[machine]]
+def best_good(trials: Sequence[TrialShown], machine: int) -> TrialShown | None:
+    """Return the trial of a machine that was best by measured terms of those that can be the answer, None if none."""
+    good = [trial for trial in trials if trial.good[machine]]
     return min(good, key=lambda trial: float(trial.measured[machine]), default=None)
 
 
@@ -221,9 +262,9 @@ def _answer(trials: Sequence[TrialShown], machine: int, axes: int, wanted: Integ
     own = slice(machine * axes, (machine + 1) * axes)
     if wanted is not None:
         for trial in trials:
-            if np.array_equal(trial.gains[own], wanted[own]) and not trial.aborted[machine]:
+            if np.array_equal(trial.gains[own], wanted[own]) and trial.good[machine]:
                 return trial.number
-    best = best_unstopped(trials, machine)
+    best = best_good(trials, machine)
     return 0 if best is None else best.number
 
 
@@ -237,7 +278,8 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
     from tuning.target import timed
 
     with timed(target) as (watched, clock):
-        found = tune_target(watched, load_policy(shipped(TUNER)))
+        policy = load_policy(shipped(TUNER))
+        found = tune_target(watched, policy)
     lanes = target.axes_per_machine
     aborts = np.sum([trial.aborted for trial in found.trials], axis=0)
     zero = np.zeros(target.num_axes, np.int64)
@@ -247,7 +289,7 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
         zero + found.moves,
         np.repeat(aborts, lanes),
         zero,
-        ("",) * target.num_axes,
+        ("; ".join(outside(policy.bundle, target, target.machine)),) * target.num_axes,
     )
 
 

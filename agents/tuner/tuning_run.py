@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.tuner.tune_target import TrialShown, tune_target
+from drive_env.loops.dynamics import DEFAULT
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
@@ -37,6 +38,7 @@ def run(
     file: Path,
     *,
     name: str,
+    doubts: Sequence[str] = (),
     keep: bool = True,
     show: Callable[[TrialShown], None] = lambda trial: None,
     say: Callable[[str], None] = lambda what: None,
@@ -50,7 +52,8 @@ def run(
         target: The drives.
         policy: A policy for GainTuning.
         file: Where the state before is left, for `drive-tune undo`.
-        name: Of the agent, for the certificate.
+        name: Of the agent, for the certificate; it is asked for the dynamics of its configuration.
+        doubts: Reservations of the certificate from the begin.
         keep: Whether drives on a bus keep the gains over a power cycle.
         show: Called after every trial.
         say: Called with what is under way.
@@ -70,6 +73,8 @@ def run(
         show(trial)
 
     def find(bench: AutoBench, basis: Basis, _: Any) -> TriedGains:
+        for doubt in doubts:
+            bench.reserve(bench.going, doubt)
         say("trials")
         return make_trials(bench, basis, policy, tried)
 
@@ -83,7 +88,10 @@ def run(
         certificates.append(certificate(target, result, 0, tuner=f"agent {name}"))
         return files(certificates[0])
 
-    result = prove_found(target, file, find, keep=keep, progress=told, budget=math.inf, files=written)
+    asked = policy.bundle.configuration.get("dynamics", DEFAULT)
+    result = prove_found(
+        target, file, find, dynamics=asked, keep=keep, progress=told, budget=math.inf, files=written
+    )  # fmt: skip
     return TunerRun(result, certificates[0], tuple(trials))
 
 
@@ -91,6 +99,7 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
     """Make the policy's trials; return its answer, and set where moves start."""
     from dataclasses import replace
 
+    from agents.tuner.kept_margins import KeptMargins
     from drive_env.safety.envelope import SafetyError, swinging_allowed
     from tuning.auto.stages import TriedGains
     from tuning.auto.trying import BY_TRIAL, proving_ground, watch_following
@@ -103,7 +112,10 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
     try:
         # The trials stop by themselves what oscillates, within 50 ms, and go on.
         with bench.spending(going), swinging_allowed(target.drives):
-            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=basis.calm)
+            tuned = tune_target(
+                replace(target, low=low, high=high), policy, show=show, calm=basis.calm,
+                margins=KeptMargins.of(bench, basis),
+            )  # fmt: skip
     except SafetyError as error:
         bench.stop(going, f"the envelope stopped the trials: {error}")
         return TriedGains.only(basis.before)
@@ -116,15 +128,21 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
     for machine in range(target.num_axes // lanes):
         own = slice(machine * lanes, (machine + 1) * lanes)
         answer = tuned.trials[int(tuned.answers[machine])]
-        if answer.aborted[machine]:
-            bench.stop(
-                np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the baseline rule's too"
-            )
+        if not answer.good[machine]:
+            kept = any(trial.kept[machine] for trial in tuned.trials)
+            why = ("every trial was stopped, the baseline rule's too" if kept else
+                   f"none of the trials keeps {bench.dynamics.name} dynamics by the identified plant")  # fmt: skip
+            bench.stop(np.arange(target.num_axes) // lanes == machine, why)
             continue
+        if lowered := sum(bool(trial.lowered[machine]) for trial in tuned.trials):
+            for journal in bench.journals[own]:
+                journal.note(f"{lowered} of the agent's {len(tuned.trials) - 1} proposals broke {bench.dynamics.name} "
+                             "dynamics by the identified plant, and lower gains were tried")  # fmt: skip
         proof[own], verified[own] = float(answer.measured[machine]), [BY_TRIAL] * lanes
         if tuned.overruled[machine]:
             for journal in bench.journals[own]:
                 journal.note(
-                    "the agent's own choice was stopped in its trial; the best trial that was not stopped is kept"
+                    "the agent's own choice was stopped in its trial, or breaks the dynamics by the identified plant; "
+                    "the best trial that was not and does not is kept"
                 )
     return replace(tried, proof=proof, verified=tuple(verified))

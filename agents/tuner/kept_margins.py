@@ -1,0 +1,70 @@
+"""Which gains keep the margins of the dynamics by the identified plant; computed, never learned."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import cascade_columns
+from tuning.auto.correction import LOWERED
+from tuning.auto.loop_margins import MEASURED
+from tuning.auto.loop_model import LoopModel, loop_models
+
+if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.stages import Basis
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# The least lowered ones first.
+NEAREST = LOWERED[np.abs(np.log(LOWERED)).sum(axis=1).argsort(kind="stable")]
+
+
+class KeptMargins(NamedTuple):
+    """The loops of identified machines with any gains.
+
+    models: Loops of each machine, and which axes it has. dynamics: What they must keep. calm: Gains for where no
+    lowered ones keep it, raw, (num_axes, count).
+    """
+
+    models: list[tuple[LoopModel, Integers]]
+    dynamics: Dynamics
+    calm: Integers
+
+    @classmethod
+    def of(cls, bench: AutoBench, basis: Basis) -> KeptMargins:
+        """Return those of the axes in a run, as they were identified."""
+        return cls(loop_models(bench.target, basis, None, bench.going, bench.dynamics), bench.dynamics, basis.calm)
+
+    def kept(self, gains: Integers) -> Mask:
+        """Return of which axes gains keep the dynamics, as far as the model may be off, (num_axes,).
+
+        Args:
+            gains: Raw, (num_axes, count).
+        """
+        keep = np.ones(len(gains), bool)
+        for model, axes in self.models:
+            keep[axes] = model.slack(self.dynamics, gains[axes][None])[0] >= -MEASURED
+        return keep
+
+    def lowered(self, gains: Integers) -> Integers:
+        """Return gains that keep the dynamics: those given, or the nearest with less velocity P and I and position P.
+
+        Args:
+            gains: Raw, (num_axes, count).
+        """
+        result, keep = gains.copy(), self.kept(gains)
+        for model, axes in self.models:
+            if keep[axes].all():
+                continue
+            columns = cascade_columns(model.device)[2:]
+            rows = np.repeat(gains[axes][None].astype(float), len(NEAREST), axis=0)
+            rows[..., columns] *= NEAREST[:, None]
+            every = np.maximum(np.rint(rows), 1).astype(np.int64)
+            good = model.slack(self.dynamics, every) >= 0.0
+            result[axes] = every[good.argmax()] if good.any() else self.calm[axes]
+        return result
