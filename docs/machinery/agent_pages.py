@@ -79,6 +79,8 @@ def is_figure(value: Any) -> bool:
 
 def number(value: Any) -> str:
     """Return a figure as it stands in a cell."""
+    if isinstance(value, Mapping) and "mean" not in value:
+        return ", ".join(f"{name} {number(figure)}" for name, figure in value.items())
     if isinstance(value, Mapping):
         return f"{value['mean']:.3g} [{value['low']:.3g}, {value['high']:.3g}]"
     if isinstance(value, list):
