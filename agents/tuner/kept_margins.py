@@ -38,7 +38,9 @@ class KeptMargins(NamedTuple):
     @classmethod
     def of(cls, bench: AutoBench, basis: Basis) -> KeptMargins:
         """Return those of the axes in a run, as they were identified."""
-        return cls(loop_models(bench.target, basis.identified, None, bench.going, bench.dynamics), bench.dynamics, basis.calm)
+        return cls(
+            loop_models(bench.target, basis.identified, None, bench.going, bench.dynamics), bench.dynamics, basis.calm
+        )
 
     def kept(self, gains: Integers) -> Mask:
         """Return of which axes gains keep the dynamics, as far as the model may be off, (num_axes,).
