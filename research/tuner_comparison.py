@@ -2,7 +2,7 @@
 
     python -m research.tuner_comparison --machines 26
 
-A search is told J by measured terms of its trials, the rule's gains first, and answers the best one. It draws gains
+A search is given J by measured terms of its trials, the rule's gains first, and answers the best one. It draws gains
 from the range that the tuner tries.
 """
 

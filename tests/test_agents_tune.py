@@ -105,7 +105,10 @@ def test_a_channel_of_the_environment_alone_moves_no_motor(tmp_path, monkeypatch
 
 def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("agents.commands.tune.open_target", lambda _: nullcontext())
+    known = SimpleNamespace(
+        device=SimpleNamespace(name="tmcm1636"), motor=SimpleNamespace(name="qbl4208"), axes_per_machine=1
+    )
+    monkeypatch.setattr("agents.commands.tune.open_target", lambda _: nullcontext(known))
     code, _, error = command("--interface", "virtual", "--channel", "none", "--node", 3, "--travel", "-1:1")
     assert code == 2
     question = "drive-agent: The motor of node 3 will turn. Is its way clear?"
