@@ -18,7 +18,14 @@ from drive_env.trials.method import method_of
 from drive_env.trials.score import Terms
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.search import trial_bench as module
-from tuning.search.trial_bench import TrialBench, Tried, first_gains, leave_oscillations_to_trials, read_gains
+from tuning.search.trial_bench import (
+    MOST_WAITING,
+    TrialBench,
+    Tried,
+    first_gains,
+    leave_oscillations_to_trials,
+    read_gains,
+)
 from tuning.search.trial_log import LoggedTrials
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -217,12 +224,27 @@ def test_an_axis_farther_than_a_fifth_of_its_move_is_brought_back_first(written,
     axes = [False, True, False, False]
     assert bench.done.went == ([([100] * 4, axes)] if brought else [])
     assert bench.moves.tolist() == [0, int(brought), 0, 0]
-    if brought:  # a trial's time, and the way at the profile's speed
-        assert bench.target.drives.log == [("advance", pytest.approx(0.25 + 0.021, abs=1.1e-3))]
+    if brought:  # the way at the profile's speed, then a trial's time until it is back, and no longer than eight
+        waited = [("advance", pytest.approx(0.021, abs=1.1e-3)), *[("advance", 0.25)] * MOST_WAITING]
+        assert bench.target.drives.log == waited and MOST_WAITING == 8
         assert written == [((GAINS // 2).tolist(), axes)] and bench.done.recovered == [axes]
     bench.moves[:] = 0
     bench._return(np.array([True, False, True, True]))  # it takes no part
     assert bench.moves.tolist() == [0] * 4
+
+
+def test_an_axis_that_is_back_is_not_waited_for_any_longer(written, monkeypatch):
+    bench = bench_of(trial())
+    drives = bench.target.drives
+    drives.position = np.array([100, 400, 100, 100])
+
+    def advance(seconds):
+        drives.log.append(seconds)
+        drives.position = np.array([100, 400 if len(drives.log) < 3 else 250, 100, 100])
+
+    monkeypatch.setattr(drives, "advance", advance)
+    bench._return(np.ones(4, bool))
+    assert len(drives.log) == 3, "the ramp, and a trial's time twice"
 
 
 def test_a_move_of_nothing_has_a_fifth_of_an_increment(written):
