@@ -284,7 +284,7 @@ def test_axes_that_pull_at_one_thing_move_together_or_not_at_all(what):
 
 @pytest.mark.slow
 def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tmp_path):
-    """One joint of an arm is given wild gains: a machine passes as a whole, so that all joints get slower ones."""
+    """One joint of an arm is given wild gains: a machine passes as a whole, so that all joints get other ones."""
     with emulated(load="robot", num_machines=1, num_threads=1) as target:
         wanted = fitted(target)
         wanted[3, 2:] = 32767
@@ -296,8 +296,9 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     failed = [any(note.startswith(FAILED) for note in axis.notes) for axis in result.axes]
     assert failed == [True] * 6
-    slower = [axis.after[VELOCITY_P] < wanted[k, VELOCITY_P] for k, axis in enumerate(result.axes)]
-    assert slower == [True] * 6, "of one set each, that made its trial together"
+    others = [axis.is_kept or list(axis.after) != wanted[k].tolist() for k, axis in enumerate(result.axes)]
+    assert others == [True] * 6, "of one set each, that made its trial together; or those from before it"
+    assert result.axes[3].after[VELOCITY_P] < 32767
 
 
 # --- where a trial begins ---------------------------------------------------------------------------------------------
@@ -389,7 +390,7 @@ def found_once(wanted):
     return design_axes
 
 
-RINGING = (11883, 382, 1437, 1007, 1370)  # of a belt: good while it moves, and a limit cycle within an encoder count
+RINGING = (11883, 382, 1600, 1007, 1370)  # of a belt: good while it moves, and a limit cycle within an encoder count
 
 
 def test_a_move_tells_whether_its_axis_shakes_at_rest():
