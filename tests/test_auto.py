@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -33,9 +34,10 @@ from tuning.auto.checks import unsafe_gains
 from tuning.auto.loop_margins import MS_ERROR
 from tuning.auto.one_button import BUDGET, auto
 from tuning.auto.proving import ProvingGround
+from tuning.compare.oracle import digest, read_oracles
 from tuning.compare.suite import load_suite, open_machines
+from tuning.compare.yardstick import Yardstick
 from tuning.drive_audit import KINDS, DriveAudit
-from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
 from tuning.rules.rules_by_name import propose
 from tuning.runs import provenance
@@ -509,25 +511,17 @@ def test_on_a_bus_it_tunes_inside_the_envelope_and_the_drive_keeps_it(tmp_path, 
 
 
 # --- the suite --------------------------------------------------------------------------------------------------------
-def hidden_ratio(target, machines, found):
-    """Return robust performance over that of the baseline rule for the true inertia, and slack, (machines,) each."""
-    drives = target.drives
-    axes = target.axes_per_machine
-    score = RobustScore(drives.device.name, drives.load.name, drives.motor.name, len(machines),
-                        friction=machines[0].friction)  # fmt: skip
-    score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(-1, axes)[:, 0])
-    J = np.concatenate([moved_inertia(group.load).reshape(-1) for group in drives.inside.groups])
-    reach = np.where(target.high >= -target.low, target.high, target.low)
-    score.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0)), reach))
-    rule = [rule_gains(drives.device, drives.motor, j, supply=v)[0] for j, v in zip(J, target.supply, strict=True)]
-    reference = score.score(np.array(rule)).performance
-    scores = score.score(found)
-    score.close()
+def hidden_ratio(machines, found):
+    """Return robust performance over that of the constrained oracle, and slack, (machines,) each."""
+    rows = read_oracles()
+    best = np.concatenate([rows[digest(machine)].gains for machine in machines])
+    with closing(Yardstick(machines, 1)) as yardstick:
+        scores, reference = yardstick.score(found), yardstick.score(best).performance
     return scores.performance / reference, scores.slack
 
 
 @pytest.mark.slow
-def test_on_the_public_machines_it_is_far_better_than_the_baseline_rule_and_stays_inside_its_envelope(tmp_path):
+def test_on_the_public_machines_it_comes_near_the_best_that_margins_allow_and_stays_inside_its_envelope(tmp_path):
     """Every fourth one of the 46 of one axis; side by side they wait for each other: that counts as drive time."""
     machines = [machine for machine in load_suite("public") if machine.load not in ("gantry", "robot")]
     machines = machines[:: -(-len(machines) // part(12, 4))]
@@ -537,14 +531,14 @@ def test_on_the_public_machines_it_is_far_better_than_the_baseline_rule_and_stay
         result = auto(target, tmp_path / f"{chosen[0].name}.toml")
         found = np.array([axis.after for axis in result.axes], np.int64)
         np.testing.assert_array_equal(found, gains(target.drives))
-        ratio, slack = hidden_ratio(target, chosen, found)
+        ratio, slack = hidden_ratio(chosen, found)
         ratios, slacks = ratios + ratio.tolist(), slacks + slack.tolist()
         accepted += result.accepted.tolist()
         seconds += result.drive_seconds.tolist()
         violations += int(result.violations.sum())
     assert len(ratios) == len(machines) and sum(accepted) >= len(machines) - 2
-    assert np.median(ratios) <= 0.8  # of a rule that breaks the margins on each
-    assert np.median(slacks) > -0.05
+    assert np.median(ratios) <= 1.3
+    assert np.median(slacks) > -0.1  # the verdict lets pass 8 %, and geared joints have reservations
     assert violations == 0
     assert max(seconds) < BUDGET + OVERTIME
 
