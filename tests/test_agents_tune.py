@@ -120,7 +120,7 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
 def test_it_tunes_both_axes_of_an_amplifier_on_mains():
     """The TGZ, whose registers, units and machines it has never seen; each axis turns a load of its own.
 
-    It acts there as on any drive; how good its answer is nobody says: its card does not hold (test_kept_margins.py).
+    It acts there as on any drive. Its card does not hold for it (test_kept_margins.py), so its cost is not judged.
     """
     with emulated("tgz_d", "inertia", num_machines=2) as target:
         tuned = tune_target(target, load_policy(shipped("gain_tuning")), trials=3)
@@ -281,7 +281,7 @@ def test_where_no_trial_can_be_the_answer_the_drive_has_what_it_had(tmp_path, mo
 
 
 def test_outside_its_card_it_says_so_before_anything_moves(tmp_path):
-    """A reservation of the certificate, and a sentence on stderr; in range there is none (below: error is empty)."""
+    """Outside its card a run prints a sentence on stderr and adds a reservation; inside, neither."""
     code, out, error = command("--load", "winder", "--dry-run", "--dynamics", "soft", "--out", tmp_path / "run")
     assert code == 0 and "Nothing was written." in out
     assert error.startswith("drive-agent: the agent was not trained on this load: winder, and its card holds for ")

@@ -525,7 +525,7 @@ def test_on_the_public_machines_it_comes_near_the_best_that_margins_allow_and_st
     """Every fourth one of the 46 of one axis; side by side they wait for each other: that counts as drive time."""
     machines = [machine for machine in load_suite("public") if machine.load not in ("gantry", "robot")]
     machines = machines[:: -(-len(machines) // part(12, 4))]
-    ratios, slacks, accepted, seconds, violations = [], [], [], [], 0
+    ratios, slacks, accepted, plain, seconds, violations = [], [], [], [], [], 0
     for target, indices in open_machines(machines):
         chosen = [machines[k] for k in indices]
         result = auto(target, tmp_path / f"{chosen[0].name}.toml")
@@ -534,11 +534,13 @@ def test_on_the_public_machines_it_comes_near_the_best_that_margins_allow_and_st
         ratio, slack = hidden_ratio(chosen, found)
         ratios, slacks = ratios + ratio.tolist(), slacks + slack.tolist()
         accepted += result.accepted.tolist()
+        plain += [axis.accepted and not axis.reservations for axis in result.axes]
         seconds += result.drive_seconds.tolist()
         violations += int(result.violations.sum())
     assert len(ratios) == len(machines) and sum(accepted) >= len(machines) - 2
     assert np.median(ratios) <= 1.3
-    assert np.median(slacks) > -0.1  # the verdict lets pass 8 %, and geared joints have reservations
+    sound = np.array(slacks)[plain]  # a reservation says that margins are not known
+    assert len(sound) >= len(machines) // 2 and np.median(sound) > 0.0 and sound.min() > -0.2, slacks
     assert violations == 0
     assert max(seconds) < BUDGET + OVERTIME
 

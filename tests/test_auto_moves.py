@@ -161,7 +161,7 @@ def test_gains_before_that_move_better_are_kept_if_their_loops_keep_the_dynamics
 
 
 @pytest.mark.parametrize("swing", [0.0, 2.0 * RESTLESS])
-def test_gains_before_with_which_an_axis_shakes_at_rest_are_nobody_s_choice(swing, monkeypatch):
+def test_gains_before_with_which_an_axis_shakes_at_rest_are_not_kept(swing, monkeypatch):
     monkeypatch.setattr(auto_moves, "measured_axis", lambda *given: SimpleNamespace(slack=lambda *asked: [0.5]))
     earlier = moved([2.0, 2.0])._replace(swing=np.array([0.0, swing]))
     start = recorded(np.full((2, 5), 7), shown=moved([3.0, 3.0]), earlier=earlier, slack=np.full(2, 0.5))

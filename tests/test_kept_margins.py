@@ -83,7 +83,7 @@ def test_outside_its_card_it_says_so(ships, device, load, motor, told):
         assert len(found) == len(told), found
         for text, part in zip(found, told, strict=True):
             assert f"the agent was not trained on this {part}" in text and "drive-tune auto" in text
-        assert not any("load" in text for text in outside(ships, target, None))  # nobody tells it of a bus
+        assert not any("load" in text for text in outside(ships, target, None))  # the load of a bus is not known
 
 
 def test_an_agent_without_such_a_table_holds_for_its_own_environment(ships):

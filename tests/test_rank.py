@@ -1,4 +1,4 @@
-"""Tuners compared: judged by the constrained oracle and by true margins, counted by the meter, whoever wrote them."""
+"""Tuners compared: judged by the constrained oracle and by true margins, and counted alike."""
 
 from __future__ import annotations
 

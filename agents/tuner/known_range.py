@@ -18,7 +18,7 @@ def outside(agent: AgentFile, target: Target, load: str | None) -> tuple[str, ..
     Args:
         agent: The tuner's file. One whose card has no such table holds for what its configuration has.
         target: What it is to tune.
-        load: Name of the load; None where nobody tells, as on a bus.
+        load: Name of the load; None where it is not known, as on a bus.
     """
     holds = agent.card.get(HOLDS)
     if not isinstance(holds, Mapping):

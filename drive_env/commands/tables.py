@@ -80,7 +80,7 @@ def print_text(text: str) -> None:
     """
     try:
         print(text, end="", flush=True)
-    except BrokenPipeError:  # nobody reads on, which is no mistake
+    except BrokenPipeError:  # the reader has closed the pipe: no error
         raise
     except OSError as error:
         raise OSError(error.errno, f"{error.strerror}; print to where there is room", "standard output") from error
