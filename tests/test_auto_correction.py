@@ -20,6 +20,7 @@ from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocit
 from tuning.auto.identified import calm_gains
 from tuning.auto.proving import RESTLESS, Proof, ProvingGround
 from tuning.auto.stages import TriedGains
+from tuning.auto.twin import FrictionGuess, Known
 from tuning.target import emulated
 
 DEVICE, STANDARD = find_device("tmcm1636"), find_dynamics("standard")
@@ -65,6 +66,8 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
     def design_axes(bench, basis, where, say=None, recorded=None, dynamics=None, most=None):
         assert recorded is not None and time_waits
         bench.most.append(most.tolist())
+        if where.any():
+            bench.asked.append("standard" if dynamics is None else dynamics.name)
         gains = np.array([gains_of(p) for p in np.broadcast_to(designs.pop(0), axes)])
         return gains, np.ones(axes), np.ones(axes)
 
@@ -128,7 +131,7 @@ def bench_of(axes=1, ground=None, seconds=99, time_waits=True):
     )  # fmt: skip
     return Bench(
         target=target, journals=[Journal() for _ in range(axes)], ground=ground, dynamics=STANDARD, response_time=2.3,
-        left=seconds, most=[],
+        left=seconds, most=[], asked=[],
     )  # fmt: skip
 
 
@@ -154,6 +157,28 @@ def test_what_a_move_shows_is_corrected_too(monkeypatch):
     found, bench, _ = corrected(monkeypatch, [800, 800], slack=lambda p: 0.5, **shaking)
     assert found.gains[0, VELOCITY_P] == 800 and not bench.journals[0].reason
     assert bench.journals[0].notes == ["gains designed again from what was measured: it does not come to rest"]
+
+
+@pytest.mark.parametrize(("failed", "asked"), [("it swung", "standard"), ("", "soft")])
+def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(failed, asked, monkeypatch):
+    """What failed its move has no response yet: that says nothing of its loops."""
+    first = {"failed": lambda p: failed if p == 1000 else ""}
+    _, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, slack=lambda p: 0.5, **first)
+    assert bench.asked[0] == asked
+
+
+@pytest.mark.parametrize(("restless", "share"), [(False, 1.0), (True, 0.4)])
+def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless, share, monkeypatch):
+    monkeypatch.setattr(correction, "fitted_plant", lambda *given: ("plant", "found"))
+    monkeypatch.setattr(
+        correction, "known_of", lambda plant, found, reach: Known(plant, FrictionGuess(0.5, 0.01), reach)
+    )
+    bench = SimpleNamespace(target=SimpleNamespace(linked=False))
+    basis_ = SimpleNamespace(
+        trial_reach=lambda bench: np.array([2.0]), identified=SimpleNamespace(known=lambda k: ("plant", "found"))
+    )
+    found = correction._known(bench, basis_, None, 0, restless)
+    assert found.friction == FrictionGuess(pytest.approx(0.5 * share), 0.01) and found.reach == 2.0
 
 
 def test_there_are_two_corrections_at_most(monkeypatch):

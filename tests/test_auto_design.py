@@ -149,9 +149,12 @@ def test_what_say_raises_ends_a_design():
 
 
 def judged(slack, models, axes=1):
-    """Return a judge whose measured loops have slack by their velocity P, and twins that cost 2.0 and keep all."""
+    """Return a judge whose measured loops have slack by their velocity P; twins cost 2, 3, ... by axis and keep all."""
     twins = SimpleNamespace(
-        dynamics=None, num_axes=axes, device=DEVICE, judge=lambda gains: (np.full(gains.shape[:2], 2.0), 1.0)
+        dynamics=None,
+        num_axes=axes,
+        device=DEVICE,
+        judge=lambda gains: (np.full(gains.shape[:2], 2.0) + np.arange(axes)[:, None], 1.0),
     )
     measured = SimpleNamespace(slack=lambda dynamics, gains: slack(gains[:, VELOCITY_P]))
     return Judge(twins, models, [measured] * axes)
@@ -178,4 +181,4 @@ def test_axes_of_one_machine_have_one_slack_and_the_worst_cost():
     both = judged(lambda p: np.ones(len(p)), [(model, np.array([0, 1]))], axes=2)
     rows = np.array([sets(300, 600), sets(450, 450)])
     np.testing.assert_allclose(both.slack(rows), [[0.5, 1.0 / 3.0]] * 2)
-    np.testing.assert_array_equal(*both.score(rows))
+    np.testing.assert_allclose(both.score(rows), 3.0)  # of the second one; the first one costs 2

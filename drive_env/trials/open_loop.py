@@ -134,7 +134,7 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
     J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 q^0.4 (1 + (a/0.5)^2)^0.2 (1 + (n/0.1)^2)^0.2 (1 + max(0, os - 2 %)/10 %)
 
     with q the effort, a the load angle and n the vibration in full steps; beyond 15 it is bent as
-    `score.cost` is, and lost steps cost 30. The ripple of the current, which J of a servo has, is not among them: such a
+    `score.cost` is, and lost steps cost 30. The ripple of the current, which J of a servo has, is not among them: the
     drive does not measure its current.
     """
     raw = (
