@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import warnings
 from contextlib import contextmanager
@@ -123,6 +124,34 @@ def test_make_and_make_vec(kind):
         assert space.dtype == np.float32 and space.is_bounded()
     several.close()
     single.close()
+
+
+# What makes an episode of two steps, and its default number.
+HORIZONS = {
+    "Tracking": ({"duration": 0.002}, 1000),
+    "GainScheduling": ({"duration": 0.02}, 200),
+    "GainTuning": ({"trials": 2}, 10),
+}
+
+
+@EVERY_KIND
+def test_the_spec_tells_the_steps_of_an_episode(kind):
+    """Gymnasium's wrappers ask for it, as TimeAwareObservation does; the environment alone truncates."""
+    short, default = HORIZONS[kind]
+    name = f"ServoDrive/{kind}-v0"
+    for options, steps in (({}, default), (short, 2)):
+        with contextlib.closing(gymnasium.make(f"drive_env:{name}", num_threads=1, **options)) as single:
+            assert single.spec.max_episode_steps == steps and single.spec.reward_threshold is None
+            assert gymnasium.wrappers.TimeAwareObservation(single).max_timesteps == steps
+        with contextlib.closing(gymnasium.make_vec(name, 2, num_threads=1, **options)) as several:
+            assert several.spec.max_episode_steps == steps
+    timed = gymnasium.wrappers.TimeAwareObservation(gymnasium.make(name, num_threads=1, **short))
+    with contextlib.closing(timed):
+        timed.reset(seed=0)
+        ends = [timed.step(timed.action_space.sample())[2:4] for _ in range(2)]
+    assert ends == [(False, False), (False, True)]
+    with contextlib.closing(gymnasium.make(single.spec)) as again:
+        assert again.spec.max_episode_steps == 2
 
 
 @EVERY_KIND

@@ -31,7 +31,7 @@ def section(name: str) -> str:
     """Return what is known of an agent."""
     agent = AgentFile.load(shipped(name))
     card = agent.card
-    module, _ = ENVIRONMENTS[agent.environment]
+    module = ENVIRONMENTS[agent.environment].module
     rows = [
         ("environment", f"[`{agent.environment}`](environments/{module}.md)"),
         ("options that it was trained with", options(agent)),

@@ -29,7 +29,10 @@ for _ in range(100):
     observations, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
 ```
 
-`gym.make("ServoDrive/Tracking-v0")` makes a single one. With Stable-Baselines3 one line makes its `VecEnv`:
+`gym.make("ServoDrive/Tracking-v0")` makes a single one; `gym.make("drive_env:ServoDrive/Tracking-v0")` needs no import
+before, as in the configuration of a training script. The steps of an episode are in `env.spec.max_episode_steps`,
+whatever the configuration makes them, so that wrappers like `TimeAwareObservation` work; the environment itself
+truncates. With Stable-Baselines3 one line makes its `VecEnv`:
 `drive_env.envs.make_vec_env("ServoDrive/Tracking-v0", num_envs=8, load="inertia")`.
 
 Every environment takes
@@ -56,7 +59,7 @@ TASKS = {
 def pages() -> dict[str, str]:
     """Return the index and a page for each environment."""
     rows, made = [], {}
-    for name, (module, kind) in ENVIRONMENTS.items():
+    for name, (module, kind, *_) in ENVIRONMENTS.items():
         rows.append((f"[`{name}`]({module}.md)", TASKS[kind]))
         made[f"{FOLDER}/{module}.md"] = page(name, module, kind)
     return {f"{FOLDER}/index.md": INDEX.format(table=table(("name", "what an agent does"), rows)), **made}

@@ -64,7 +64,7 @@ def draw_loads() -> None:
 
 def draw_environments() -> None:
     """Draw every environment after some steps, with an agent that ships at work where there is one."""
-    for name, (module, _) in ENVIRONMENTS.items():
+    for name, (module, *_) in ENVIRONMENTS.items():
         row = ENVIRONMENT_ROWS[module]
         with gymnasium.make(name, render_mode="rgb_array", **row.options) as env:
             policy = open_policy(row.policy).policy if row.policy else None

@@ -7,29 +7,41 @@ is a view of it.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-# Name -> file and class of the vector environment.
+
+class EnvironmentRow(NamedTuple):
+    """File and class of a vector environment, and the return from which Gymnasium's users count it as solved.
+
+    The steps of an episode are the configuration's: an environment tells them in its `spec` once it is made.
+    """
+
+    module: str
+    kind: str
+    reward_threshold: float | None = None
+
+
 ENVIRONMENTS = {
-    "ServoDrive/GainTuning-v0": ("gain_tuning", "GainTuning"),
-    "ServoDrive/GainScheduling-v0": ("gain_scheduling", "GainScheduling"),
-    "ServoDrive/Tracking-v0": ("tracking", "Tracking"),
+    "ServoDrive/GainTuning-v0": EnvironmentRow("gain_tuning", "GainTuning"),
+    "ServoDrive/GainScheduling-v0": EnvironmentRow("gain_scheduling", "GainScheduling"),
+    "ServoDrive/Tracking-v0": EnvironmentRow("tracking", "Tracking"),
 }
 
 
 def register() -> None:
     """Register the environments with Gymnasium, once."""
-    for name, (module, kind) in ENVIRONMENTS.items():
+    for name, row in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
                 name,
-                entry_point=f"drive_env.envs:make_{module}",
-                vector_entry_point=f"drive_env.envs.{module}:{kind}",
+                entry_point=f"drive_env.envs:make_{row.module}",
+                vector_entry_point=f"drive_env.envs.{row.module}:{row.kind}",
+                reward_threshold=row.reward_threshold,
             )
 
 
@@ -55,8 +67,8 @@ def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
         from drive_env.envs.stable_baselines import DriveVecEnv
     except ImportError as error:
         raise ImportError(f"make_vec_env needs Stable-Baselines3 ({error}): pip install 'drive-env[agents]'") from None
-    module, kind = ENVIRONMENTS[name]
-    lanes = getattr(importlib.import_module(f"drive_env.envs.{module}"), kind)
+    row = ENVIRONMENTS[name]
+    lanes = getattr(importlib.import_module(f"drive_env.envs.{row.module}"), row.kind)
     return VecMonitor(DriveVecEnv(lanes(num_envs, autoreset_mode="SameStep", **options)))
 
 

@@ -250,6 +250,11 @@ class GainScheduling(VectorEnvironment):
             self._close_environments()
             raise
 
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps of an episode."""
+        return int(self._steps)
+
     # --- Environments
     # ----------------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:

@@ -231,6 +231,11 @@ class GainTuning(VectorEnvironment):
             self._close_environments()
             raise
 
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps of an episode."""
+        return int(self.config.trials)
+
     # --- construction ---------------------------------------------------------------------------------------------
     def _new_drives(self, num_envs: int) -> Any:
         from drive_env.emulator.emulated_drives import EmulatedDrives

@@ -292,6 +292,11 @@ class Tracking(VectorEnvironment):
             self._close_environments()
             raise
 
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps of an episode."""
+        return int(self.config.steps)
+
     # --- construction ---------------------------------------------------------------------------------------------
     def _new_drives(self, num_envs: int) -> Any:
         from drive_env.emulator.emulated_drives import EmulatedDrives

@@ -6,12 +6,14 @@ actions alone, so that it is the same among 1, 8 or 64 environments and under an
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -87,6 +89,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
         self._some_ended = False
         self._has_begun = False
         self._stage: float | None = None
+        self._spec: EnvSpec | None = None
 
     # --- what a subclass gives ------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Observation, Info]:
@@ -119,6 +122,11 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
             )
         return observation, own.copy(), terminated, truncated, info
 
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Steps after which an episode is truncated; None if there is no such number."""
+        return None
+
     def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         raise NotImplementedError
 
@@ -147,6 +155,18 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
         return Curriculum() if machines is None else machines.distributions.curriculum
 
     # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What it was made by, with the steps of an episode as they are configured; None if not by Gymnasium."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        # Gymnasium wraps what is registered with a number of steps into a limit of its own, whatever the duration is.
+        self._spec = copy.copy(spec)
+        if self._spec is not None and self._spec.max_episode_steps is None:
+            self._spec.max_episode_steps = self.max_episode_steps
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
@@ -267,6 +287,15 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
         self.action_space = vector.single_action_space
         self.render_mode = vector.render_mode
         self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """As of the vectorised environment."""
+        return self.vector.spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self.vector.spec = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
         """Begin an episode."""
