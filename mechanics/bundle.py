@@ -7,7 +7,7 @@ shape of each array; what is passed is the table's address. Compiled code reads 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
@@ -56,6 +56,32 @@ class Bundle:
     @property
     def _layout(self) -> Any:
         return type(self)
+
+    def save_state(self) -> dict[str, Any]:
+        """Return copies of what is in it but integers, which are addresses or fixed, and arrays that are read-only."""
+        found: dict[str, Any] = {}
+        for name in fields_of(self._layout):
+            value = getattr(self, name)
+            if isinstance(value, Bundle):
+                found[name] = value.save_state()
+            elif isinstance(value, np.ndarray):
+                found |= {name: value.copy()} if value.flags.writeable else {}
+            elif not isinstance(value, int) or isinstance(value, bool):
+                found[name] = value
+        return found
+
+    def restore_state(self, state: Mapping[str, Any]) -> None:
+        """Bring back what `save_state` returned, into the arrays that are there where they are as large."""
+        changed = {}
+        for name, value in state.items():
+            own = getattr(self, name)
+            if isinstance(own, Bundle):
+                own.restore_state(value)
+            elif isinstance(own, np.ndarray) and own.shape == value.shape:
+                own[...] = value
+            else:
+                changed[name] = np.array(value) if isinstance(own, np.ndarray) else value
+        self.replace(**changed)
 
     def replace(self, **values: Any) -> None:
         """Set fields; compiled code sees them from its next call on."""

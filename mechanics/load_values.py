@@ -16,6 +16,7 @@ Floats = NDArray[np.float64]
 FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")
 CONTACT_COLUMNS = ("low", "high", "contact_stiffness", "contact_damping")
 ROLL_COLUMNS = ("start", "core", "thickness", "density")
+VALUE_ARRAYS = ("armature", "friction", "contact", "roll", "stiffness", "damping")  # of LoadValues
 _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
 from mechanics.load import Load
-from mechanics.load_values import FRICTION_COLUMNS, LoadValues
+from mechanics.load_values import FRICTION_COLUMNS, VALUE_ARRAYS, LoadValues
 from mechanics.modal import Corrections, corrections
 from mechanics.plant import PackedPlant
 from mechanics.template import Template, template_of
@@ -266,6 +266,24 @@ class PackedLoad:
             profile_of_position=of_position,
             profile_period=float(period),
         )
+
+    def save_state(self) -> dict[str, Any]:
+        """Return all that the copies go on from, position, speed and parameters, as dicts of arrays."""
+        return {
+            "model": {name: getattr(self.model, name).copy() for name in self.template.model_arrays},
+            "mean_inertia": float(self.model.stat.meaninertia),
+            "data": {name: getattr(self.data, name).copy() for name in self.template.data_arrays},
+            "values": {name: getattr(self.values, name).copy() for name in VALUE_ARRAYS},
+            "plant": self.plant.save_state(),
+        }
+
+    def restore_state(self, state: Mapping[str, Any]) -> None:
+        """Bring copies of the same load to what `save_state` returned."""
+        for own, saved in ((self.model, state["model"]), (self.data, state["data"]), (self.values, state["values"])):
+            for name, values in saved.items():
+                getattr(own, name)[...] = values
+        self.model.stat.meaninertia = state["mean_inertia"]
+        self.plant.restore_state(state["plant"])
 
     def joint_positions(self) -> Floats:
         """Return the joints' positions [rad or m], shape (copies, D), half a step ago if staggered."""

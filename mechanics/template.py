@@ -6,6 +6,7 @@ import re
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import mujoco
@@ -94,6 +95,25 @@ class Template:
             if name not in self.joints
         }
         self._row, self._column, self._entry = self._places_of_inertia()
+
+    @cached_property
+    def model_arrays(self) -> tuple[str, ...]:
+        """Arrays of a copy of the model that a load's parameters change, or MuJoCo derives from what they change."""
+        return tuple(
+            name
+            for name in dir(self.model)
+            if name.startswith(("body_", "dof_", "jnt_", "tendon_", "efm0_"))
+            and isinstance(array := getattr(self.model, name), np.ndarray)
+            and array.dtype == float
+            and array.size
+        )
+
+    @cached_property
+    def data_arrays(self) -> tuple[str, ...]:
+        """Arrays of a model's data that a step leaves for the next: not those that it makes as long as it needs."""
+        data = mujoco.MjData(self.model)
+        arrays = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
+        return tuple(name for name, array in arrays.items() if isinstance(array, np.ndarray) and array.size)
 
     @property
     def scratch(self) -> mujoco.MjData:

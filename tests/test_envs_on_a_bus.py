@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from contextlib import contextmanager
 
 import numpy as np
@@ -104,3 +106,19 @@ def test_gain_tuning(load):
         found = run(env, 1, seed=3)
         env.close()
     assert_same(expected, found)
+
+
+def test_environments_on_a_bus_have_no_state_that_could_be_put_back():
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated, on_a_bus(emulated) as drives:
+        lanes = Tracking(1, load="inertia", drives=drives)
+        for refused in (lanes.save_state, lambda: lanes.restore_state({})):
+            with pytest.raises(
+                ValueError, match="a state is of emulated drives; on a bus nobody can put machines back"
+            ):
+                refused()
+        for duplicate in (copy.deepcopy, pickle.dumps):
+            with pytest.raises(
+                TypeError, match="an environment on drives that were given to it can neither be pickled"
+            ):
+                duplicate(lanes)
+        lanes.close()

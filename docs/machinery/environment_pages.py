@@ -46,6 +46,16 @@ Every environment takes
 - `reward=`, a function of observations, actions and info of your own; `info["reward_terms"]` has the terms of ours;
 - `stage`, 0 to 1, an attribute that widens the set of machines during training.
 
+## States
+
+`state = env.unwrapped.save_state()` takes down all that an environment goes on from: drives, machine, trajectory,
+messages on the bus, random generators, how far the episode is. `env.unwrapped.restore_state(state)` puts it back, and
+what follows is the same to the bit, as often as you like: for planning with the emulator as the model, for resets to a
+state, for a tree search. A state is dicts of arrays; it pickles, and another environment of the same configuration
+takes it, in another process too. One of another configuration is refused with what differs. `copy.deepcopy(env)` and
+`pickle` copy an environment with its state. Vector environments do all that likewise. Real drives cannot be put back:
+on a bus all of it is refused.
+
 The file that an environment's configuration comes from may hold any field of the tables on its page.
 """
 # One line for the index: what an agent does there.

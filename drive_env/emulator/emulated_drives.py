@@ -41,6 +41,7 @@ from drive_env.firmware.cycle import Call
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.master.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.motors import Motor, find_motor
+from drive_env.saved_state import Saved, State, check_alike
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import copies_per_model
@@ -66,7 +67,7 @@ def check_number_of_machines(number: int) -> None:
         raise ValueError(f"num_machines must be {MOST_MACHINES} at most, not {number}")
 
 
-class EmulatedDrives:
+class EmulatedDrives(Saved):
     """Emulated drives that turn emulated machines.
 
     The drives come up commissioned for their motor and in switch on disabled; with `commissioned=False` they have their
@@ -95,6 +96,8 @@ class EmulatedDrives:
     Raises:
         ValueError: For an unknown name, a motor that the device does not turn, or a machine that cannot be.
     """
+
+    STATE = ("_objects", "_parameters", "_noise_seeds", "_now", "_schedule", "_reported", "_faults")
 
     # Of the Drives interface: what emulated drives do not have, and their time, which passes when it is asked to.
     bus = None
@@ -304,6 +307,34 @@ class EmulatedDrives:
     def reset_node(self, where: Mask | None = None) -> None:
         """Reset the drives (NMT reset node): values return to the stored ones, the automaton starts anew."""
         self._objects.restart(checked_mask(where, self.num_axes))
+
+    # --- states ---------------------------------------------------------------------------------------------------
+    def save_state(self) -> State:
+        """Return all that drives and machines go on from, bit by bit, as plain data that pickles."""
+        return {
+            "of": self._description(),
+            "groups": [group.load.save_state() for group in self._groups],
+        } | super().save_state()
+
+    def restore_state(self, state: State) -> None:
+        """Put drives and machines back to a state that such drives have saved, these or others that were made alike.
+
+        Raises:
+            ValueError: For a state of other drives, naming what differs.
+        """
+        check_alike("drives", state["of"], self._description())
+        super().restore_state(state)
+        for group, saved in zip(self._groups, state["groups"], strict=True):
+            group.load.restore_state(saved)
+
+    def _description(self) -> State:
+        """Return what drives must have in common to have the same states."""
+        groups = [(group.load.copies, group.load.h, group.load.staggered) for group in self._groups]
+        return {
+            "device": self.device.name, "load": str(self.load.name), "motor": self.motor.name,
+            "machines": self.num_machines, "parameters": sorted(self._parameters), "models": groups,
+            "bytes of a record": self._records.dtype.itemsize,
+        }  # fmt: skip
 
     def close(self) -> None:
         """Give the threads back; the drives cannot be used afterwards."""

@@ -129,10 +129,33 @@ class LiveDictionary:
             values = self._values.get(key)
             if isinstance(values, np.ndarray):
                 np.copyto(values, raw, where=axes)
-        after = self.context()
-        if any(np.any(one != other) for one, other in zip(before, after, strict=True)):
-            self._scale_changes += 1
+        self._count_scale_change(before)
         self.device.firmware.power_on(self._records, axes)
+
+    def save_state(self) -> dict[str, Any]:
+        """Return records, values beside them and what is stored, as plain data."""
+        return {
+            "records": self._records.view(np.uint8).copy(),
+            "values": {key: value.copy() for key, value in self._values.items() if isinstance(value, np.ndarray)},
+            "stored": {key: raw.copy() for key, raw in self._stored.items()},
+            "network_codes": self.network_codes.copy(),
+        }
+
+    def restore_state(self, state: Mapping[str, Any]) -> None:
+        """Bring records and values of as many axes of the same device to what `save_state` returned."""
+        before = self.context()
+        self._records.view(np.uint8)[...] = state["records"]
+        self._count_scale_change(before)
+        self._values |= {key: value.copy() for key, value in state["values"].items()}
+        self.network_codes = state["network_codes"].copy()
+        if any(not np.array_equal(self._stored[key], raw) for key, raw in state["stored"].items()):
+            self._stored = {key: raw.copy() for key, raw in state["stored"].items()}
+            self._snapshot = None
+
+    def _count_scale_change(self, before: units.Context) -> None:
+        """Count a change if the scales are others than those of before."""
+        if any(np.any(one != other) for one, other in zip(before, self.context(), strict=True)):
+            self._scale_changes += 1
 
     @property
     def records(self) -> NDArray[np.void]:

@@ -15,6 +15,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
+from drive_env.saved_state import Saved
 from mechanics.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector, reader
 from mechanics.compiled import cached, inlined, stage
 
@@ -26,7 +27,7 @@ Mask = NDArray[np.bool_]
 _LOST, _ACTION, _OBSERVATION = (k << 40 for k in (1, 2, 3))
 
 
-class BusDelays:
+class BusDelays(Saved):
     """The delays of every environment's bus; an environment's chance follows from its generator alone.
 
     Args:
@@ -35,6 +36,8 @@ class BusDelays:
 
     Compiled code passes messages on by `pass_on`, with the lines' addresses.
     """
+
+    STATE = ("actions", "observations", "is_there")
 
     def __init__(self, num_envs: int, deepest: int = 8) -> None:
         self._keys = np.zeros(num_envs, np.uint64)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.envs.vector_environment import check_choice
+from drive_env.saved_state import Saved
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
@@ -55,7 +56,7 @@ def find_payload(load: Load, chosen: str, low: float | None, high: float | None)
     return Payload(name, low, high)
 
 
-class PayloadChanges:
+class PayloadChanges(Saved):
     """When each machine's payload changes in an episode, and to what: once in each of its equal parts.
 
     Args:
@@ -69,6 +70,8 @@ class PayloadChanges:
         at: Step of each change, shape (num_envs, count).
         factor: On the nominal value, from then on, shape (num_envs, count).
     """
+
+    STATE = ("at", "factor")
 
     def __init__(self, payload: Payload, machines: Machines, num_envs: int, steps: int, count: int) -> None:
         self._payload = payload

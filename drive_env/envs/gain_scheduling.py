@@ -208,6 +208,11 @@ class GainScheduling(VectorEnvironment):
         ValueError: For a value that is none, naming those that are.
     """
 
+    STATE = (
+        *VectorEnvironment.STATE, "_machines", "_payload_changes", "_programme", "_bus", "_gain_bus", "_now", "_origin",
+        "_action", "_acting", "_parameters", "_samples",
+    )  # fmt: skip
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -236,6 +241,8 @@ class GainScheduling(VectorEnvironment):
         self._cycles = round(self.config.step / CYCLE)
         self._steps = round(self.config.duration / self.config.step)
         self._action: Floats = np.zeros(0)  # of every axis
+        nothing = np.zeros((self._cycles, num_envs * self._axes))
+        self._samples = nothing, nothing, nothing  # of the last step, as they have come: error, velocity, current
         self._parameters: dict[str, Floats] = {}  # the true machines
         c = self.config
         self._payload = find_payload(row, c.payload, c.payload_low, c.payload_high)
@@ -285,8 +292,12 @@ class GainScheduling(VectorEnvironment):
             self._gain_bus.reset(self._machines.values, self.rngs, gains, at_rest, mask)
         if self._pictures is not None:
             self._pictures.begin(mask)
-        nothing = np.zeros((self._cycles, self.drives.num_axes))
-        return self._observe(nothing, nothing, nothing), self._tell(np.full(self.num_envs, "", object))
+        error, velocity, current = (np.where(axes, 0.0, rows) for rows in self._samples)
+        self._samples = error, velocity, current
+        return self._present()
+
+    def _present(self) -> tuple[NDArray[np.float32], Info]:
+        return self._observe(*self._samples), self._tell(np.full(self.num_envs, "", object))
 
     def _step_environments(self, action: Any) -> Stepped:
         chosen = np.clip(np.asarray(action, float).reshape(self._action.shape), -1.0, 1.0)
@@ -302,9 +313,9 @@ class GainScheduling(VectorEnvironment):
         terminated = fault != ""
         terms = self._terms(error, current, terminated)
         reward = sum(weight * terms[name] for name, weight in self.config.weights.items())
-        seen = self._seen(error, velocity, current)
+        self._samples = self._seen(error, velocity, current)
         info = self._tell(fault) | {"reward_terms": terms}
-        return self._observe(*seen), np.asarray(reward, float), terminated, self._now >= self._steps, info
+        return self._observe(*self._samples), np.asarray(reward, float), terminated, self._now >= self._steps, info
 
     def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         return None if self._pictures is None else self._pictures.draw(lane)

@@ -191,6 +191,12 @@ class GainTuning(VectorEnvironment):
         ValueError: For a value that is none, naming those that are.
     """
 
+    STATE = (
+        *VectorEnvironment.STATE, "_machines", "_score", "_trials", "_identified", "_move", "_origin", "_direction",
+        "_safe", "_rule", "_best", "_last", "_best_is_stable", "_following", "_last_features", "_best_features",
+        "_wave", "_measured", "_robust_cost", "_left", "_noise", "_trial", "_parameters",
+    )  # fmt: skip
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -348,6 +354,9 @@ class GainTuning(VectorEnvironment):
         info["aborted"] = mask & self._stopped(tried)
         info["faults"] = faults
         return self._observe(), info
+
+    def _present(self) -> tuple[Any, Info]:
+        return self._observe(), self._told()
 
     def _step_environments(self, action: Any) -> Stepped:
         n = self.num_envs

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.saved_state import Saved
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -28,7 +30,7 @@ class Reach(NamedTuple):
     acceleration: Floats
 
 
-class Programme:
+class Programme(Saved):
     """A programme for each environment: all axes of an environment move in unison, from rest at the start.
 
     Args:
@@ -37,6 +39,8 @@ class Programme:
         preview: Cycles that are known beyond it.
         cycle: [s].
     """
+
+    STATE = ("_table",)
 
     def __init__(self, num_envs: int, cycles: int, preview: int, cycle: float) -> None:
         self._cycle = cycle

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from drive_env.envs.random_faults import RandomFaults, check_ranges
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS, names_of
+from drive_env.saved_state import Saved
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -226,7 +227,7 @@ class Distributions:
         return "\n".join(lines) + "\n"
 
 
-class RandomMachines:
+class RandomMachines(Saved):
     """Emulated machines drawn anew, environment by environment.
 
     Args:
@@ -236,6 +237,8 @@ class RandomMachines:
     Raises:
         ValueError: If a distribution names a parameter that these machines do not have.
     """
+
+    STATE = ("values", "_orders")
 
     def __init__(self, drives: EmulatedDrives, distributions: Distributions) -> None:
         self.distributions = distributions

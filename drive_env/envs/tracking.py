@@ -262,6 +262,8 @@ class Tracking(VectorEnvironment):
         ValueError: For a value that is none, naming those that are.
     """
 
+    STATE = (*VectorEnvironment.STATE, "_machines", "_bus", "_episodes")
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -431,7 +433,10 @@ class Tracking(VectorEnvironment):
         if self._pictures is not None:
             self._pictures.begin(mask)
         cycle.describe_lanes(own.address, mask)
-        observation = own.observation.copy()
+        return self._present()
+
+    def _present(self) -> tuple[NDArray[np.float32], Info]:
+        observation = self._episodes.observation.copy()
         if self._machines is None:
             return observation, {}
         return observation, {"parameters": {name: values.copy() for name, values in self._machines.values.items()}}

@@ -7,8 +7,10 @@ actions alone, so that it is the same among 1, 8 or 64 environments and under an
 from __future__ import annotations
 
 import copy
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import gymnasium
@@ -19,7 +21,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.envs.randomisation import Curriculum
+from drive_env.envs.randomisation import Curriculum, Distributions
+from drive_env.saved_state import Saved, State, check_alike
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +35,7 @@ Reward = Callable[[Observation, Any, Info], ArrayLike]
 RENDER_MODES = ("rgb_array", "human")
 
 
-class VectorEnvironment(VectorEnv[Any, Any, Any]):
+class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     """Base of the vector environments; `config` is a subclass's configuration.
 
     A subclass gives `_reset_environments` and `_step_environments`; it may replace `_render_environment` and
@@ -58,7 +61,10 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
             one that is not a number.
     """
 
+    STATE: tuple[str, ...] = ("_ended", "_some_ended", "_has_begun", "_stage", "_np_random_seed")
     config: Any
+    drives: Any
+    _owned: bool  # whether the drives are its own
 
     def __init__(
         self,
@@ -122,6 +128,10 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
             )
         return observation, own.copy(), terminated, truncated, info
 
+    def _present(self) -> tuple[Observation, Info]:
+        """Return what a reset that led to the present state would have: observations, and what is to be told."""
+        raise NotImplementedError
+
     @property
     def max_episode_steps(self) -> int | None:
         """Steps after which an episode is truncated; None if there is no such number."""
@@ -153,6 +163,61 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
         """Schedule of the stage that the distributions have; of drives that are taken as they are, a constant."""
         machines = getattr(self, "_machines", None)
         return Curriculum() if machines is None else machines.distributions.curriculum
+
+    # --- states ---------------------------------------------------------------------------------------------------
+    def save_state(self) -> State:
+        """Return all that the environments go on from, as plain data that pickles: continued from it, they do the same.
+
+        It holds drives, machines, trajectories, delays, random generators and how far each episode is; a function that
+        was given, as a reward, is none of it.
+
+        Raises:
+            ValueError: On a bus: real drives cannot be put back.
+        """
+        return {
+            "of": self._description(),
+            "drives": self._emulated_drives().save_state(),
+            "rngs": [rng.bit_generator.state for rng in self.rngs],
+        } | super().save_state()
+
+    def restore_state(self, state: State) -> None:
+        """Put the environments back to a state that these have saved, or others of the same configuration.
+
+        Raises:
+            ValueError: For a state of another configuration, naming what differs; on a bus.
+        """
+        drives = self._emulated_drives()
+        check_alike("environments", state["of"], self._description())
+        drives.restore_state(state["drives"])
+        super().restore_state(state)
+        for rng, saved in zip(self.rngs, state["rngs"], strict=True):
+            rng.bit_generator.state = saved
+        if (pictures := getattr(self, "_pictures", None)) is not None:
+            pictures.begin(np.ones(self.num_envs, bool))
+
+    def _emulated_drives(self) -> Any:
+        machine = self.drives.machine
+        if machine is None:
+            raise ValueError("a state is of emulated drives; on a bus nobody can put machines back to it")
+        return machine.drives
+
+    def _description(self) -> State:
+        """Return what environments must have in common to have the same states."""
+        from drive_env import __version__
+
+        table = {one.name: _text(getattr(self.config, one.name)) for one in fields(self.config)}
+        table.pop("num_threads", None)
+        return {"environment": type(self).__name__, "version": __version__, "num_envs": self.num_envs, **table}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if not self._owned:
+            raise TypeError(
+                "an environment on drives that were given to it can neither be pickled nor copied: they are no part of "
+                "it"
+            )
+        how = {"config": self.config, "autoreset_mode": self.autoreset_mode, "render_mode": self.render_mode}
+        how |= {"reward": self.reward_function}
+        return _restored, (type(self), self.num_envs, how, self.save_state(), self._spec)
 
     # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
     @property
@@ -325,6 +390,24 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
         """Return the picture, uint8 of shape (height, width, 3); "human" shows it and returns None."""
         return self.vector.render_environment(0)
 
+    def save_state(self) -> State:
+        """Return all that the environment goes on from, as `VectorEnvironment.save_state` does."""
+        rng = self._np_random
+        return self.vector.save_state() | {"np_random": None if rng is None else rng.bit_generator.state}
+
+    def restore_state(self, state: State) -> None:
+        """Put the environment back to a state that it has saved, or another of the same configuration.
+
+        Raises:
+            ValueError: As `VectorEnvironment.restore_state`.
+        """
+        self.vector.restore_state(state)
+        if (saved := state.get("np_random")) is not None:
+            self.np_random.bit_generator.state = saved
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.vector,), {"_np_random": self._np_random, "_np_random_seed": self._np_random_seed}
+
     def close(self) -> None:
         """Release drives and pictures."""
         self.vector.close()
@@ -373,6 +456,21 @@ def one_of(tree: Any) -> Any:
         for key, value in tree.items()
         if not key.startswith("_") and (f"_{key}" not in tree or tree[f"_{key}"][0])
     }
+
+
+def _restored(kind: Any, num_envs: int, how: dict[str, Any], state: State, spec: EnvSpec | None) -> VectorEnvironment:
+    """Return environments made anew, in a state."""
+    made: VectorEnvironment = kind(num_envs, **how)
+    made.restore_state(state)
+    made.spec = spec
+    return made
+
+
+def _text(value: Any) -> str:
+    """Return a field of a configuration as text that is the same for the same value."""
+    if isinstance(value, Distributions):
+        return value.to_toml()
+    return f"{value.__module__}.{value.__qualname__}" if inspect.isroutine(value) else repr(value)
 
 
 def check_choice(what: str, value: Any, valid: Sequence[Any]) -> None:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_CHANGING = ("axes", "state", "begins", "ends")  # of a fault, beside what its order says
 ABSENT, WAITING, DUE, ON, OVER = range(5)  # a machine: not concerned, waits for the condition, for the time, ...
 TWO_PI = 2.0 * math.pi
 SEED_STEP = 2_654_435_761  # golden ratio of 2^32: neighbouring seeds give noises apart
@@ -134,23 +135,17 @@ class MachineFaults:
                 f"fault stage_short: phase={given['phase']:g} must be -1 to {len(changes) - 2} of a "
                 f"{drives.device.name}; -1 is a short across the DC link"
             )
-        delay, length = cycles_of(order, row, drives.inside.cycles)
-        condition = Condition.parse(order.when)
         axes = np.repeat(machines, self._axes_per_machine)
         if axis is not None:
             axes &= np.arange(drives.num_axes) % self._axes_per_machine == axis
         if of_node is not None:
             axes &= of_node
+        fault = self._made(self._next_number + 1, order, axes)
         self._rehearse(changes, given, axes)
         self._next_number += 1
-        begins = np.full(drives.num_machines, drives.inside.cycle + delay)
-        state = np.where(machines, DUE if condition.quantity == NO_CONDITION else WAITING, ABSENT)
-        self._faults.append(
-            _MachineFault(
-                self._next_number, order, row, given, condition, changes, delay, length, axes, state, begins,
-                np.full(drives.num_machines, NEVER),
-            )
-        )  # fmt: skip
+        fault.begins[:] = drives.inside.cycle + fault.delay
+        fault.state[:] = np.where(machines, DUE if fault.condition.quantity == NO_CONDITION else WAITING, ABSENT)
+        self._faults.append(fault)
         return self._next_number
 
     def check(self, order: Order) -> tuple[FaultRow, tuple[Change, ...]]:
@@ -196,6 +191,27 @@ class MachineFaults:
         """Whether there is any fault to look after."""
         return bool(self._faults)
 
+    # --- states ---------------------------------------------------------------------------------------------------
+    def save_state(self) -> dict[str, Any]:
+        """Return the faults that are there or still to come, and what they act on, as plain data."""
+        return {
+            "next": self._next_number,
+            "jam": self._jam.copy(),
+            "base": {quantity: values.copy() for quantity, values in self._base.items()},
+            "held": {quantity: mask.copy() for quantity, mask in self._held.items()},
+            "faults": [
+                (fault.number, fault.order, *(getattr(fault, name).copy() for name in _CHANGING))
+                for fault in self._faults
+            ],
+        }
+
+    def restore_state(self, state: Mapping[str, Any]) -> None:
+        """Take the faults of a state over, with machines and records that are those of the state already."""
+        self._next_number, self._jam = state["next"], state["jam"].copy()
+        self._base = {quantity: values.copy() for quantity, values in state["base"].items()}
+        self._held = {quantity: mask.copy() for quantity, mask in state["held"].items()}
+        self._faults = [self._made(number, order, *arrays) for number, order, *arrays in state["faults"]]
+
     # --- time -----------------------------------------------------------------------------------------------------
     def act(self, now: int) -> int:
         """Begin and end what is due at cycle `now`; return the cycle by which to call again."""
@@ -237,6 +253,17 @@ class MachineFaults:
                 self._refresh(fault)
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _made(self, number: int, order: Order, axes: Mask, *changing: NDArray[np.int64]) -> _MachineFault:
+        """Return a fault as its order has it, with its axes, and its state, begin and end in each machine."""
+        row, changes = self.check(order)
+        delay, length = cycles_of(order, row, self._drives.inside.cycles)
+        given, condition = checked_parameters(row, order.parameters), Condition.parse(order.when)
+        nothing = np.zeros(self._drives.num_machines, np.int64)
+        state, begins, ends = (array.copy() for array in changing or (nothing, nothing, nothing + NEVER))
+        return _MachineFault(
+            number, order, row, given, condition, changes, delay, length, axes.copy(), state, begins, ends
+        )
+
     def _changes(self, name: str) -> tuple[Change, ...]:
         load = self._drives.load
         names = tuple(parameter.name for parameter in load.parameters)

@@ -143,6 +143,7 @@ class ClosedLoopTrials(OpenLoopTrials):
     The machine is identified with the loop open; it is closed then, and is what it was after `leave`.
     """
 
+    STATE = (*OpenLoopTrials.STATE, "_closes", "_inertia")
     computes_demand = False  # how far an axis is behind is what is seen of its loop
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float, closed: ClosedLoop) -> None:

@@ -21,6 +21,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains
 from drive_env.motors import Motor
+from drive_env.saved_state import Saved
 from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
@@ -110,7 +111,7 @@ def measured_cost(costs: Floats) -> Floats:
     return np.asarray(0.5 * costs[:2].mean(axis=0) + 0.5 * costs.max(axis=0))
 
 
-class Trials:
+class Trials(Saved):
     """Runs trials on drives; the axes of a machine are stopped together.
 
     Args:

@@ -64,6 +64,7 @@ ON_FROM = 0.8  # of the working speed, from which CoolStep acts in a trial
 class LoadDetectionTrials(OpenLoopTrials):
     """Runs trials of a load detection, as `Trials` does of loops; every trial ends where it began."""
 
+    STATE = (*OpenLoopTrials.STATE, "_away", "_acceleration", "_per_volt")
     returns = True
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:

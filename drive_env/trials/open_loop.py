@@ -229,6 +229,8 @@ class OpenLoopTrials(Trials):
     counter gets.
     """
 
+    STATE: tuple[str, ...] = ("sensor", "window", "loop", "acts_by_load", "_speeds", "_zero", "_fell")
+
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         super().__init__(drives, motor, axes, t_0)
         self.sensor: Integers | None = None

@@ -49,6 +49,7 @@ from drive_env.gains import has_linear_model, small_time_constants, write_gains
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
 from drive_env.loops.true_plant import elastic_lags, true_machines
+from drive_env.saved_state import Saved
 from drive_env.trials.positioning import (
     CYCLE,
     SETTLED,
@@ -211,7 +212,7 @@ class CurrentSwings(NamedTuple):
     resting: Floats
 
 
-class RobustScore:
+class RobustScore(Saved):
     """Scores gains on emulated machines: every variant of every machine is a machine of one set, run side by side.
 
     The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
@@ -231,6 +232,8 @@ class RobustScore:
         repeats: Runs of every variant of every machine, whose scores are averaged.
         dynamics: What the loops must keep.
     """
+
+    STATE = ("_drives", "_t_0", "_reference", "_move", "_loops", "_constant")
 
     def __init__(
         self,
