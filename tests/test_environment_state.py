@@ -1,4 +1,7 @@
-"""An environment's state is data: continued from it, environments do the same to the bit, here and elsewhere."""
+"""An environment's state is data: continued from it, environments do the same to the bit, here and elsewhere.
+
+And a reset may begin from a state, with a machine and a trajectory that are given.
+"""
 
 from __future__ import annotations
 
@@ -204,3 +207,138 @@ def test_a_state_of_other_drives_is_refused():
         pytest.raises(ValueError, match="the state is of other drives: load is inertia there and belt here"),
     ):
         other.restore_state(one.save_state())
+
+
+# --- what a reset may be given ----------------------------------------------------------------------------------------
+@A_FEW_CASES
+def test_a_reset_to_a_state_returns_what_was_seen_there_and_goes_on(kind, options):
+    with made(kind, options, 3) as environments, made(kind, options, 3) as others:
+        environments.reset(seed=5)
+        seen = run(environments, actions(environments, 1, 0))[-1][0]
+        state = environments.save_state()
+        told = environments.reset(options={"reset_mask": np.array([True, False, False])})[0]
+        begun = environments.save_state()
+        observation, info = others.reset(options={"state": state})
+        np.testing.assert_array_equal(observation, seen)
+        for name, values in environments.drives.machine.parameters.items():
+            assert values[1] == info["parameters"][name][1], name
+        np.testing.assert_array_equal(others.reset(options={"state": begun})[0][1:], seen[1:])  # these go on
+        np.testing.assert_array_equal(others.reset(options={"state": begun})[0][0], told[0])
+        given = actions(environments, 2, 1)
+        assert_same(run(others, given), run(environments, given))
+    name = f"ServoDrive/{kind.__name__}-v0"
+    with contextlib.closing(gymnasium.make(name, num_threads=1, **options)) as single:
+        single.reset(seed=5)
+        state = single.unwrapped.save_state()
+        single.unwrapped.np_random.random()
+        single.reset(options={"state": state})
+        np.testing.assert_equal(single.unwrapped.save_state(), state)
+
+
+def test_an_episode_that_had_ended_has_ended_in_its_state():
+    with made(Tracking, {"duration": 0.002, "autoreset_mode": "Disabled"}) as environments:
+        environments.reset(seed=0)
+        run(environments, actions(environments, 2, 0))
+        state = environments.save_state()
+        environments.reset()
+        environments.restore_state(state)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            environments.step(environments.action_space.sample())
+
+
+@pytest.mark.parametrize(("kind", "options"), [
+    (Tracking, {"distributions": "two_mass"}), (GainScheduling, {"load": "two_mass", "payload": "none"}),
+    (GainTuning, {"load": "two_mass"}),
+])  # fmt: skip
+def test_a_reset_takes_parameters_of_the_machine_for_one_episode(kind, options):
+    """Of every environment or of each its own; what has a distribution is drawn again later, the rest is default."""
+    given = {"motor.R_s": 0.7, "load.inertia": [1e-5, 2e-5]}
+    with made(kind, options) as environments:
+        environments.reset(seed=2)
+        drawn = environments.reset(seed=4)[1]["parameters"]
+        defaults = kind(1, num_threads=1, **options | {"distributions": {"parameters": {}}})
+        usual = defaults.drives.machine.parameters
+        defaults.close()
+        info = environments.reset(seed=4, options={"machine": given})[1]
+        true = environments.drives.machine.parameters
+        for name, value in given.items():
+            np.testing.assert_array_equal(true[name], value * np.ones(2))
+            np.testing.assert_array_equal(info["parameters"][name], true[name])
+        others = [name for name in usual if name not in given]
+        for name in others:
+            np.testing.assert_array_equal(true[name], drawn[name])
+        again = environments.reset(seed=4)[1]["parameters"]
+        for name in usual:
+            np.testing.assert_array_equal(again[name], drawn[name])
+        environments.reset(options={"machine": given})
+        mask = np.array([True, False])
+        environments.reset(seed=4, options={"reset_mask": mask})
+        kept = environments.drives.machine.parameters
+        assert kept["load.inertia"][1] == 2e-5 and kept["load.inertia"][0] == drawn["load.inertia"][0]
+
+
+@pytest.mark.parametrize(("kind", "options", "says"), [
+    (Tracking, {"machine": {"load.mass": 1.0}}, "machines have no parameter 'load.mass'; they have motor.R_s"),
+    (Tracking, {"machine": {"motor.R_s": -1.0}}, "motor.R_s must be above 0, not -1"),
+    (Tracking, {"machine": {"motor.R_s": [1.0, 1.0, 1.0]}}, "one value or one for each of 2 machines"),
+    (Tracking, {"speed": 1.0}, "option of reset is one of 'reset_mask', 'state', 'machine', 'trajectory', not 'speed'"),
+    (GainTuning, {"trajectory": None}, "is one of 'reset_mask', 'state', 'machine', not 'trajectory'"),
+    (Tracking, {"trajectory": np.zeros((3, 5))}, r"in shape \(3, 1011\) or \(2, 3, 1011\), finite, not shape \(3, 5\)"),
+    (Tracking, {"trajectory": np.full((3, 1011), np.nan)}, "finite, not numbers that are not finite"),
+    (Tracking, {"trajectory": lambda rng, length, period: np.zeros((2, length))}, r"\(3, 1011\), finite, not shape"),
+    (Tracking, {"state": {}, "machine": {"motor.R_s": 1.0}}, "all that a reset begins from; leave machine out"),
+])  # fmt: skip
+def test_what_a_reset_cannot_take_is_refused(kind, options, says):
+    with made(kind, {}) as environments:
+        environments.reset(seed=0)
+        with pytest.raises(ValueError, match=says):
+            environments.reset(options=options)
+
+
+def ramp(rng, length, period):
+    """Return a ramp at a speed that is drawn."""
+    t = np.arange(length) * period
+    speed = rng.uniform(1.0, 3.0)
+    return np.stack([speed * t, np.full(length, speed), np.zeros(length)])
+
+
+def test_a_trajectory_of_ones_own_is_a_function_or_rows():
+    """Configured it is called in every episode; given to a reset it is for that episode alone."""
+    with made(Tracking, {"trajectory": ramp}) as environments, made(Tracking, {}) as usual:
+        reference = environments._episodes.reference
+        environments.reset(seed=3)
+        per_turn = environments._per_turn[0]
+        speeds = reference[:, 0, 1000] / per_turn
+        assert np.all((speeds > 1.0) & (speeds < 3.0)) and speeds[0] != speeds[1]
+        copied = copy.deepcopy(environments)
+        np.testing.assert_array_equal(copied.reset()[0], environments.reset()[0])
+        copied.close()
+
+        moves = usual.reset(seed=3)[0]
+        rows = np.stack([ramp(np.random.default_rng(k), 1011, 0.001) for k in range(2)])
+        for given in (ramp, rows[0], rows):
+            seen = usual.reset(seed=3, options={"trajectory": given})[0]
+            assert not np.array_equal(seen, moves)
+        np.testing.assert_allclose(usual._episodes.reference[:, :2] / per_turn, rows[:, :2])
+        np.testing.assert_array_equal(usual.reset(seed=3)[0], moves)
+
+
+def test_a_reward_of_ones_own_sees_how_the_episode_ends():
+    seen = []
+
+    def reward(observation, action, info):
+        seen.append((info["terminated"], info["truncated"]))
+        return 1.0 - 5.0 * info["terminated"] + 2.0 * info["truncated"]
+
+    options = {"duration": 0.02, "reward": reward, "autoreset_mode": "Disabled"}
+    with made(Tracking, options) as environments:
+        environments.reset(seed=0)
+        environments.drives.machine.enable_input = np.array([False, True])
+        rewards = [environments.step(np.zeros((2, 1), np.float32))[1] for _ in range(2)]
+        assert [row.tolist() for row in rewards] == [[1.0, 1.0], [-4.0, 1.0]]
+        assert [terminated.tolist() for terminated, _ in seen] == [[False, False], [True, False]]
+    single = SingleEnvironment(Tracking(1, num_threads=1, **options | {"duration": 0.001}))
+    single.reset(seed=0)
+    _, value, terminated, truncated, info = single.step(np.zeros(1, np.float32))
+    assert (value, terminated, truncated) == (3.0, False, True) and "truncated" not in info
+    single.close()

@@ -43,8 +43,20 @@ Every environment takes
 - `drives=`, a `CanDrives`, to act on real drives in place of emulated ones;
 - `render_mode=`, `"rgb_array"` for pictures of machine and scope (Gymnasium's `RecordVideo` films them), `"human"` for
   a window;
-- `reward=`, a function of observations, actions and info of your own; `info["reward_terms"]` has the terms of ours;
+- `reward=`, a function of observations, actions and info of your own; `info["reward_terms"]` has the terms of ours,
+  `info["terminated"]` and `info["truncated"]` say which episodes end with this step;
 - `stage`, 0 to 1, an attribute that widens the set of machines during training.
+
+## Resets
+
+`env.reset(seed=..., options=...)` takes a dict of
+
+| option | what it does |
+| --- | --- |
+| `machine` | true parameters for this episode by name, one value or one per environment; the rest is drawn |
+| `trajectory` | Tracking alone: a function or its rows, (3, samples) or (environments, 3, samples), for this episode |
+| `state` | goes on from a saved state instead of beginning an episode; nothing else is given then |
+| `reset_mask` | of vector environments: which of them begin |
 
 ## States
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -59,7 +59,7 @@ def configured(
     if source is None:
         table: dict[str, Any] = {}
     elif isinstance(source, kind):
-        table = asdict(source)  # type: ignore[call-overload]
+        table = {field.name: getattr(source, field.name) for field in fields(kind)}  # type: ignore[arg-type]
     elif isinstance(source, Mapping):
         table = dict(source)
     elif isinstance(source, (str, Path)):

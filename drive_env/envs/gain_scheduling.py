@@ -265,13 +265,11 @@ class GainScheduling(VectorEnvironment):
     # --- Environments
     # ----------------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
-        for name in options:
-            check_choice("an option of reset", name, ("reset_mask",))
         axes = np.repeat(mask, self._axes)
         # First, so that it is the same on a bus, where no machine is drawn.
         self._programme.draw(self.config.excitation, self.reach, self.rngs, mask)
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.stage)
+            self._machines.redraw(self.rngs, mask, self.stage, options.get("machine"))
             self._payload_changes.draw(self.rngs, mask)
             self._parameters = {name: values.copy() for name, values in self._machines.values.items()}
         else:

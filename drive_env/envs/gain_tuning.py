@@ -312,11 +312,9 @@ class GainTuning(VectorEnvironment):
 
     # --- an episode -----------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Any, Info]:
-        for name in options:
-            check_choice("an option of reset", name, ("reset_mask",))
         drives, axes = self.drives, np.repeat(mask, self._axes)
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.stage)
+            self._machines.redraw(self.rngs, mask, self.stage, options.get("machine"))
             for lane in np.flatnonzero(mask):
                 self._noise[lane] = self.rngs[lane].integers(1, 2**31)
             self._trial[mask] = 0.0

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from drive_env.emulator.parameters import check_known, check_parameter
 from drive_env.envs.random_faults import RandomFaults, check_ranges
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS, names_of
@@ -238,7 +239,7 @@ class RandomMachines(Saved):
         ValueError: If a distribution names a parameter that these machines do not have.
     """
 
-    STATE = ("values", "_orders")
+    STATE = ("values", "_orders", "_given")
 
     def __init__(self, drives: EmulatedDrives, distributions: Distributions) -> None:
         self.distributions = distributions
@@ -254,34 +255,52 @@ class RandomMachines(Saved):
                              f"{', '.join(self._defaults)}")  # fmt: skip
         self.values = {name: values.copy() for name, values in self._defaults.items()}
         self._orders: list[Order | None] = [None] * machines
+        self._given: list[str] = []  # parameters without a law that have been given: an episode later they are default
         if distributions.faults is not None:
             for name in distributions.faults.names:
                 drives.inside.faults.check(Order(name))
             self.values |= {name: np.zeros(machines) for name in FAULT_VALUES}
 
-    def redraw(self, rngs: Sequence[np.random.Generator], where: Mask | None = None, stage: float = 1.0) -> None:
+    def redraw(
+        self,
+        rngs: Sequence[np.random.Generator],
+        where: Mask | None = None,
+        stage: float = 1.0,
+        given: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
         """Draw the machines where the mask is true, put them to rest and switch their drives on anew.
 
         Afterwards `values` has the present value of everything by name, each of shape (num_machines,). A machine that
         cannot be stepped (a resonance too fast) is drawn again with its own generator.
 
+        Args:
+            rngs: The machines' generators.
+            where: Machines.
+            stage: Of the curriculum, 0...1.
+            given: Values that stand in place of the drawn or default ones until these machines are drawn again, by
+                name: one, or one per machine.
+
         Raises:
-            ValueError: If none of many draws of a machine can be.
+            ValueError: If none of many draws of a machine can be, or for a value that is given and cannot be.
         """
+        fixed = self._checked(given or {})
         machine = self._drives.machine
         mask = np.ones(self._drives.num_machines, bool) if where is None else np.asarray(where, bool)
         if self.distributions.faults is not None:
             machine.clear_fault(where=mask)  # the next machine is drawn sound
+        for name in self._given:
+            self.values[name] = np.where(mask, self._defaults[name], self.values[name])
+        self._given += [name for name in fixed if name not in self.distributions.laws and name not in self._given]
         noise = np.ones(len(mask))
         for lane in map(int, np.flatnonzero(mask)):
             noise[lane] = rngs[lane].integers(1, 2**32)
-            self._draw(lane, rngs[lane], stage)
+            self._draw(lane, rngs[lane], stage, fixed)
         machine.seed_noise(noise, mask)
         try:
             self._set(mask)
         except ValueError:
             for lane in map(int, np.flatnonzero(mask)):
-                self._set_one(lane, rngs[lane], stage)
+                self._set_one(lane, rngs[lane], stage, fixed)
         # Supply before the reset, which charges the link from it; temperatures after: it sets them to 25 degC.
         axes = np.repeat(mask, self._drives.num_axes // self._drives.num_machines)
         supply = np.where(axes, self._per_axis("supply.voltage"), machine.supply)
@@ -311,17 +330,31 @@ class RandomMachines(Saved):
             self.values["fault.number"][lane] = 1.0 + list(FAULTS).index(order.name)
             self.values["fault.at"][lane] = order.at
 
-    def _draw(self, lane: int, rng: np.random.Generator, stage: float) -> None:
+    def _checked(self, given: Mapping[str, ArrayLike]) -> dict[str, Floats]:
+        """Return given values of all machines; ValueError for a name or value that is none."""
+        machines, fixed = self._drives.num_machines, {}
+        for name, value in given.items():
+            check_known(name, self._defaults)
+            values = np.asarray(value, float)
+            if values.shape not in ((), (machines,)):
+                raise ValueError(f"{name} takes one value or one for each of {machines} machines, not {values.shape}")
+            fixed[name] = np.broadcast_to(values, (machines,))
+            check_parameter(name, fixed[name])
+        return fixed
+
+    def _draw(self, lane: int, rng: np.random.Generator, stage: float, fixed: Mapping[str, Floats]) -> None:
         defaults = {name: float(values[lane]) for name, values in self._defaults.items()}
         drawn, self._orders[lane] = self.distributions.draw_with_fault(rng, defaults, stage)
         for name, value in drawn.items():
             self.values[name][lane] = value
+        for name, values in fixed.items():
+            self.values[name][lane] = values[lane]
 
     def _set(self, mask: Mask) -> None:
-        drawn = [name for name in self.distributions.laws if name not in BESIDE]
+        drawn = [name for name in (*self.distributions.laws, *self._given) if name not in BESIDE]
         self._drives.machine.set_all({name: self.values[name] for name in drawn}, mask)
 
-    def _set_one(self, lane: int, rng: np.random.Generator, stage: float) -> None:
+    def _set_one(self, lane: int, rng: np.random.Generator, stage: float, fixed: Mapping[str, Floats]) -> None:
         one = np.arange(self._drives.num_machines) == lane
         for attempt in range(_TRIES):
             try:
@@ -329,7 +362,7 @@ class RandomMachines(Saved):
             except ValueError as error:
                 if attempt == _TRIES - 1:
                     raise ValueError(f"{_TRIES} draws in a row gave impossible machines: {error}") from error
-                self._draw(lane, rng, stage)
+                self._draw(lane, rng, stage, fixed)
             else:
                 return
 

@@ -25,7 +25,7 @@ from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
-from drive_env.envs.trajectories import TRAJECTORIES, draw
+from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
 from drive_env.envs.vector_environment import (
     Floats,
     Info,
@@ -111,6 +111,8 @@ class TrackingConfig:
         has one cycle to answer.
     trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode. "hold": the start;
         "moves": to random places within the amplitude, with rests of up to 0.1 s; "sines": three sines of 0.5 to 5 Hz.
+        A function of your own is called with the environment's generator, the number of samples and their period [s],
+        and returns position [rev], velocity [rev/s] and acceleration [rev/s^2], shape (3, samples).
         None: hold, 5 rev and 25 rev/s for inverted_pendulum, else moves: two_mass 2 and 20, gantry 3 and 15,
         cart_pendulum 5 and 15, every other load 1 and 10; of steppers 5 rev/s at most.
     distributions: What else is drawn anew in each episode, as `randomisation.Distributions` takes it; None: noise
@@ -130,7 +132,7 @@ class TrackingConfig:
     rate: int = 1000
     duration: float = 1.0
     delay: int = 1
-    trajectory: str | None = None
+    trajectory: str | Trajectory | None = None
     amplitude: float | None = None
     speed: float | None = None
     distributions: Any = None
@@ -148,7 +150,8 @@ class TrackingConfig:
         check_choice("mode", self.mode, tuple(OBJECTS))
         check_choice("action", self.action, ACTIONS)
         check_choice("rate", self.rate, RATES)
-        check_choice("trajectory", self.trajectory, TRAJECTORIES)
+        if not callable(self.trajectory):
+            check_choice("trajectory, if no function,", self.trajectory, TRAJECTORIES)
         for name in self.weights:
             check_choice("a weight's name", name, tuple(WEIGHTS))
         object.__setattr__(self, "weights", {**WEIGHTS, **self.weights})
@@ -262,6 +265,7 @@ class Tracking(VectorEnvironment):
         ValueError: For a value that is none, naming those that are.
     """
 
+    OPTIONS = (*VectorEnvironment.OPTIONS, "trajectory")
     STATE = (*VectorEnvironment.STATE, "_machines", "_bus", "_episodes")
 
     def __init__(
@@ -404,12 +408,12 @@ class Tracking(VectorEnvironment):
 
     # --- an episode -----------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
-        for name in options:
-            check_choice("an option of reset", name, ("reset_mask",))
         axes = np.repeat(mask, self._axes)
-        self._draw_references(mask)  # first, so that they are the same on a bus, where no machine is drawn
+        self._draw_references(
+            mask, options.get("trajectory")
+        )  # first, so that they are the same on a bus, where no machine is drawn
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.stage)
+            self._machines.redraw(self.rngs, mask, self.stage, options.get("machine"))
             if self._is_stepper:
                 self.drives.write(cia402.SENSOR_SELECTION, ENCODER, where=axes)
             motion.enable(self.drives, mode=self.config.mode, where=axes)
@@ -477,12 +481,18 @@ class Tracking(VectorEnvironment):
         return own.observation[0].copy(), own.reward.item(), terminated, truncated, info
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _draw_references(self, mask: Mask) -> None:
-        """Draw the trajectories of the environments that begin."""
+    def _draw_references(self, mask: Mask, given: ArrayLike | Trajectory | None) -> None:
+        """Draw the trajectories of the environments that begin, or take those that are given for this episode."""
         config, own = self.config, self._episodes
+        length = own.reference.shape[2]
+        kind = config.trajectory if given is None else given
+        if not (isinstance(kind, str) or callable(kind)):
+            rows = checked(kind, (3, length), (self.num_envs, 3, length))
         for lane in np.flatnonzero(mask):
-            turns = draw(str(config.trajectory), self.rngs[lane], own.reference.shape[2], CYCLE,
-                         float(config.amplitude or 0.0), float(config.speed or 0.0))  # fmt: skip
+            if isinstance(kind, str) or callable(kind):
+                turns = draw(kind, self.rngs[lane], length, CYCLE, float(config.amplitude), float(config.speed))
+            else:
+                turns = rows if rows.ndim == 2 else rows[lane]
             own.reference[lane] = turns * self._per_turn[lane]
             own.reference[lane, 1] = turns[1] * self._speed_counts[lane]
         own.lanes["step"][mask] = 0

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+# Generator, number of samples, their period [s] -> what `draw` returns.
+Trajectory = Callable[[np.random.Generator, int, float], ArrayLike]
 
 TRAJECTORIES = ("hold", "moves", "sines")
 SINES = 3
@@ -16,22 +20,42 @@ SHORTEST_MOVE = 0.05  # s
 PEAK_OF_MEAN = 1.875  # peak over mean velocity of a move of fifth order
 
 
-def draw(kind: str, rng: np.random.Generator, length: int, period: float, amplitude: float, speed: float) -> Floats:
+def draw(
+    kind: str | Trajectory, rng: np.random.Generator, length: int, period: float, amplitude: float, speed: float
+) -> Floats:
     """Return position [rev], velocity [rev/s], acceleration [rev/s^2], shape (3, length); it begins at rest at 0.
 
     Args:
-        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines.
+        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines. A function returns
+            all of it as it likes, of generator, length and period.
         rng: Where chance comes from.
         length: Samples.
         period: Of the samples [s].
         amplitude: Largest position [rev].
         speed: Largest velocity [rev/s].
+
+    Raises:
+        ValueError: For what a function returns that has another shape, or is not finite.
     """
+    if callable(kind):
+        return checked(kind(rng, length, period), (3, length))
     if kind == "hold":
         return np.zeros((3, length))
     if kind == "moves":
         return _moves(rng, length, period, amplitude, speed)
     return _sines(rng, length, period, amplitude, speed)
+
+
+def checked(rows: ArrayLike, *shapes: tuple[int, ...]) -> Floats:
+    """Return somebody's own rows of position, velocity and acceleration; ValueError if they are none."""
+    found = np.asarray(rows, float)
+    if found.shape not in shapes or not np.isfinite(found).all():
+        what = "numbers that are not finite" if found.shape in shapes else f"shape {found.shape}"
+        raise ValueError(
+            "a trajectory has rows of position [rev], velocity [rev/s] and acceleration [rev/s^2] in shape "
+            f"{' or '.join(map(str, shapes))}, finite, not {what}"
+        )
+    return found
 
 
 def _moves(rng: np.random.Generator, length: int, period: float, amplitude: float, speed: float) -> Floats:

@@ -53,14 +53,15 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
             `reset(options={"reset_mask": ...})` alone.
         render_mode: None, "rgb_array" or "human".
         reward: Called after every step with the observations, the actions and the info of all environments, of which
-            info["reward_terms"] are the environment's own terms, (num_envs,) each; returns the rewards, (num_envs,),
-            in place of the environment's.
+            info["reward_terms"] are the environment's own terms, and info["terminated"] and info["truncated"] how
+            episodes end, (num_envs,) each; returns the rewards, (num_envs,), in place of the environment's.
 
     Raises:
         ValueError: For a mode that is none, or less than one environment; in a step for a reward of another shape, or
             one that is not a number.
     """
 
+    OPTIONS: tuple[str, ...] = ("reset_mask", "state", "machine")  # of reset
     STATE: tuple[str, ...] = ("_ended", "_some_ended", "_has_begun", "_stage", "_np_random_seed")
     config: Any
     drives: Any
@@ -121,7 +122,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         observation, reward, terminated, truncated, info = self._step_environments(action)
         if self.reward_function is None:
             return observation, reward, terminated, truncated, info
-        own = np.asarray(self.reward_function(observation, action, info), float)
+        ends = {"terminated": terminated.copy(), "truncated": truncated.copy()}
+        own = np.asarray(self.reward_function(observation, action, info | ends), float)
         if own.shape != (self.num_envs,) or not np.isfinite(own).all():
             raise ValueError(
                 f"reward returned {own!r}; it must return {self.num_envs} numbers, one for each environment"
@@ -240,9 +242,24 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         Args:
             seed: Of environment 0, the others follow by one; or one for each environment. None goes on with each
                 environment's generator.
-            options: "reset_mask", shape (num_envs,), bool; others are the environment's.
+            options: "reset_mask", shape (num_envs,), bool. "state": go on from one that `save_state` returned, instead
+                of beginning; nothing else is given then. "machine": true parameters for these episodes, by name, one
+                value or one for each environment, in place of those that would be drawn; not on a bus. Others are the
+                environment's.
+
+        Raises:
+            ValueError: For an option that there is not, naming those that there are, or a value that is none.
         """
         options = dict(options or {})
+        for name in options:
+            check_choice("an option of reset", name, self.OPTIONS)
+        if (state := options.pop("state", None)) is not None:
+            if options or seed is not None:
+                raise ValueError(f"a state is all that a reset begins from; leave {', '.join(options) or 'seed'} out")
+            self.restore_state(state)
+            return self._present()
+        if options.get("machine") and self.drives.machine is None:
+            raise ValueError("machine is of emulated machines; leave it out on a bus")
         mask = self._reset_mask(options.pop("reset_mask", None))
         for lane, one in enumerate(self._seeds(seed)):
             if one is not None and mask[lane]:
@@ -366,6 +383,8 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
         """Begin an episode."""
         super().reset(seed=seed)
         observation, info = self.vector.reset(seed=seed, options=options)
+        if options and options.get("state"):
+            self._restore_generator(options["state"])
         return one_of(observation), one_of(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
@@ -402,6 +421,9 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
             ValueError: As `VectorEnvironment.restore_state`.
         """
         self.vector.restore_state(state)
+        self._restore_generator(state)
+
+    def _restore_generator(self, state: State) -> None:
         if (saved := state.get("np_random")) is not None:
             self.np_random.bit_generator.state = saved
 
