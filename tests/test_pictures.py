@@ -12,6 +12,7 @@ import pytest
 from test_render import needs_gl
 
 from drive_env import EmulatedDrives
+from drive_env.devices import device_names
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.pictures import Pictures
@@ -19,7 +20,7 @@ from drive_env.envs.tracking import Tracking
 from drive_env.pictures import opengl, window
 from drive_env.pictures.opengl import OpenGLError, has_display
 from drive_env.pictures.scene import Scene
-from drive_env.pictures.scope_picture import COLORS
+from drive_env.pictures.scope_picture import COLORS, panels
 from mechanics.loads import LOADS
 
 KINDS = {
@@ -89,6 +90,27 @@ def test_the_single_environment_renders_and_who_looks_changes_nothing(kind):
         found.append(np.array(rows))
         env.close()
     np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("device", [pytest.param(name, marks=needs_gl) for name in device_names()])
+def test_every_device_is_drawn(device):
+    """A stepper tells no torque current; its third panel has how far it is behind its steps, which is its torque."""
+    stepper = device == "tmcm6212"
+    options = {"device": device, "load": "inertia", "render_mode": "rgb_array", "trajectory": "sines"}
+    lanes = Tracking(1, num_threads=1, **options | ({"action": "offset", "offset": 0.001} if stepper else {}))
+    lanes.reset(seed=0)
+    for _ in range(50):
+        lanes.step(0.3 * lanes.action_space.high)
+    assert of_trace(lanes.render()[0][:, WIDTH // 2 :]) > 100
+    recording = lanes._pictures._recorders[0].recording()
+    third = panels(recording)[2]
+    assert (third.name, third.unit) == (("lag", "full steps") if stepper else ("current", "A"))
+    assert np.isfinite(third.actual).all() and 0.0 < np.abs(third.actual).max() < 20.0
+    if stepper:
+        lanes.step(lanes.action_space.high)
+        sampled = lanes._episodes.sampled[:, 0, 0]  # before that step's cycle: what was looked at last
+        assert third.actual[-1, 0] == pytest.approx((sampled[3] - sampled[1]) / lanes._episodes.scales[0, 2])
+    lanes.close()
 
 
 @EVERY_KIND

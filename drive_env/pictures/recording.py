@@ -14,6 +14,7 @@ from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -30,13 +31,14 @@ POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (
 )
 TARGET_VELOCITY, TARGET_CURRENT, MODE = (cia402.TARGET_VELOCITY, 0), (cia402.TARGET_TORQUE, 0), (cia402.MODE_DISPLAY, 0)
 _RECORDED = (POSITION_DEMAND, POSITION, VELOCITY, CURRENT, TARGET_VELOCITY, TARGET_CURRENT, MODE)
+_OF_TORQUE = (CURRENT, TARGET_CURRENT)  # which drives in open loop have not
 _PROFILED_MODES = (1, 3, 8)  # pp, pv, csp: 6062h goes on in them, and its slope is the velocity demand
 _CSV, _CST = 9, 10
 CYCLE = 0.001  # s between two samples
 
 
 class Recording(NamedTuple):
-    """A run of one machine: n samples of D joints and A axes. Motor side, SI; a demand that there is not is nan."""
+    """A run of one machine: n samples of D joints and A axes. Motor side, SI; what there is not is nan."""
 
     load: Load
     title: str
@@ -52,6 +54,8 @@ class Recording(NamedTuple):
     current: Floats  # (n, A) [A], peak i_q
     load_torque: Floats  # (n,) [N*m, or the load's unit]
     events: tuple[tuple[float, str], ...]  # what happens from when on [s]
+    # (n, A) how far a stepper's rotor is behind its steps [full steps]: of one in open loop that is its torque
+    lag: Floats | None = None
 
 
 class Recorder:
@@ -75,6 +79,8 @@ class Recorder:
         self._period = period
         count = drives.num_axes // drives.num_machines
         self._axes = slice(machine * count, (machine + 1) * count)
+        known = drives.inside.objects.entries
+        self._names = [name for name in _RECORDED if name not in _OF_TORQUE or known.has(name)]
         self._rows: list[Floats] = []
         self._joints: list[Floats] = []
         self._load_torque: list[float] = []
@@ -105,8 +111,8 @@ class Recorder:
         for _ in range(cycles):
             self._joints.append(self.drives.machine.joint_positions[self._machine])
             self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
-            trace = self.drives.record(_RECORDED, CYCLE)
-            self._rows.append(np.array([trace[name][0, self._axes] for name in _RECORDED], np.float64))
+            trace = self.drives.record(self._names, CYCLE)
+            self._rows.append(np.array([trace[name][0, self._axes] for name in self._names], np.float64))
             self._wanted.append(np.full((2, self._axes.stop - self._axes.start), np.nan))
 
     def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
@@ -120,7 +126,7 @@ class Recorder:
         self._wanted.append(np.stack([part[self._axes] for part in (wanted or (none, none))]))
         self._joints.append(self.drives.machine.joint_positions[self._machine])
         self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
-        self._rows.append(np.array([self.drives.read(name)[self._axes] for name in _RECORDED], np.float64))
+        self._rows.append(np.array([self.drives.read(name)[self._axes] for name in self._names], np.float64))
 
     def mark(self, text: str) -> None:
         """Remember what happens from now on; it is shown beside the machine."""
@@ -136,9 +142,15 @@ class Recorder:
             raise ValueError("nothing was recorded; let time pass with advance() of the recorder")
         drives = self.drives
         raw = np.stack(self._rows)  # (n, objects, A)
-        k = {name: raw[:, column] for column, name in enumerate(_RECORDED)}
-        si = {name: from_raw(drives, name, values, self._axes) for name, values in k.items() if name != MODE}
+        k = {name: raw[:, column] for column, name in enumerate(self._names)}
+        nothing = np.full(raw[:, 0].shape, np.nan)
+        si = dict.fromkeys(_OF_TORQUE, nothing)
+        si |= {name: from_raw(drives, name, values, self._axes) for name, values in k.items() if name != MODE}
         mode = k[MODE]
+        lag = None
+        if CURRENT not in k and Role.FULL_STEPS in drives.device.roles:
+            behind = from_raw(drives, POSITION, units.wrap(k[POSITION_DEMAND] - k[POSITION]), self._axes)
+            lag = behind / (2.0 * np.pi) * drives.read(Role.FULL_STEPS)[self._axes]
         # From one millisecond to the next, across the end of the counter too.
         slope = units.wrap(np.diff(k[POSITION_DEMAND], axis=0, prepend=k[POSITION_DEMAND][:1]))
         profiled = from_raw(drives, POSITION_DEMAND, slope, self._axes) / self._period
@@ -165,6 +177,7 @@ class Recorder:
             current=si[CURRENT],
             load_torque=np.array(self._load_torque),
             events=tuple(self._events),
+            lag=lag,
         )
 
 

@@ -56,7 +56,9 @@ def panels(recording: Recording) -> list[Panel]:
     return [
         Panel("position", unit, recording.position_demand * factor, recording.position * factor),
         Panel("velocity", "rpm", recording.velocity_demand * RPM, recording.velocity * RPM),
-        Panel("current", "A", recording.current_demand, recording.current),
+        Panel("current", "A", recording.current_demand, recording.current)
+        if recording.lag is None
+        else Panel("lag", "full steps", np.full_like(recording.lag, np.nan), recording.lag),
     ]
 
 
