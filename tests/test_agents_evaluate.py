@@ -401,6 +401,16 @@ def test_recorded_episodes_are_repeated(tmp_path):
     found = evaluate(Gentle(), "tracking", SHORT, episodes=2)
     path = tmp_path / "episodes.npz"
     episode_log.save(path, found.environment, found.configuration, found.episodes)
+    with np.load(path) as stored:
+        for k, (episode, steps) in enumerate(zip(found.episodes, np.split(np.arange(100), 2), strict=True)):
+            np.testing.assert_array_equal(stored["rewards"][steps], episode.rewards)
+            np.testing.assert_array_equal(stored["final_observations"][k], episode.observations[-1])
+        assert np.flatnonzero(stored["truncations"]).tolist() == [49, 99] and not stored["terminations"].any()
+    tripped = [found.episodes[0]._replace(terminated=True), found.episodes[1]]
+    episode_log.save(tmp_path / "tripped.npz", found.environment, found.configuration, tripped)
+    with np.load(tmp_path / "tripped.npz") as stored:
+        ends = [np.flatnonzero(stored[name]).tolist() for name in ("terminations", "truncations")]
+    assert ends == [[49], [99]]
     same = episode_log.repeat(Gentle(), episode_log.load(path))
     assert same == (0.0, 0.0, 100)
 
