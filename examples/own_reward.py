@@ -1,19 +1,17 @@
-"""Train with a reward of your own: wrap the environments, and give the wrapper to Stable-Baselines3.
+"""Train with a reward of your own: a function, which the environments call after every step.
 
     python examples/own_reward.py --steps 200000
 
-The environment's reward terms come in `info["reward_terms"]`, so a wrapper can weigh them anew or add its own.
+The environment's reward terms come in `info["reward_terms"]`, so it can weigh them anew or add its own.
 """
 
 import argparse
 from dataclasses import dataclass
 
 import numpy as np
-from gymnasium.vector import VectorWrapper
 from stable_baselines3 import PPO
 
-from drive_env.envs.stable_baselines import DriveVecEnv
-from drive_env.envs.tracking import Tracking
+from drive_env.envs import make_vec_env
 
 
 @dataclass
@@ -23,28 +21,20 @@ class Arguments:
     seed: int = 0
 
 
-class Thrifty(VectorWrapper):
-    """Pays for tracking and fines copper losses: the square of the current, entry 4 of an axis."""
-
-    def __getattr__(self, name):  # DriveVecEnv needs more than Gymnasium's wrappers hand through
-        return getattr(self.env, name)
-
-    def step(self, actions):
-        observation, _, terminated, truncated, info = self.env.step(actions)
-        ended = info.get("final_info", info)  # of environments that ended, the episode's last step
-        current = observation[:, 4::8]
-        reward = ended["reward_terms"]["tracking"] - 5.0 * np.square(current).mean(axis=1) - 10.0 * terminated
-        return observation, reward, terminated, truncated, info
+def thrifty(observations, actions, info):
+    """Pay for tracking; fine copper losses, the square of the current (entry 4 of an axis), and a trip."""
+    losses = np.square(observations[:, 4::8]).mean(axis=1)
+    return info["reward_terms"]["tracking"] - 5.0 * losses - 10.0 * info["terminated"]
 
 
 def main(arguments: Arguments) -> None:
-    envs = Tracking(arguments.environments, load="two_mass", mode="csp", action="offset", autoreset_mode="SameStep")
-    env = DriveVecEnv(Thrifty(envs))
+    options = {"load": "two_mass", "mode": "csp", "action": "offset", "reward": thrifty}
+    env = make_vec_env("ServoDrive/Tracking-v0", arguments.environments, **options)
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
     model.learn(arguments.steps)
     env.seed(1_000_000)
     observation, total = env.reset(), 0.0
-    for _ in range(envs.config.steps):
+    for _ in range(env.get_attr("max_episode_steps")[0]):
         observation, reward, _, _ = env.step(model.predict(observation, deterministic=True)[0])
         total += float(reward.mean())
     print(f"mean return of {arguments.environments} episodes with seeds of their own: {total:.1f}")

@@ -249,7 +249,8 @@ def test_an_episode_is_the_same_among_1_8_and_64_lanes_and_under_2_threads(kind)
     options = {"distributions": "inertia", "load": "inertia"}
     for num_envs, first, threads in ((1, 0, 1), (1, 70, 1), (8, 0, 1), (64, 0, 1), (72, 0, 2)):
         with lanes_of(kind, num_envs, num_threads=threads, **options) as lanes:
-            results = run(lanes, actions(lanes, steps_of(lanes) + 3, first), seed=20 + first)[:4]
+            seeds = [20 + first + lane for lane in range(num_envs)]
+            results = run(lanes, actions(lanes, steps_of(lanes) + 3, first), seed=seeds)[:4]
         for lane in range(num_envs):
             if first + lane in (0, 5, 70):
                 found.setdefault(first + lane, []).append([column[:, lane] for column in results])
@@ -259,6 +260,21 @@ def test_an_episode_is_the_same_among_1_8_and_64_lanes_and_under_2_threads(kind)
             for expected, seen in zip(one, other, strict=True):
                 np.testing.assert_array_equal(seen, expected)
     assert not np.array_equal(found[0][0][0], found[5][0][0])
+
+
+@EVERY_KIND
+def test_no_two_environments_of_neighbouring_seeds_have_the_same_machine(kind):
+    """168 machines of 21 seeds and 8 environments, twice: the episode after is of another one again."""
+    laws = {"parameters": {"motor.R_s": {"law": "uniform", "low": 0.9, "high": 1.1, "of": "default"}}}
+    drawn = []
+    with lanes_of(kind, 8, distributions=laws, load="inertia") as lanes:
+        machines = lanes._machines
+        for seed in range(21):
+            lanes._reset_environments = lambda mask, options: (machines.redraw(lanes.rngs, mask), {})
+            for given in (seed, None):
+                lanes.reset(seed=given)
+                drawn += machines.values["motor.R_s"].tolist()
+    assert len(set(drawn)) == len(drawn) == 2 * 21 * 8
 
 
 def randomised(kind):

@@ -49,15 +49,26 @@ def steps_seen(lanes, number):
 def test_a_lane_of_a_seed_is_the_same_among_any_number():
     many = Counting(8).reset(seed=5)[0]
     assert len({tuple(row) for row in many}) == 8
-    for lane in range(8):
-        assert np.array_equal(Counting(1).reset(seed=5 + lane)[0][0], many[lane])
-    given = Counting(3).reset(seed=[7, 5, 12])[0]
-    assert np.array_equal(given, many[[2, 0, 7]])
+    for number in range(1, 8):
+        assert np.array_equal(Counting(number).reset(seed=5)[0], many[:number])
+    alone = [Counting(1).reset(seed=seed)[0][0] for seed in (7, 5, 12)]
+    assert np.array_equal(Counting(3).reset(seed=[7, 5, 12])[0], alone)  # a seed of its own makes it a single one
+    assert np.array_equal(alone[1], many[0])
+
+
+def test_neighbouring_seeds_have_nothing_in_common():
+    """Environment k of a seed draws from a sequence of its own, and from no other seed's."""
+    numbers = []
+    for seed in range(21):
+        lanes = Counting(8)
+        lanes.reset(seed=seed)
+        numbers += [rng.integers(0, 2**63) for rng in lanes.rngs]
+    assert len(set(numbers)) == 21 * 8
 
 
 def test_without_a_seed_each_lane_goes_on_with_its_generator():
     lanes, alone = Counting(4), Counting(1)
-    first = lanes.reset(seed=1)[0]
+    first = lanes.reset(seed=[1, 2, 3, 4])[0]
     second = lanes.reset()[0]
     assert np.all(first[:, 0] != second[:, 0])
     alone.reset(seed=3)
@@ -154,7 +165,7 @@ def test_the_first_reset_begins_every_environment():
 def test_one_lane_is_a_view():
     one = SingleEnvironment(Counting(1, autoreset_mode="Disabled"))
     observation, info = one.reset(seed=6)
-    assert np.array_equal(observation, Counting(3).reset(seed=4)[0][2])
+    assert np.array_equal(observation, Counting(3).reset(seed=6)[0][0])
     assert info == {"drawn": observation[0]}
     for _ in range(3):
         observation, reward, terminated, truncated, info = one.step(np.zeros(1, np.float32))

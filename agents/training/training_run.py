@@ -79,5 +79,5 @@ def segment_length(run: TrainingRun, lanes: CountedEnvironments) -> int:
 
 
 def segment_seed(seed: int, segment: int) -> int:
-    """Return the seed of environment 0 in a segment; the others' follow by one."""
+    """Return the seed of all environments in a segment."""
     return int(np.random.SeedSequence([seed, segment]).generate_state(1)[0]) >> 1

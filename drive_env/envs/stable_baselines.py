@@ -37,10 +37,10 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
 
     def reset(self) -> Any:
         """Begin an episode in every environment, with the seeds and options given before."""
-        seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
+        seed = self._seeds[0] if self._seeds else None  # the others are this one and a count, which would be less apart
         options = self._options[0] if self._options and self._options[0] else None
         self._follow_curriculum()
-        observation, told = self.vector.reset(seed=seeds, options=options)
+        observation, told = self.vector.reset(seed=seed, options=options)
         self.reset_infos = [_of_environment(told, lane) for lane in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()

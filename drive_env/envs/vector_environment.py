@@ -240,8 +240,10 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         """Begin an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Of environment 0, the others follow by one; or one for each environment. None goes on with each
-                environment's generator.
+            seed: Of all; each environment has a generator of its own from it, number k that of
+                `SeedSequence(seed, spawn_key=(k,))`, so that neighbouring seeds have none in common. Environment 0 is
+                the single environment of that seed. Or a seed for each, of single environments. None goes on with
+                each environment's generator.
             options: "reset_mask", shape (num_envs,), bool. "state": go on from one that `save_state` returned, instead
                 of beginning; nothing else is given then. "machine": true parameters for these episodes, by name, one
                 value or one for each environment, in place of those that would be drawn; not on a bus. Others are the
@@ -261,9 +263,10 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         if options.get("machine") and self.drives.machine is None:
             raise ValueError("machine is of emulated machines; leave it out on a bus")
         mask = self._reset_mask(options.pop("reset_mask", None))
-        for lane, one in enumerate(self._seeds(seed)):
+        for lane, (one, place) in enumerate(self._seeds(seed)):
             if one is not None and mask[lane]:
-                self.rngs[lane], self._np_random_seed = seeding.np_random(one)
+                self.rngs[lane] = _generator(int(one), place)
+                self._np_random_seed = int(one)
         observation, info = self._reset_environments(mask, options)
         self._ended = self._ended & ~mask
         self._some_ended = bool(self._ended.any())
@@ -342,16 +345,23 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
             raise ValueError("the first reset must be of all environments; leave reset_mask out")
         return chosen
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, (int, np.integer)):
-            return [int(seed) + lane for lane in range(self.num_envs)]
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[tuple[int | None, int]]:
+        """Return of each environment its seed, and its place among those of that seed."""
+        if seed is None or isinstance(seed, (int, np.integer)):
+            return [(seed, lane) for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(
                 f"{len(seed)} seeds do not fit {self.num_envs} environments; give one number or one per environment"
             )
-        return seed
+        return [(one, 0) for one in seed]
+
+
+def _generator(seed: int, place: int) -> np.random.Generator:
+    """Return the generator of an environment: of the first among those of a seed Gymnasium's own of that seed."""
+    first: np.random.Generator = seeding.np_random(seed)[0]
+    if place == 0:
+        return first
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(place,))))
 
 
 class SingleEnvironment(gymnasium.Env[Any, Any]):
