@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -395,6 +396,35 @@ def test_a_policy_that_sticks_ends_the_command_with_a_line(tmp_path, served):
     assert found.exit_code == 1 and "Traceback" not in found.output
     assert "drive-agent: entry 0 of the policy's action has been at the end of its range for 100 ms" in found.output
     assert int(emulated.read(0x6041)[0]) & 0x4F == 0x40
+
+
+def test_episodes_are_a_dataset_of_minari(tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    options = ("evaluate", agent(tmp_path / "agent.npz", mode="csv", duration=0.05), "--episodes", 2)
+    told = run(*options, "--out", tmp_path / "out", "--minari", "servo/two-mass-v0")
+    assert told.exit_code == 0, told.output
+    dataset = minari.load_dataset("servo/two-mass-v0")
+    assert (dataset.total_episodes, dataset.total_steps) == (2, 100)
+    recorded = episode_log.load(tmp_path / "out" / "episodes.npz")
+    for k, episode in enumerate(dataset.iterate_episodes()):
+        np.testing.assert_array_equal(episode.observations[:-1], recorded.observations[k])
+        np.testing.assert_array_equal(episode.actions, recorded.actions[k])
+        assert np.flatnonzero(episode.truncations).tolist() == [49] and not episode.terminations.any()
+    env = dataset.recover_environment()
+    assert env.spec.max_episode_steps == 50 and env.unwrapped.vector.config.mode == "csv"
+    np.testing.assert_array_equal(env.reset(seed=recorded.seeds[1])[0], recorded.observations[1][0])
+    env.close()
+    for name, says in (("servo/two-mass-v0", "there is such a dataset"), ("two mass", "name has a version")):
+        told = run(*options, "--minari", name)
+        assert told.exit_code == 2 and says in told.output and "Traceback" not in told.output
+
+
+def test_a_dataset_without_minari_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "minari", None)
+    told = run("evaluate", agent(tmp_path / "agent.npz"), "--minari", "servo/two-mass-v0")
+    assert told.exit_code == 2 and "pip install 'drive-env[minari]'" in told.output
 
 
 def test_recorded_episodes_are_repeated(tmp_path):

@@ -47,7 +47,7 @@ BUS_EPISODES, EPISODES = 8, 64
 SLOW, LATE = 1.05, 0.0005
 BUS_OPTIONS = ("bus", "interface", "channel", "node")
 OF_A_BUS_ALONE = ("bitrate", "device", "sensor")
-NOT_OF_A_GAP = (*BUS_OPTIONS, *OF_A_BUS_ALONE, "episodes", "against", "replay")
+NOT_OF_A_GAP = (*BUS_OPTIONS, *OF_A_BUS_ALONE, "episodes", "against", "replay", "minari")
 ELSEWHERE = ("workers", "cluster")
 
 
@@ -125,6 +125,13 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for report, episodes and pictures, new or empty.")
     ] = None,
+    minari: Annotated[
+        str | None,
+        typer.Option(
+            "--minari",
+            help="Keep the episodes as a Minari dataset of this name, as servo/tracking-v0 (extra `minari`).",
+        ),
+    ] = None,
     workers: Workers = None,
     cluster: Cluster = None,
     trust: Trust = False,
@@ -145,6 +152,10 @@ def evaluate(
             _tell_card(policy, json)
             return
         _check_side(context, lockstep, gap, replay)
+        if minari is not None:
+            from agents.evaluation import minari_dataset
+
+            minari_dataset.check_name(minari)
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
         recorded = None if recording is None else recording.environment
         loaded, configuration = _open(policy, environment, load, config, recorded, trust)
@@ -174,6 +185,8 @@ def evaluate(
         _tell(found, gaps, json, before=before)
         if folder is not None:
             _save(found, folder, gaps, json)
+        if minari is not None:
+            minari_dataset.save(minari, found)
 
 
 @dataclass(frozen=True)
@@ -231,7 +244,7 @@ def _check_side(context: typer.Context, lockstep: bool, gap: int | None, replay:
         raise ValueError(
             f"--{away[0]} is for episodes on the emulator; leave it out on a bus, with --gap and with --replay"
         )
-    if replay is not None and (extra := _typed(context, (*BUS_OPTIONS, *OF_A_BUS_ALONE))):
+    if replay is not None and (extra := _typed(context, (*BUS_OPTIONS, *OF_A_BUS_ALONE, "minari"))):
         raise ValueError(f"--replay acts on no drives; leave --{extra[0]} out")
     if gap is not None and (extra := _typed(context, NOT_OF_A_GAP)):
         raise ValueError(f"--gap serves its own machines, one episode each; leave --{extra[0]} out")

@@ -40,21 +40,27 @@ def save(path: Path, environment: str, configuration: dict[str, Any], episodes: 
     """Write episodes to an .npz."""
     about = {"environment": environment, "configuration": plain(as_kept(configuration))}
     about |= {"seeds": [episode.seed for episode in episodes]}
-    lengths = [len(episode.actions) for episode in episodes]
-    is_last = np.zeros(sum(lengths), bool)
-    is_last[np.cumsum(lengths) - 1] = True
-    terminated = is_last & np.repeat([episode.terminated for episode in episodes], lengths)
+    terminated, truncated = ends_of(episodes)
     arrays = {
         "about": np.frombuffer(json.dumps(about).encode(), np.uint8),
-        "lengths": np.array(lengths),
+        "lengths": np.array([len(episode.actions) for episode in episodes]),
         "observations": np.concatenate([episode.observations[:-1] for episode in episodes]).astype(np.float32),
         "actions": np.concatenate([episode.actions for episode in episodes]).astype(np.float32),
         "rewards": np.concatenate([episode.rewards for episode in episodes]),
         "terminations": terminated,
-        "truncations": is_last & ~terminated,
+        "truncations": truncated,
         "final_observations": np.stack([episode.observations[-1] for episode in episodes]).astype(np.float32),
     }
     write_arrays(path, arrays)
+
+
+def ends_of(episodes: Sequence[Episode]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which steps of all episodes, one after the other, terminated one, and which truncated one."""
+    lengths = [len(episode.actions) for episode in episodes]
+    is_last = np.zeros(sum(lengths), bool)
+    is_last[np.cumsum(lengths) - 1] = True
+    terminated = is_last & np.repeat([episode.terminated for episode in episodes], lengths)
+    return terminated, is_last & ~terminated
 
 
 def load(path: Path) -> EpisodeRecording:
