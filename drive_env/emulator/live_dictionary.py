@@ -130,7 +130,8 @@ class LiveDictionary:
             if isinstance(values, np.ndarray):
                 np.copyto(values, raw, where=axes)
         after = self.context()
-        if any(np.any(one != other) for one, other in zip(before, after, strict=True)):
+        # The peak current of a drive that needs none is nan, and stays what it was.
+        if not all(np.array_equal(one, other, equal_nan=True) for one, other in zip(before, after, strict=True)):
             self._scale_changes += 1
         self.device.firmware.power_on(self._records, axes)
 
