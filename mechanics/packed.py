@@ -389,7 +389,7 @@ class PackedLoad:
 
 
 def _copies_last(array: Floats) -> Floats:
-    return np.moveaxis(array, 0, -1)
+    return array.transpose(*range(1, array.ndim), 0)
 
 
 def pack(
