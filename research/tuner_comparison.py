@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from agents.policies.policy import load_policy
 from agents.shipped import TUNER, shipped
 from agents.tuner.surrogate import IDENTIFIED, SHOWN
-from research.surrogate_training import GAINS, HIGH, LOW, MACHINES, TRAINING, UNSEEN, Answers, judge
+from research.surrogate_training import BUDGETS, UNSEEN, Answers, judge
+from research.tuner_recipes import RECIPES
 from tuning.search.samplers import Proposer, new_proposer
 
 Array = NDArray[np.float32]
 
 SAMPLERS = ("tpe", "cmaes", "gp")
+RECIPE = RECIPES["tmcm1636"]
 
 
 class SearchPolicy:
@@ -38,14 +40,14 @@ class SearchPolicy:
     def act(self, observation: Array) -> Array:
         """Return the change of the log gains to try, from the incumbent."""
         if not self._proposers:
-            low, high = np.array(LOW), np.array(HIGH)
+            low, high = np.array(RECIPE.low), np.array(RECIPE.high)
             self._proposers = [
-                new_proposer(self._sampler, low, high, seed=k, trials=11, first=[np.zeros(len(GAINS))])
+                new_proposer(self._sampler, low, high, seed=k, trials=11, first=[np.zeros(len(RECIPE.gains))])
                 for k in range(len(observation))
             ]
             for proposer in self._proposers:
                 proposer.ask(1)
-        G = len(GAINS)
+        G = len(RECIPE.gains)
         for proposer, cost in zip(self._proposers, observation[:, IDENTIFIED + 2 * G + SHOWN - 1], strict=True):
             proposer.tell([[float(cost)]], [{}])
         asked = np.array([proposer.ask(1)[0] for proposer in self._proposers])
@@ -53,26 +55,26 @@ class SearchPolicy:
 
     def answer(self, observation: Array) -> Array:
         """Return no change: the incumbent stays."""
-        return np.zeros((len(observation), len(GAINS)), np.float32)
+        return np.zeros((len(observation), len(RECIPE.gains)), np.float32)
 
 
 def main() -> None:
     """Compare from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--machines", type=int, default=MACHINES, help="machines of a row")
+    parser.add_argument("--machines", type=int, default=BUDGETS["full"].judged, help="machines of a row")
     parser.add_argument("--tuners", nargs="+", default=[TUNER, *SAMPLERS], help="agent or samplers")
     arguments = parser.parse_args()
     for name in arguments.tuners:
         policy = SearchPolicy(name) if name in SAMPLERS else load_policy(shipped(name))
-        _tell(name, judge(policy, arguments.machines, UNSEEN))
+        _tell(name, judge(RECIPE, policy, arguments.machines, UNSEEN))
 
 
 def _tell(name: str, answers: Answers) -> None:
     print(f"{name}: robust cost over the rule's, median {np.median(answers.ratio):.2f}; constraints kept "
           f"{100.0 * answers.kept.mean():.0f} % (the rule {100.0 * answers.rule.mean():.0f} %); trials stopped "
           f"{100.0 * answers.aborted.mean():.0f} %")  # fmt: skip
-    for (load, motor), ratio, kept in zip(TRAINING, answers.ratio, answers.kept, strict=True):
-        print(f"  {load} on {motor}: {np.median(ratio):.2f}, {100.0 * kept.mean():.0f} %")
+    for row, ratio, kept in zip(RECIPE.rows, answers.ratio, answers.kept, strict=True):
+        print(f"  {row.name}: {np.median(ratio):.2f}, {100.0 * kept.mean():.0f} %")
 
 
 if __name__ == "__main__":
