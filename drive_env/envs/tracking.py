@@ -17,7 +17,7 @@ from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import counts_per_ampere
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import Drives, device_of, machine_of
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control
 from drive_env.envs import tracking_cycle as cycle
@@ -25,6 +25,7 @@ from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
+from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, draw
 from drive_env.envs.vector_environment import (
     Floats,
@@ -189,7 +190,9 @@ class TrackingConfig:
         if (low, high) != (0.0, 0.0) and self.task.joint is None:
             raise ValueError(f"tilt is of a pendulum, and load {self.load!r} has none; leave it out")
         if not float(self.fall or 0.0) > max(abs(low), abs(high)):
-            raise ValueError(f"fall ({self.fall:g} rad) must be beyond the greatest tilt, {max(abs(low), abs(high)):g} rad")
+            raise ValueError(
+                f"fall ({self.fall:g} rad) must be beyond the greatest tilt, {max(abs(low), abs(high)):g} rad"
+            )
         return low, high
 
     @property
@@ -354,7 +357,7 @@ class Tracking(VectorEnvironment):
         distributions, machine = self.config.distributions, self.drives.machine
         if machine is not None:
             if isinstance(distributions, str) and distributions in shipped():
-                distributions = laws_of(distributions, self.drives.device, machine.parameters)
+                distributions = laws_of(distributions, device_of(self.drives), machine.parameters)
             return RandomMachines(machine.drives, Distributions.load(distributions or {"parameters": {}}))
         if distributions is not None:
             raise ValueError("distributions are of emulated machines; leave them out on a bus")
@@ -406,11 +409,11 @@ class Tracking(VectorEnvironment):
             sampled=self._control.sampled,
             angles=np.zeros(n),
             arm=np.zeros(n),
-            weights=np.array([config.weights[name] for name in cycle.TERMS], float),
+            weights=np.array([config.weights[name] for name in TERMS], float),
             margins=np.array([config.margins[name] for name in cycle.MARGINS], float),
             observation=np.zeros((n, *(self.single_observation_space.shape or ())), np.float32),
             reward=np.zeros(n),
-            terms=np.zeros((len(cycle.TERMS), n)),
+            terms=np.zeros((len(TERMS), n)),
             ended=np.zeros((2, n), bool),
             kind=cycle.KINDS[str(config.mode), config.action],
             fall=float(config.fall or np.inf),
@@ -474,7 +477,8 @@ class Tracking(VectorEnvironment):
 
     def _arms(self) -> Floats:
         """Return how far the bobs are beside their axes at a right angle [inc], shape (num_envs,)."""
-        length = self.config.task.length if self._machines is None else self.drives.machine.parameters["load.length"]
+        machine = self.drives.machine
+        length = self.config.task.length if machine is None else machine.parameters["load.length"]
         per_metre = find_load(self.config.load).gears[0] / (2.0 * np.pi)
         return np.asarray(length * per_metre * self._per_turn.reshape(self.num_envs, -1)[:, 0])
 
@@ -485,7 +489,7 @@ class Tracking(VectorEnvironment):
             angles = np.zeros(self.num_envs)
             for lane in np.flatnonzero(mask):
                 angles[lane] = self.rngs[lane].uniform(low, high)
-            self.drives.machine.place(joint, angles, mask)
+            machine_of(self.drives).place(joint, angles, mask)
 
     def _act(self, action: Any) -> bool:
         """Make a step; return whether any drive went into fault or a pole fell."""
@@ -508,7 +512,7 @@ class Tracking(VectorEnvironment):
     def _step_environments(self, action: Any) -> Stepped:
         some, own = self._act(action), self._episodes
         terms, ended = own.terms.copy(), own.ended.copy()
-        info: Info = {"reward_terms": dict(zip(cycle.TERMS, terms, strict=True))}
+        info: Info = {"reward_terms": dict(zip(TERMS, terms, strict=True))}
         if some:
             info["fault"] = self._faults(ended[0])
             info["_fault"] = ended[0]
@@ -516,7 +520,7 @@ class Tracking(VectorEnvironment):
 
     def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
         some, own = self._act(action), self._episodes
-        info: Info = {"reward_terms": dict(zip(cycle.TERMS, own.terms[:, 0].tolist(), strict=True))}
+        info: Info = {"reward_terms": dict(zip(TERMS, own.terms[:, 0].tolist(), strict=True))}
         if some:
             info["fault"] = self._faults(own.ended[0])[0]
         terminated, truncated = own.ended[:, 0].tolist()

@@ -23,7 +23,6 @@ PREVIEW = 10  # cycles
 LONGEST_DELAY = 10  # cycles, and as many of jitter
 COMMISSIONED_INERTIA = 3.0  # rotor inertias: what the presets were computed for
 
-TERMS = ("tracking", "speed", "load", "carried", "effort", "smoothness", "trip")
 # Where an error is worth 0.1 of a term: of amplitude, of speed, rad, of the current limit, of the action.
 MARGINS = {"tracking": 0.25, "speed": 0.5, "load": 0.2, "effort": 1.0, "smoothness": 1.0}
 
@@ -105,7 +104,7 @@ def act(address, first, count):
                 value = np.rint(own.target[axis])
             else:
                 value = np.rint(given * full)
-            if kind == DIRECT_POSITION or kind == RAMP_POSITION:
+            if kind in (DIRECT_POSITION, RAMP_POSITION):
                 value += origin[axis]
             message[k, a] = value
             last[axis, 1] = last[axis, 0]
