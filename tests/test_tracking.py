@@ -340,7 +340,7 @@ def test_bus_imperfections_are_drawn_and_late():
         assert set(ages) >= {2.0, 3.0} and 0.05 < np.mean(ages > 2.0) < 0.5
 
 
-# --- ramps, tilts, bobs ------------------------------------------------------------------------------------------------
+# --- ramps, tilts, bobs -----------------------------------------------------------------------------------------------
 def test_ramped_actions_add_up_to_the_target_within_the_full_scale():
     with tracking(load="inertia", mode="csv", action="ramp", ramp=10.0, speed=8.0) as lanes:
         lanes.reset(seed=0)
@@ -371,7 +371,7 @@ def test_the_carried_term_is_the_error_of_where_the_bob_is():
     with tracking(1, load="cart_pendulum", distributions="cart_pendulum", weights={"carried": 1.0}) as lanes:
         lanes.reset(seed=2)
         for _ in range(300):
-            seen, _, _, _, info = lanes.step(np.array([[0.2]], np.float32))
+            *_, info = lanes.step(np.array([[0.2]], np.float32))
         machine = lanes.drives.machine
         reference = lanes._episodes.reference[0, 0, 299]
         cart = lanes.drives.read((0x6064, 0))[0] - lanes._episodes.origin[0]
@@ -388,7 +388,7 @@ def test_the_carried_term_is_the_error_of_where_the_bob_is():
         ({"load": "inverted_pendulum", "tilt": (0.2, 0.1)}, r"tilt is \[low, high\] within a turn, in order"),
         (
             {"load": "inverted_pendulum", "tilt": (0.0, 0.7)},
-            r"fall \(0.6 rad\) must be beyond the greatest tilt, 0.7 rad",
+            "must be beyond the greatest tilt, 0.7 rad",
         ),
         ({"margins": {"traking": 1.0}}, "a margin's name is one of 'tracking', .* not 'traking'"),
         ({"margins": {"tracking": 0.0}}, "the margin of tracking must be above 0 and finite, not 0"),

@@ -62,8 +62,8 @@ TASKS: dict[str, SuiteTask] = {
     ),
     "ServoDrive/PoleSwingUp-v1": _tracking(
         "a hanging pole is swung up and held, on a rail that ends",
-        0.80, "load", "inverted_pendulum", 8.0, rate=500, mode="csv", action="ramp", ramp=8.0, tilt=(pi - 0.25, pi + 0.25),
-        fall=inf, trajectory="hold", amplitude=5.0, speed=25.0, margins={"load": 1.0},
+        0.80, "load", "inverted_pendulum", 8.0, rate=500, mode="csv", action="ramp", ramp=8.0,
+        tilt=(pi - 0.25, pi + 0.25), fall=inf, trajectory="hold", amplitude=5.0, speed=25.0, margins={"load": 1.0},
     ),
     "ServoDrive/ArmPath-v1": _tracking(
         "six joints of an arm follow a path under gravity with an unknown tool: the agent leads their set-points",
