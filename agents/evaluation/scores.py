@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.envs import environment_of
 from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
@@ -142,7 +143,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 
 def figures(environment: str, config: Any) -> tuple[Figure, ...]:
     """Return the figures of an environment, the score first: where a pole can fall, the time that it stood."""
-    found = FIGURES[environment]
+    found = FIGURES[environment_of(environment)]
     if np.isfinite(getattr(getattr(config, "task", None), "fall", np.inf)):
         found = tuple(sorted(found, key=lambda figure: figure.compute is not upright))
     return found

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-TRAJECTORIES = ("hold", "moves", "sines")
+TRAJECTORIES = ("hold", "moves", "sines", "run")
 SINES = 3
 FREQUENCIES = (0.5, 5.0)  # Hz
 SOFT_START = 0.1  # s
@@ -20,7 +20,8 @@ def draw(kind: str, rng: np.random.Generator, length: int, period: float, amplit
     """Return position [rev], velocity [rev/s], acceleration [rev/s^2], shape (3, length); it begins at rest at 0.
 
     Args:
-        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines.
+        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines; "run" goes on at
+            the speed from the first moment, faster than a load can follow.
         rng: Where chance comes from.
         length: Samples.
         period: Of the samples [s].
@@ -29,6 +30,9 @@ def draw(kind: str, rng: np.random.Generator, length: int, period: float, amplit
     """
     if kind == "hold":
         return np.zeros((3, length))
+    if kind == "run":
+        t = np.arange(length) * period
+        return np.stack([speed * t, np.full(length, speed), np.zeros(length)])
     if kind == "moves":
         return _moves(rng, length, period, amplitude, speed)
     return _sines(rng, length, period, amplitude, speed)
