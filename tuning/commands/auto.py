@@ -12,6 +12,7 @@ from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     DynamicsOption,
+    InertiaRangeOption,
     Json,
     TargetOptions,
     asked_dynamics,
@@ -31,14 +32,7 @@ if TYPE_CHECKING:
 def auto(
     drive: TargetOptions,
     dynamics: DynamicsOption = None,
-    inertia_range: Annotated[
-        str | None,
-        typer.Option(
-            "--inertia-range",
-            help="Load inertia that the tuned axis must bear with weaker margins, over that of tuning: LOW/HIGH.",
-            show_default="0.5/2",
-        ),
-    ] = None,
+    inertia_range: InertiaRangeOption = None,
     store: Annotated[
         bool,
         typer.Option("--store/--no-store", help="Drives on a bus store the gains, so that they survive a power cycle."),
