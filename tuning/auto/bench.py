@@ -28,7 +28,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-DESIGNED_AGAIN = "gains designed again from what was measured"
 # Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
 # record; and one from where a response has ended.
 RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3

@@ -15,7 +15,7 @@ from drive_env.gains import cascade_columns
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
-from tuning.auto.bench import DESIGNED_AGAIN, MOVE_TIME, TRIAL_TIME
+from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.design import Judge, design
 from tuning.auto.loop_margins import MEASURED, measure, measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models
@@ -270,7 +270,7 @@ def _try(
     passed = bench.whole_machines(proof.passed & where)
     for k in map(int, np.flatnonzero(passed)):
         reason = why[k] or "as its other axes were"
-        bench.journals[k].note(f"{DESIGNED_AGAIN}: {reason}")
+        bench.journals[k].note(f"gains designed again from what was measured: {reason}")
         bench.journals[k].correct(recorded.gains[k], gains[k], reason)
     unknown = np.full(len(where), np.nan)
     fresh = replace(

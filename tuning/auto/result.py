@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.auto.bench import DESIGNED_AGAIN
 from tuning.certificate.certificate import TAKEN, verdict
 from tuning.lateness import late_first
 
@@ -141,7 +140,7 @@ def _with_outcomes(notes: Sequence[str], corrections: Sequence[Correction]) -> t
     """Return notes of an axis; of gains that were designed again and did not stay they say so."""
     left, told = list(corrections), []
     for note in notes:
-        one = next((one for one in left if note == f"{DESIGNED_AGAIN}: {one.reason}"), None)
+        one = next((one for one in left if note.endswith(f"measured: {one.reason}")), None)
         if one is not None:
             left.remove(one)
         told.append(note if one is None or one.outcome == TAKEN else f"{note}; {one.outcome}")

@@ -47,9 +47,9 @@ def auto(
     Of an open-loop stepper it sets the phase currents, the StallGuard threshold and CoolStep, and writes
     stepper-certificate.json in place of certificate.json and report.html.
 
-    The motor turns, for 10 to 40 s an axis. The verdict is accepted, accepted with reservations, which are listed, or
-    rejected. Writes before.toml, with which `drive-tune undo` restores the state before, certificate.json and
-    report.html. Exit code 1 if an axis was rejected; the reason is printed.
+    The motor turns, for 9 to 20 s an axis, longer where a stepper's loop is closed. The verdict is accepted, accepted
+    with reservations, which are listed, or rejected. Writes before.toml, with which `drive-tune undo` restores the
+    state before, certificate.json and report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
         from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files
