@@ -202,6 +202,12 @@ class PackedLoad:
         for values in (plant.bristle, plant.carried, plant.diverged, plant.load_torque, plant.clock):
             values[where] = 0
 
+    def place(self, joint: int, position: Floats, where: NDArray[np.bool_]) -> None:
+        """Put a joint of the copies where the mask is true to a position [rad or m], shape (copies,), at rest."""
+        self._by_copy(self.data.qpos)[where, joint] = position[where]
+        for array in (self.data.qvel, self.plant.qvel_before):
+            self._by_copy(array)[where, joint] = 0.0
+
     def jam(self, torque: Floats) -> None:
         """Hold the loads of axes by dry friction that withstands a torque seen from the rotor.
 
@@ -407,7 +413,7 @@ class PackedLoad:
 
 
 def _copies_last(array: Floats) -> Floats:
-    return np.moveaxis(array, 0, -1)
+    return array.transpose(*range(1, array.ndim), 0)
 
 
 def pack(

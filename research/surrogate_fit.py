@@ -18,7 +18,6 @@ from agents.tuner.surrogate import ASKED, CONTEXT, IDENTIFIED, KEY, LAYERS, LEAS
 Array = NDArray[np.float32]
 
 HEADS, VALUE, SUMMARY, HIDDEN, HIDDEN_OF_TRIAL = 4, 24, 64, 96, 128
-REACH = (0.8, 1.0, 1.0)  # of velocity P and I and position P: gains are normalised with it
 # Of the dynamics, over their standard deviation: exact ones would tell a set of machines, and with it their load.
 BLUR = 0.5
 EPOCHS, BATCH, RATE, DECAY = 30, 128, 4e-3, 2e-3  # BATCH is of machines
@@ -90,10 +89,22 @@ class SurrogateNetwork(nn.Module):  # type: ignore[misc]
 
 
 def fit(
-    data: TrialData, seed: int, networks: int, progress: Callable[[float], None] = lambda share: None
+    data: TrialData,
+    reach: Sequence[float],
+    seed: int,
+    networks: int,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> dict[str, Array]:
-    """Return the arrays of a surrogate: the normaliser's, and the networks' weights in half precision."""
-    normal = _normaliser(data)
+    """Return the arrays of a surrogate: the normaliser's, and the networks' weights in half precision.
+
+    Args:
+        data: Trials.
+        reach: By which the gains are divided, one number for each.
+        seed: Of the networks.
+        networks: How many.
+        progress: Called with the share that is done.
+    """
+    normal = _normaliser(data, reach)
     arrays: dict[str, Any] = normal._asdict()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # networks this small are slower on several; and the result is the same everywhere
@@ -111,11 +122,11 @@ def _part(progress: Callable[[float], None], number: int, count: int, share: flo
     progress((number + share) / count)
 
 
-def _normaliser(data: TrialData) -> Normaliser:
+def _normaliser(data: TrialData, reach: Sequence[float]) -> Normaliser:
     flat = data.shown[np.isfinite(data.worth)]
     return Normaliser(
         data.context.mean(axis=0), 1.0 / (data.context.std(axis=0) + 1e-6),
-        flat.mean(axis=0), 1.0 / (flat.std(axis=0) + 1e-6), 1.0 / np.array(REACH, np.float32)
+        flat.mean(axis=0), 1.0 / (flat.std(axis=0) + 1e-6), 1.0 / np.array(reach, np.float32)
     )  # fmt: skip
 
 

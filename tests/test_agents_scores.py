@@ -58,13 +58,14 @@ def test_trials_that_were_stopped_are_counted_where_they_cost_something():
     assert np.isnan(scores.stopped(episode(tracking(), terms), SimpleNamespace(abort_cost=0.0)))
 
 
-def test_the_hidden_score_is_told_over_the_rule_s_with_which_the_episode_began():
+@pytest.mark.parametrize(("robust_cost", "kept"), [(1.0, 1.0), (29.9, 1.0), (30.1, 0.0), (45.0, 0.0)])
+def test_the_hidden_score_is_the_answers_robust_cost_and_whether_it_keeps_the_constraints(robust_cost, kept):
     figures = {figure.name: figure for figure in scores.FIGURES["ServoDrive/GainTuning-v0"]}
-    cost = figures["robust cost relative to the rule's (emulator)"]
-    assert cost.compute(episode(tracking(), {}, {"robust_cost": 4.0}, {"robust_cost": 1.0}), None) == pytest.approx(
-        0.25
-    )
-    assert np.isnan(cost.compute(episode(tracking()), None))
+    cost, share = figures["robust cost (emulator)"], figures["constraints kept (emulator) [share]"]
+    told = episode(tracking(), {}, {"robust_cost": 4.0}, {"robust_cost": robust_cost})
+    assert cost.compute(told, None) == robust_cost and share.compute(told, None) == kept
+    assert cost.lower_is_better and not share.lower_is_better
+    assert np.isnan(cost.compute(episode(tracking()), None)) and np.isnan(share.compute(episode(tracking()), None))
 
 
 def test_the_return_is_the_sum_of_rewards():

@@ -11,11 +11,14 @@ from agents.policies.agent_file import MAX_BYTES, AgentFile
 from agents.policies.policy import PolicyError, load_policy, policy_of
 from agents.shipped import find_agent, shipped, shipped_names
 from agents.tuner.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
+from drive_env.envs.gain_tuning import GainTuningConfig
 from research import surrogate_training as training
+from research.tuner_recipes import RECIPES, Row, laws
 
-G = len(training.GAINS)
+RECIPE = RECIPES["tmcm1636"]
+G = len(RECIPE.gains)
 ENTRIES = IDENTIFIED + 2 * G + 2 * SHOWN
-LOW, HIGH = np.array(training.LOW), np.array(training.HIGH)
+LOW, HIGH = np.array(RECIPE.low), np.array(RECIPE.high)
 
 
 def trials(machines=1_000, count=6, seed=0):
@@ -38,7 +41,7 @@ def bundle():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "BATCH", 32)  # many steps for little data
         patch.setattr(fitting, "EPOCHS", 30)
-        return training.bundle_of(fitting.fit(trials(), 0, 2), {})
+        return training.bundle_of(RECIPE, fitting.fit(trials(), RECIPE.reach, 0, 2), {})
 
 
 @pytest.fixture
@@ -77,9 +80,9 @@ def test_trials_of_rounds_with_fewer_are_joined_and_the_missing_count_for_nothin
     assert np.isnan(joined.worth[40:, 4:]).all() and np.isfinite(joined.worth[:40]).all()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "EPOCHS", 1)
-        first = fitting.fit(joined, 0, 1)
+        first = fitting.fit(joined, RECIPE.reach, 0, 1)
         joined.gains[40:, 4:], joined.shown[40:, 4:] = 5.0, -5.0
-        again = fitting.fit(joined, 0, 1)
+        again = fitting.fit(joined, RECIPE.reach, 0, 1)
     for name, array in first.items():
         np.testing.assert_array_equal(array, again[name], err_msg=name)
 
@@ -282,24 +285,58 @@ class Constant:
 def test_a_tuner_that_answers_the_rules_gains_has_the_rules_hidden_j_and_one_that_tried_nothing_else_may_not(
     monkeypatch,
 ):
-    monkeypatch.setitem(training.CONFIGURATION, "trials", 1)
-    found = training.judge(Constant(0.0, 0.0), 2, 5, [("inertia", "ec_i_40")])
+    monkeypatch.setattr(training, "TRIALS", 1)
+    one = RECIPE._replace(rows=(Row("inertia", "ec_i_40"),))
+    found = training.judge(one, Constant(0.0, 0.0), 2, 5)
     assert found.ratio == pytest.approx(1.0) and found.best == pytest.approx(1.0)
     with pytest.raises(RuntimeError, match="answered gains that it had not tried"):
-        training.judge(Constant(0.0, 0.5), 2, 5, [("inertia", "ec_i_40")])
+        training.judge(one, Constant(0.0, 0.5), 2, 5)
 
 
 @pytest.mark.slow
 def test_training_from_nothing_makes_a_tuner_repeats_and_goes_on_from_kept_trials(tmp_path):
     rounds = (training.Round(sets=1, trials=8), training.Round(sets=1, trials=10))
-    options = {"rounds": rounds, "machines_at_once": 2, "rows": [("inertia", "ec_i_40")]}
-    first = training.train(3, **options, kept=tmp_path)
+    one = RECIPE._replace(rows=(Row("inertia", "ec_i_40"),))
+    few = training.Budget(rounds, machines=2, networks=3, judged=2)
+    first = training.train(one, 3, budget=few, kept=tmp_path)
     (tmp_path / "trials_3_1_0_0.npz").unlink()  # stopped in its second round
-    for other in (training.train(3, **options, kept=tmp_path), training.train(3, **options)):
+    for other in (training.train(one, 3, budget=few, kept=tmp_path), training.train(one, 3, budget=few)):
         for name, array in first.arrays.items():
             assert np.array_equal(array, other.arrays[name]), name
     assert first.card["machines"] == 2 * 2 and first.card["trials"] == 2 * 8 + 2 * 10
-    assert training.judge(policy_of(first), 2, 5, [("inertia", "ec_i_40")]).ratio.shape == (1, 2)
+    assert training.judge(one, policy_of(first), 2, 5).ratio.shape == (1, 2)
+
+
+@pytest.mark.parametrize("device", sorted(RECIPES))
+def test_a_recipe_makes_a_tuner_of_its_device_with_figures(device, tmp_path, monkeypatch):
+    """From the command line, of its first row's machines."""
+    pytest.importorskip("research.surrogate_fit", reason="fitting takes torch", exc_type=ImportError)
+    one = RECIPES[device]._replace(rows=RECIPES[device].rows[:1], dynamics=("standard",))
+    monkeypatch.setitem(training.RECIPES, device, one)
+    few = training.Budget((training.Round(1, 2), training.Round(1, 2)), machines=2, networks=1, judged=2)
+    monkeypatch.setitem(training.BUDGETS, "quick", few)
+    file = tmp_path / "mine.npz"
+    training.main(["--device", device, "--budget", "quick", "--out", str(file)])
+    made = AgentFile.load(file)
+    assert GainTuningConfig(**made.configuration).device == device
+    assert made.card["holds for"]["devices"] == [device] and made.card["trials"] == 2 * 2 * 2
+    assert made.card["figures"]["machines"] == 2
+    assert made.card["figures"]["median of the factory's gains"] > 0.0
+    assert len(made.settings["low"]) == len(one.gains)
+    # What it ends with is a trial, and the figure is that of the same machines and trials.
+    again = training.judge(one, policy_of(made), 2, made.card["figures"]["seed"])
+    assert np.median(again.ratio) == pytest.approx(made.card["figures"]["median"], abs=1e-3)
+
+
+def test_a_load_of_more_times_has_that_inertia_stiffness_and_friction_and_the_same_frequencies():
+    row = Row("two_mass", "am3041_e", 16.0)
+    small, large = (dict(laws(RECIPES["tgz_d"], row._replace(times=times)).laws) for times in (1.0 + 1e-12, 16.0))
+    scaled = {f"load.{name}" for name in ("inertia", "stiffness", "damping", "coulomb", "breakaway", "viscous")}
+    for name, law in small.items():
+        times = 16.0 if name in scaled else 1.0
+        assert (large[name].low, large[name].high) == pytest.approx((times * law.low, times * law.high)), name
+    assert scaled <= set(small)
+    assert laws(RECIPES["tmcm1636"], RECIPES["tmcm1636"].rows[0]) is None, "as it ships"
 
 
 # --- what ships -------------------------------------------------------------------------------------------------------
@@ -322,19 +359,19 @@ def test_agents_are_found_by_name_or_file(tmp_path):
 def test_the_shipped_tuner_performs_as_its_card_says():
     """On the card's own machines, of every kind, figure by figure: they are drawn from a seed and never trained on."""
     card = AgentFile.load(shipped("gain_tuning")).card["figures"]
-    found = training.judge(load_policy(shipped("gain_tuning")), training.MACHINES, card["seed"])
+    machines = training.BUDGETS["full"].judged
+    found = training.judge(RECIPE, load_policy(shipped("gain_tuning")), machines, card["seed"])
     assert found.ratio.size == card["machines"] >= 200
     for name, figure in training.figures_of(found.ratio).items():
         np.testing.assert_allclose(figure, card[name], atol=0.03, err_msg=name)
-    for (load, motor), row in zip(training.TRAINING, found.ratio, strict=True):
-        name = f"{load} on {motor}"
-        assert np.median(row) == pytest.approx(card["median of each row"][name], abs=0.05), name
+    for row, ratio in zip(RECIPE.rows, found.ratio, strict=True):
+        assert np.median(ratio) == pytest.approx(card["median of each row"][row.name], abs=0.05), row.name
     assert found.aborted.mean() == pytest.approx(card["trials that were stopped"], abs=0.03)
 
 
 def test_the_shipped_tuner_is_of_this_trainings_kind():
     """What acts is what the documented command makes: settings and configuration are those of the code."""
-    ships, made = AgentFile.load(shipped("gain_tuning")), training.bundle_of({}, {})
+    ships, made = AgentFile.load(shipped("gain_tuning")), training.bundle_of(RECIPE, {}, {})
     assert (ships.kind, ships.configuration) == (made.kind, made.configuration)
     assert ships.settings == json.loads(json.dumps(dict(made.settings)))
 

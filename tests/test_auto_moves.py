@@ -146,11 +146,31 @@ def bench_of_pairs(num_axes):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("slack", "kept"), [(0.5, True), (-0.1, False), (None, False)])
-def test_gains_before_that_move_better_are_kept_if_their_loops_keep_the_dynamics(slack, kept, monkeypatch):
-    """By the measured loops; where these were not measured, nothing says so of the gains before."""
-    axis = None if slack is None else SimpleNamespace(slack=lambda *asked: [slack])
+def judge_loops(monkeypatch, before, model=None):
+    """Have a pair's loops keep the dynamics by so much: with the gains before as measured, with raw gains by model."""
+    axis = None if before is None else SimpleNamespace(slack=lambda *asked: [before])
     monkeypatch.setattr(auto_moves, "measured_axis", lambda *given: axis)
+    known = SimpleNamespace(slack=lambda dynamics, gains: [(model or {}).get(int(gains[0, 0, 0]), 1.0)])
+    rows = [(known, np.array([0])), (known, np.array([1]))]
+    monkeypatch.setattr(auto_moves, "loop_models", lambda *given: rows)
+
+
+BEFORE, NEW = 3, 7  # raw gains, all alike
+
+
+@pytest.mark.parametrize(
+    ("measured", "model", "kept"),
+    [
+        (0.5, {}, True),
+        (-0.1, {}, False),
+        (None, {}, False),  # not measured: nothing says so of the gains before
+        (0.5, {BEFORE: -0.04, NEW: 0.2}, False),  # with a lighter load, say, which no move shows
+        (0.5, {BEFORE: -0.04, NEW: -0.05}, True),
+    ],
+)
+def test_gains_before_that_move_better_are_kept_if_their_loops_keep_the_dynamics(measured, model, kept, monkeypatch):
+    """By the measured loops, and by the model with what may become of the machine."""
+    judge_loops(monkeypatch, measured, model)
     start = recorded(np.full((2, 5), 7), shown=moved([3.0, 3.0]), earlier=moved([2.0, 2.0]), slack=np.full(2, 0.5),
                      overshoot=np.full(2, 0.3))  # fmt: skip
     found = keep_what_is_better(bench_of_pairs(2), basis(np.full((2, 5), 3)), start, np.ones(2, bool))
@@ -162,7 +182,7 @@ def test_gains_before_that_move_better_are_kept_if_their_loops_keep_the_dynamics
 
 @pytest.mark.parametrize("swing", [0.0, 2.0 * RESTLESS])
 def test_gains_before_with_which_an_axis_shakes_at_rest_are_not_kept(swing, monkeypatch):
-    monkeypatch.setattr(auto_moves, "measured_axis", lambda *given: SimpleNamespace(slack=lambda *asked: [0.5]))
+    judge_loops(monkeypatch, 0.5)
     earlier = moved([2.0, 2.0])._replace(swing=np.array([0.0, swing]))
     start = recorded(np.full((2, 5), 7), shown=moved([3.0, 3.0]), earlier=earlier, slack=np.full(2, 0.5))
     found = keep_what_is_better(bench_of_pairs(2), basis(np.full((2, 5), 3)), start, np.ones(2, bool))
@@ -176,7 +196,7 @@ def test_a_machine_of_several_axes_is_as_good_as_its_worst(monkeypatch):
     gains_now, gains_before = np.full((4, 5), 7), np.full((4, 5), 3)
     bench = bench_of_pairs(4)
     start = recorded(gains_now, shown=moved(now), earlier=moved(before), slack=np.full(4, 0.5))
-    monkeypatch.setattr(auto_moves, "measured_axis", lambda *given: SimpleNamespace(slack=lambda *asked: [0.5]))
+    judge_loops(monkeypatch, 0.5)
     found = keep_what_is_better(bench, basis(gains_now, before=gains_before), start, np.ones(4, bool))
     assert found.kept.tolist() == [bool(journal.notes) for journal in bench.journals] == [True, True, False, False]
     assert found.gains[:, 0].tolist() == [3, 3, 7, 7]

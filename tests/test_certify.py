@@ -125,6 +125,7 @@ OVERSHOT = "a step of its set-point in csp overshoots by 24 %"
 def test_a_correction_says_what_gave_way_why_and_whether_it_stayed(steps, final, is_kept, outcomes):
     journal = Journal()
     for old, new in steps:
+        journal.note(f"gains designed again from what was measured: {OVERSHOT}")
         journal.correct(np.array(old), np.array(new), OVERSHOT)
         journal.correct(np.array(new), np.array(new), "as its other axes were")  # which changes nothing here
     bench = SimpleNamespace(
@@ -138,3 +139,5 @@ def test_a_correction_says_what_gave_way_why_and_whether_it_stayed(steps, final,
     assert [(c.old, c.new, c.reason, c.outcome) for c in axis.corrections] == [
         (old, new, OVERSHOT, outcome) for (old, new), outcome in zip(steps, outcomes, strict=True)
     ]
+    again = f"gains designed again from what was measured: {OVERSHOT}"
+    assert list(axis.notes) == [again if one == TAKEN else f"{again}; {one}" for one in outcomes]

@@ -283,6 +283,8 @@ def test_machines_side_by_side_are_those_alone():
     together = open_loops(RATES, three, CascadeGains.of(DEVICE, raw), f)
     clear, over = loop_clearance(STANDARD, RATES, three, CascadeGains.of(DEVICE, raw))
     assert clear.shape == over.shape == (3,) and len({*clear.tolist()}) == 3
+    of_variants = loop_clearance(STANDARD, RATES, three, CascadeGains.of(DEVICE, raw), 3)
+    assert [part.tolist() for part in of_variants] == [clear.tolist(), over[:1].tolist()], "of the first the step alone"
     for k in range(3):
         one = type(three)(*(values[k : k + 1] for values in three))
         alone = open_loops(RATES, one, CascadeGains.of(DEVICE, raw[:1]), f[:1])

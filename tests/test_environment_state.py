@@ -17,6 +17,7 @@ import pytest
 
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
+from drive_env.envs.suite import TASKS
 from drive_env.envs.tracking import Tracking
 from drive_env.envs.vector_environment import SingleEnvironment
 
@@ -44,6 +45,7 @@ CASES = {
     "short": (GainScheduling, {"device": "tgz_d", "load": "inertia", **SHORT}),
     "servo": (GainTuning, {"trials": 3}),
     "servo of steppers": (GainTuning, {"device": "tmcm6212", "load": "inertia", "trials": 3}),
+    **{name: (Tracking, dict(task.options)) for name, task in TASKS.items()},
 }
 EVERY_CASE = pytest.mark.parametrize(("kind", "options"), CASES.values(), ids=CASES)
 FEW = ("two masses", "stepper", "belt", "servo")

@@ -189,14 +189,14 @@ def test_latency_delays_gains_and_measurements():
     slow = {"parameters": {"bus.action_latency": {"law": "choice", "values": [3]}}}
     environment = env(1, distributions=slow)
     environment.reset(seed=0)
-    written = []
-    write = environment.drives.write
-    environment.drives.write = lambda name, value, where=None: (
-        written.append((environment.drives.inside.cycle, name, int(value[0]))), write(name, value, where))  # fmt: skip
-    start = environment.drives.inside.cycle
+    played = []
+    record = environment.drives.record
+    environment.drives.record = lambda objects, duration, play: (
+        played.extend(play[POSITION_P][:, 0].tolist()), record(objects, duration, play=play))[1]  # fmt: skip
     environment.step(np.full((1, 3), 0.5))
-    acts = [now - start for now, name, value in written if name == POSITION_P and value != environment.base_gains[0, 4]]
-    assert acts == [3]
+    before = int(environment.base_gains[0, 4])
+    assert [value != before for value in played] == [False] * 3 + [True] * 7
+    assert environment.drives.read(POSITION_P).tolist() == played[-1:]
 
 
 # --- on a bus ---------------------------------------------------------------------------------------------------------

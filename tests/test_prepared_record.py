@@ -78,6 +78,19 @@ def test_a_scale_of_some_axes_and_a_reset_are_seen(pair):
     assert_equal(both(pair, [0x6064], 0.02), [0x6064])
 
 
+def test_a_reset_that_leaves_the_scales_alone_keeps_what_is_prepared(pair):
+    drives = pair[1]
+    drives.record(0x6064, 0.001)
+    prepared = dict(drives._prepared)
+    drives.machine.reset()
+    drives.record(0x6064, 0.001)
+    assert len(prepared) == 1 and drives._prepared == prepared
+    drives.write(0x2058, 1000)
+    drives.machine.reset()  # 65536 again
+    drives.record(0x6064, 0.001)
+    assert drives._prepared.keys() == prepared.keys() and drives._prepared != prepared
+
+
 def test_counters_go_on_past_the_end_of_their_type():
     with EmulatedDrives(load="inertia", num_threads=1) as drives:
         motion.enable(drives, mode="cst")

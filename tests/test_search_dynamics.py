@@ -18,6 +18,8 @@ from drive_env.loops.true_plant import true_machines
 from drive_env.loops.worst_margins import worst_margins
 from drive_env.trials.score import robust_cost
 from tuning.commands.cli import app
+from tuning.search import optimise as search
+from tuning.search.model_margins import ModelMargins
 from tuning.search.optimise import Settings, TrialRow, objective_values, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
@@ -136,6 +138,32 @@ def test_dynamics_that_cannot_be_asked_for_are_refused(tmp_path):
     assert refused.exit_code == 2 and "leave --dynamics out" in refused.output and not out.exists()
     refused = drive_tune("optimise", "--dynamics", "45/8", "--out", out)
     assert refused.exit_code == 2 and "phase margin/gain margin/Ms" in refused.output and not out.exists()
+
+
+def test_gains_of_a_search_bear_the_load_inertia_that_was_asked_for(tmp_path, monkeypatch):
+    asked = []
+
+    class Margins(ModelMargins):
+        def __init__(self, target, dynamics, where):
+            asked.append((dynamics.name, dynamics.inertia_range))
+            super().__init__(target, dynamics, where)
+
+    monkeypatch.setattr(search, "ModelMargins", Margins)
+    one, two = tmp_path / "one", tmp_path / "two"
+    arguments = ("--trials", 1, "--copies", 1, "--inertia-range", "0.2/5", "--out", one, "--json")
+    done = drive_tune("optimise", *arguments)
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["settings"]["inertia_range"] == "0.2/5"
+    assert drive_tune("optimise", "--config", one / "settings.toml", "--out", two).exit_code == 0
+    assert asked == [("standard", (0.2, 5.0))] * 2
+
+
+def test_a_journal_of_another_range_of_load_inertia_is_refused(tmp_path):
+    journal = tmp_path / "search.journal"
+    arguments = ("optimise", "--trials", 1, "--copies", 1, "--load", "inertia", "--journal", journal)
+    assert drive_tune(*arguments, "--out", tmp_path / "one").exit_code == 0
+    refused = drive_tune(*arguments, "--inertia-range", "0.5/3", "--out", tmp_path / "two")
+    assert refused.exit_code == 2 and "give another --journal" in refused.output, refused.output
 
 
 def test_the_command_asks_for_standard_dynamics_and_says_whose_margins_it_prints(tmp_path):

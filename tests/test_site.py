@@ -78,7 +78,7 @@ def test_every_load_has_a_page_with_its_picture_and_parameters():
 
 def test_every_environment_has_its_spaces_and_configuration():
     made = environment_pages.pages()
-    for module, *_ in ENVIRONMENTS.values():
+    for module, _ in ENVIRONMENTS.values():
         text = made[f"reference/environments/{module}.md"]
         for heading in ("Action space", "Observation space", "Reward and end", "Info", "Configuration", "Arguments"):
             assert f"## {heading}\n" in text, (module, heading)

@@ -457,9 +457,11 @@ def _guard(environment: str, stall: float | None, saturation: float | None) -> A
     from dataclasses import replace
 
     from agents.policies.guard import LIMITS
+    from drive_env.envs import environment_of
 
     given = {"stall": stall, "saturation": saturation}
-    return replace(LIMITS[environment], **{name: value or None for name, value in given.items() if value is not None})
+    own = LIMITS[environment_of(environment)]
+    return replace(own, **{name: value or None for name, value in given.items() if value is not None})
 
 
 def _tell(

@@ -50,7 +50,7 @@ def search(
         from agents.commands.train import with_load
         from agents.training.search import BEST, SearchTrial
         from agents.training.search import search as run_search
-        from agents.training.tasks import ENVIRONMENTS, environment_name
+        from agents.training.tasks import environment_name, short_name
 
         for name, value in (("--trials", trials), ("--steps", steps)):
             if value is not None and value < 1:
@@ -58,7 +58,7 @@ def search(
         given = with_load(environment, algorithm, preset, load, config)
         if steps is not None:
             given["n_timesteps"] = steps
-        short = ENVIRONMENTS[environment_name(environment)].short
+        short = short_name(environment_name(environment))
         folder = Path("runs") / f"search-{short}-{algorithm}" if out is None else out
 
         def tell(trial: SearchTrial, best: SearchTrial | None) -> None:

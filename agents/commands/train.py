@@ -55,7 +55,7 @@ def train(
     resumed.
     """
     with errors_as_exit_codes():
-        from agents.training.tasks import ENVIRONMENTS
+        from agents.training.tasks import short_name
         from agents.training.train import clear, run_to_resume, with_figures
         from agents.training.train import train as run_training
         from agents.training.training_run import AGENT, CHECKPOINT, CURVE, TrainingRun
@@ -69,7 +69,7 @@ def train(
                     raise ValueError(f"--steps {steps} must be 1 or more")
                 given["n_timesteps"] = steps
             run = TrainingRun(environment, algorithm, given, seed=seed, preset=preset)
-            folder = new_folder(out, f"{ENVIRONMENTS[run.environment].short}-{algorithm}")
+            folder = new_folder(out, f"{short_name(run.environment)}-{algorithm}")
         else:
             given_too = [name for name in given_options(context) if name not in ("--resume", "--trust")]
             if given_too:

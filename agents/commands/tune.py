@@ -263,14 +263,14 @@ def _report(done: TunerRun, folder: Path, json: bool, bus: bool) -> None:
             }
         )  # fmt: skip
     else:
-        _print(done, refused, rule)
+        _print(done, refused)
         undo = ", before.toml for `drive-tune undo`" if bus else ""  # an emulated drive ended with this program
         print_lines([f"written to {folder}: report.html to read, certificate.json{undo}"])
     if refused:
         raise typer.Exit(REFUSED)
 
 
-def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
+def _print(done: TunerRun, refused: list[str]) -> None:
     from drive_env.devices import find_device
 
     result = done.result
@@ -282,10 +282,9 @@ def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
         lines.append(f"{name:<7}{''.join(f'{value:>{width}}' for value in gains)}")
     if axis.accepted and (said := _answer(done)):
         lines.append(said)
-    if axis.accepted and rule is not None:
+    if axis.accepted and done.trials:
         lines.append(
-            f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the baseline rule's J of {rule:.3f}; "
-            f"{certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}"
+            f"J {axis.proof:.3f}; {certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}"
         )
     for loop in certified.frequency_responses:
         if loop.tuned:

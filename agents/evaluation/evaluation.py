@@ -19,10 +19,11 @@ import numpy as np
 from agents.evaluation.scores import Episode, Interval, figures, interval
 from agents.policies.agent_file import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
-from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_environments
+from agents.training.tasks import configuration_of, environment_name, make_environments, row_of
 from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
+from drive_env.envs import environment_of
 from drive_env.master.realtime_section import undisturbed
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_json
@@ -200,7 +201,7 @@ def evaluate(
     if on is not None and not on.drives.time_waits and on.drives.bus is not None:
         timing = on.drives.bus.total_timing
         evaluation.late = timing.late / max(timing.cycles, 1)
-        evaluation.pace = pace if environment in FIXED_STEPS else 1.0
+        evaluation.pace = pace if environment_of(environment) in FIXED_STEPS else 1.0
     return evaluation
 
 
@@ -212,9 +213,9 @@ def _how_to_act_on(on: GivenDrives) -> dict[str, Any]:
 
 def _guarded(policy: Any, lanes: Any, environment: str, on: GivenDrives | None) -> GuardedPolicy:
     """Return the policy with its limits: those of given drives, and hardly any where nothing can break."""
-    limits = PATIENT if on is None else on.guard or LIMITS[environment]
+    limits = PATIENT if on is None else on.guard or LIMITS[environment_of(environment)]
     space = lanes.single_action_space
-    return GuardedPolicy(policy, space.low, space.high, STEP_SECONDS[environment](lanes.config), limits)
+    return GuardedPolicy(policy, space.low, space.high, STEP_SECONDS[environment_of(environment)](lanes.config), limits)
 
 
 def _all_rounds(
@@ -230,7 +231,7 @@ def _all_rounds(
         all_end: As `_episodes` has it.
         told: Called with the share that is done.
     """
-    step, steps = STEP_SECONDS[environment](lanes.config), ENVIRONMENTS[environment].steps(lanes.config)
+    step, steps = STEP_SECONDS[environment_of(environment)](lanes.config), row_of(environment).steps(lanes.config)
     recorded: list[Episode] = []
     spent, due = 0.0, 0.0
     for first in range(0, len(seeds), lanes.num_envs):
@@ -307,6 +308,7 @@ def _episodes(
     count = lanes.num_envs
     observation, begun = lanes.reset(seed=list(seeds))
     policy.reset(None)
+    policy.told(begun.get("parameters"), np.ones(count, bool))
     first = [_of_environment(begun, lane) for lane in range(count)]
     rows: list[Any] = [_seen(observation)]
     actions: list[Any] = []
@@ -402,7 +404,7 @@ def _num_envs_of(environment: str, drives: Drives, options: Mapping[str, Any]) -
     if load is None:
         import importlib
 
-        task = ENVIRONMENTS[environment]
+        task = row_of(environment)
         module = importlib.import_module(f"drive_env.envs.{task.short}")
         load = getattr(module, f"{task.kind}Config")().load
     axes = find_load(load).num_axes

@@ -12,6 +12,7 @@ from agents.policies.guard import GuardLimits
 from agents.training.tasks import environment_name, make_environments
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.envs import environment_of
 from drive_env.safety.limits import given
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def target_for(
     more |= options
     warm_up(environment, configuration)
     position, velocity = None, None
-    if environment_name(environment) == "ServoDrive/Tracking-v0":
+    if environment_of(environment_name(environment)) == "ServoDrive/Tracking-v0":
         lanes = make_environments(environment, 1, _emulated(configuration))
         amplitude, speed = lanes.config.amplitude, lanes.config.speed  # type: ignore[attr-defined]
         lanes.close()
@@ -74,7 +75,7 @@ def target_for(
         position = ((at - reach).tolist(), (at + reach).tolist())
         velocity = (SPEED_SLACK * speed * speed_turn).tolist()
     # A trial of gains may oscillate: it sees that and stops the environment by itself.
-    oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
+    oscillation = environment_of(environment_name(environment)) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)
     with on_bus(travel=FREE, safety=limits, **more) as target:
         yield target

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.envs import environment_of
+from drive_env.trials.score import TRIP
 from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
@@ -86,16 +88,15 @@ def pole(episode: Episode, config: Any) -> float:
     return float(np.sqrt(np.mean(np.square(episode.observations[1:, -2]))))
 
 
-def _told(name: str, ratio: bool) -> Callable[[Episode, Any], float]:
-    """Return a figure of GainTuning's info: at the end, or relative to that of the rule, with which it begins."""
+def _told(name: str) -> Callable[[Episode, Any], float]:
+    """Return a figure of GainTuning's info at the end of an episode."""
+    return lambda episode, config: float(np.asarray(episode.last.get(name, np.nan)))
 
-    def compute(episode: Episode, config: Any) -> float:
-        if name not in episode.last:
-            return float("nan")
-        end = float(np.asarray(episode.last[name]))
-        return end / float(np.asarray(episode.first[name])) if ratio else end
 
-    return compute
+def constraints_kept(episode: Episode, config: Any) -> float:
+    """Return 1 where the answer of GainTuning keeps the constraints, else 0; NaN on given drives, which do not tell."""
+    cost = _told("robust_cost")(episode, config)
+    return cost if np.isnan(cost) else float(cost < TRIP)
 
 
 def _mean_term(name: str) -> Callable[[Episode, Any], float]:
@@ -126,9 +127,9 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
         RETURN,
     ),
     "ServoDrive/GainTuning-v0": (
-        Figure("robust cost relative to the rule's (emulator)", _told("robust_cost", ratio=True)),
-        Figure("J by measured terms, relative to the rule's", _told("measured", ratio=True)),
-        Figure("J by measured terms", _told("measured", ratio=False)),
+        Figure("robust cost (emulator)", _told("robust_cost")),
+        Figure("constraints kept (emulator) [share]", constraints_kept, lower_is_better=False),
+        Figure("J by measured terms", _told("measured")),
         Figure("stopped trials [share]", stopped),
         RETURN,
     ),
@@ -142,7 +143,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 
 def figures(environment: str, config: Any) -> tuple[Figure, ...]:
     """Return the figures of an environment, the score first: where a pole can fall, the time that it stood."""
-    found = FIGURES[environment]
+    found = FIGURES[environment_of(environment)]
     if np.isfinite(getattr(getattr(config, "task", None), "fall", np.inf)):
         found = tuple(sorted(found, key=lambda figure: figure.compute is not upright))
     return found

@@ -18,6 +18,7 @@ from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
 from agents.training.tasks import environment_name, make_environments
 from drive_env.bus.config import Machine
 from drive_env.drives.interface import Drives, machine_of
+from drive_env.envs import environment_of
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 
@@ -85,7 +86,7 @@ def on_both_sides(
         )
     rows = draw_machines(config, machines, seed)
     options: dict[str, Any] = {"name": name, "episodes": 1}
-    limits = guard or LIMITS[environment]
+    limits = guard or LIMITS[environment_of(environment)]
     noises = (0,) if lockstep else (0, OTHER_NOISE)
     found: dict[int, list[Evaluation]] = {}
     missing: dict[int, str] = {}

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.policies.experts import CarriageServo, ComputedTorque, Pendulum, SpeedCurve, SwingUp, TorqueCascade
 from agents.training.tasks import environment_name
 
 Array = NDArray[np.float32]
@@ -131,13 +132,37 @@ BASELINES: dict[str, dict[str, Any]] = {
 }
 
 
+# Task of the suite -> name of a baseline -> what makes it. A baseline that cannot act has no row: the set-points
+# of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole.
+SUITE_TASKS: dict[str, dict[str, Any]] = {
+    "ServoDrive/TorqueTracking-v1": {"rest": nothing, "cascade": TorqueCascade, "expert": ComputedTorque},
+    "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": feed_forward},
+    "ServoDrive/Crane-v1": {"rest": nothing, "cascade": CarriageServo, "expert": Pendulum},
+    "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
+    "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
+    "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": feed_forward},
+    "ServoDrive/StepperRun-v1": {"rest": nothing, "expert": SpeedCurve},
+}
+
+
+def baselines_of(environment: str) -> dict[str, Any]:
+    """Return the baselines of an environment or task by name: what makes each from configuration and actions."""
+    name = environment_name(environment)
+    if name not in SUITE_TASKS:
+        return BASELINES[name]
+    return {
+        row: (lambda configuration, actions, made=made: made(actions if made is nothing else configuration))
+        for row, made in SUITE_TASKS[name].items()
+    }
+
+
 def baseline(name: str, environment: str, configuration: Any, actions: int) -> Any:
     """Return a baseline of an environment by name.
 
     Raises:
         ValueError: If it has none of that name.
     """
-    rows = BASELINES[environment_name(environment)]
+    rows = baselines_of(environment)
     if name not in rows:
         raise ValueError(f"{environment} has no baseline {name!r}; it has {', '.join(rows)}")
     return rows[name](configuration, actions)

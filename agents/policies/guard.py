@@ -103,6 +103,11 @@ class GuardedPolicy:
         self._at_limit[:] = 0
         self._ask(self._policy.reset, mask, within=self._limits.stall)
 
+    def told(self, parameters: Any, mask: NDArray[np.bool_]) -> None:
+        """Tell a policy that asks for it which machines begin."""
+        if parameters is not None and hasattr(self._policy, "told"):
+            self._ask(lambda known: self._policy.told(known, mask), parameters, within=self._limits.stall)
+
     def act(self, observation: Any) -> Any:
         """Return the policy's action.
 

@@ -69,9 +69,9 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
         return _callable(text)
     if text in shipped_names():
         return replace(_bundle(str(shipped(text))), name=text)
-    from agents.policies.baselines import BASELINES
+    from agents.policies.baselines import BASELINES, SUITE_TASKS
 
-    baselines = sorted({name for rows in BASELINES.values() for name in rows})
+    baselines = sorted({name for rows in (*BASELINES.values(), *SUITE_TASKS.values()) for name in rows})
     raise PolicyNotFoundError(
         f"{text!r} is not a policy; give an agent that ships ({', '.join(shipped_names())}), a file "
         f"({', '.join((*OPENERS, CHECKPOINT))}), a Python function (module:function) or a baseline "
@@ -110,9 +110,9 @@ def names_a_file(text: str) -> bool:
 
 def is_baseline(text: str) -> bool:
     """Return whether a text names a baseline, which acts in whatever environment is asked for."""
-    from agents.policies.baselines import BASELINES
+    from agents.policies.baselines import BASELINES, SUITE_TASKS
 
-    return any(text in rows for rows in BASELINES.values())
+    return any(text in rows for rows in (*BASELINES.values(), *SUITE_TASKS.values()))
 
 
 class CallablePolicy:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from drive_env.envs import environment_of, make_vector
+from drive_env.envs.suite import TASKS as SUITE
+
 if TYPE_CHECKING:
     from drive_env.envs.vector_environment import VectorEnvironment
 
@@ -32,16 +35,29 @@ ENVIRONMENTS = {
 
 
 def environment_name(text: str) -> str:
-    """Return the full name of an environment from any spelling: tracking, Tracking-v0, ServoDrive/Tracking-v0.
+    """Return the full name of an environment or task from any spelling: tracking, Tracking-v0, ServoDrive/Tracking-v0.
 
     Raises:
         ValueError: If there is none, naming those that are.
     """
     wanted = _letters(text)
-    for name, task in ENVIRONMENTS.items():
-        if wanted in (_letters(name), _letters(name.partition("/")[2]), _letters(task.short)):
+    for name in (*ENVIRONMENTS, *SUITE):
+        last = name.partition("/")[2]
+        if wanted in (_letters(name), _letters(last), _letters(last.partition("-")[0])):
             return name
-    raise ValueError(f"there is no environment {text!r}; there are {', '.join(ENVIRONMENTS)}")
+    raise ValueError(f"there is no environment {text!r}; there are {', '.join((*ENVIRONMENTS, *SUITE))}")
+
+
+def row_of(environment: str) -> TrainingTask:
+    """Return the row of a configurable environment, or of the one that a task of the suite configures."""
+    return ENVIRONMENTS[environment_of(environment)]
+
+
+def short_name(environment: str) -> str:
+    """Return the name of an environment's or a task's files."""
+    if environment in ENVIRONMENTS:
+        return ENVIRONMENTS[environment].short
+    return "".join(f"_{c.lower()}" if c.isupper() else c for c in environment.partition("/")[2].partition("-")[0])[1:]
 
 
 def make_environments(
@@ -52,18 +68,18 @@ def make_environments(
     Args:
         environment: Its name.
         num_envs: Number of environments.
-        configuration: The environment's own options.
+        configuration: The environment's own options; a task of the suite takes none but its own.
         options: drives, sensor, autoreset_mode, render_mode, as the environment takes them.
 
     Raises:
         ValueError: For a name or a value that is none.
     """
-    import importlib
-
-    task = ENVIRONMENTS[environment_name(environment)]
-    kind = getattr(importlib.import_module(f"drive_env.envs.{task.short}"), task.kind)
-    made: VectorEnvironment = kind(num_envs, config=dict(configuration or {}), **options)
-    return made
+    name, own = environment_name(environment), dict(configuration or {})
+    if name in SUITE:
+        plain_own = SUITE[name].options
+        own = {key: value for key, value in own.items() if key not in plain_own or value != plain_own[key]}
+        return make_vector(num_envs, name=name, **own, **options)
+    return make_vector(num_envs, name=name, config=own, **options)
 
 
 def configuration_of(lanes: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from agents.training.algorithms import ALGORITHMS
 from agents.training.counted_environments import CountedEnvironments
-from agents.training.tasks import ENVIRONMENTS, environment_name
+from agents.training.tasks import environment_name, row_of
 
 CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
 EPISODES_PER_SEGMENT = 3  # of every environment, at least
@@ -74,7 +74,7 @@ Report = Callable[[Progress], None]
 
 def segment_length(run: TrainingRun, lanes: CountedEnvironments) -> int:
     """Return the steps of a segment: a share of the run, but at least some episodes of every environment."""
-    episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
+    episode: int = row_of(run.environment).steps(lanes.config) * lanes.num_envs
     return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
 
 

@@ -31,7 +31,7 @@ def section(name: str) -> str:
     """Return what is known of an agent."""
     agent = AgentFile.load(shipped(name))
     card = agent.card
-    module = ENVIRONMENTS[agent.environment].module
+    module, _ = ENVIRONMENTS[agent.environment]
     rows = [
         ("environment", f"[`{agent.environment}`](environments/{module}.md)"),
         ("options that it was trained with", options(agent)),

@@ -54,7 +54,7 @@ Every environment takes
 | option | what it does |
 | --- | --- |
 | `machine` | true parameters for this episode by name, one value or one per environment; the rest is drawn |
-| `trajectory` | Tracking alone: a function or its rows, (3, samples) or (environments, 3, samples), for this episode |
+| `trajectory` | Tracking alone: for this episode a function, or rows of (3, samples) or (all axes, 3, samples) |
 | `state` | goes on from a saved state instead of beginning an episode; nothing else is given then |
 | `reset_mask` | of vector environments: which of them begin |
 
@@ -81,7 +81,7 @@ TASKS = {
 def pages() -> dict[str, str]:
     """Return the index and a page for each environment."""
     rows, made = [], {}
-    for name, (module, kind, *_) in ENVIRONMENTS.items():
+    for name, (module, kind) in ENVIRONMENTS.items():
         rows.append((f"[`{name}`]({module}.md)", TASKS[kind]))
         made[f"{FOLDER}/{module}.md"] = page(name, module, kind)
     return {f"{FOLDER}/index.md": INDEX.format(table=table(("name", "what an agent does"), rows)), **made}

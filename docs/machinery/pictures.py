@@ -1,6 +1,6 @@
 """Draw the site's pictures of loads and environments, and film a machine while it is tuned, into docs/assets.
 
-python docs/machinery/pictures.py             # all; or the names of some: loads environments film
+python docs/machinery/pictures.py             # all; or the names of some: loads environments tasks film
 
 Pictures are committed: they need OpenGL (as `drive-env render` does), which not every computer that builds the site
 has. Run it again after a load or an environment has changed.
@@ -9,7 +9,8 @@ has. Run it again after a load or an environment has changed.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,26 +19,30 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from agents.policies.baselines import baseline
 from agents.policies.open_policy import open_policy
 from agents.shipped import TUNER
-from agents.tuner.tune_target import TrialShown, tune_target
+from agents.training.tasks import short_name
 from drive_env import EmulatedDrives, motion
 from drive_env.envs import ENVIRONMENTS
+from drive_env.envs.suite import TASKS
 from drive_env.gains import write_gains
 from drive_env.pictures.demonstration import PictureFormat
 from drive_env.pictures.recording import CYCLE, Recorder
 from drive_env.pictures.render import Picture
+from drive_env.trials.gain_trial import PROBE
 from mechanics.loads import LOADS
 from mechanics.shaft import one
+from tuning.auto.one_button import auto
 from tuning.target import emulated
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets"
 QUALITY = 82  # of WebP
 LOAD_PICTURE = PictureFormat(width=960, height=420)  # of which the machine is the left half
-# The film: a belt axis, all trials of the tuner that ships, and then its answer once more.
+# The film: a belt axis with the gains before auto, with those that it tried, and with its answer.
 FILM = PictureFormat(width=800, height=450, frames_per_second=12.5)
-SLOW, MOVE, ANSWER = 5.0, 131_072, 8  # slow motion; two turns [inc]; frames for which the answer's end is held
-TRIAL = 0.32  # s of a trial that are shown: the move, and how it settles
+SLOW, MOVE, ANSWER = 10.0, 131_072, 16  # slow motion; two turns [inc]; frames for which the answer's end is held
+SHOWN = 0.32  # s that are shown: the move, and how it settles
 
 
 class Row(NamedTuple):
@@ -64,7 +69,7 @@ def draw_loads() -> None:
 
 def draw_environments() -> None:
     """Draw every environment after some steps, with an agent that ships at work where there is one."""
-    for name, (module, *_) in ENVIRONMENTS.items():
+    for name, (module, _) in ENVIRONMENTS.items():
         row = ENVIRONMENT_ROWS[module]
         with gymnasium.make(name, render_mode="rgb_array", **row.options) as env:
             policy = open_policy(row.policy).policy if row.policy else None
@@ -77,16 +82,36 @@ def draw_environments() -> None:
             save(np.asarray(env.render()), ASSETS / "environments" / f"{module}.webp")
 
 
+def draw_tasks() -> None:
+    """Draw every task of the suite with its expert at work, after a third of the episode."""
+    for name, task in TASKS.items():
+        with gymnasium.make(name, render_mode="rgb_array") as env:
+            lanes = env.unwrapped.vector  # type: ignore[attr-defined]
+            expert = baseline("expert", name, lanes.config, lanes.single_action_space.shape[0])
+            observation, info = env.reset(seed=1)
+            if hasattr(expert, "told"):
+                known = {key: np.atleast_1d(value) for key, value in info["parameters"].items()}
+                expert.told(known, np.ones(1, bool))
+            for _ in range(task.steps // 3):
+                observation, *_ = env.step(expert.act(observation))
+            save(np.asarray(env.render()), ASSETS / "tasks" / f"{short_name(name)}.webp")
+
+
 def film_tuning() -> None:
-    """Film the trials with which the tuner that ships tunes a belt axis: each trial's gains, on the same machine."""
-    trials: list[TrialShown] = []
-    with emulated(load="belt") as target:
-        tuned = tune_target(target, open_policy(TUNER).policy, show=trials.append)
-        titles = target.device.gains.titles
-    answer = int(tuned.answers.ravel()[0])
-    rows = [(trial_title(k, trial, titles), trial.gains) for k, trial in enumerate(trials)]
-    rows.append((f"answer: trial {trials[answer].number}", tuned.gains))
-    pictures = [Image.fromarray(frame) for title, gains in rows for frame in trial_frames(title, gains)]
+    """Film a move of a belt axis with the gains before auto, with those that it tried, and with its answer."""
+    with emulated(load="belt") as target, tempfile.TemporaryDirectory() as folder:
+        (axis,) = auto(target, Path(folder) / "before.toml").axes
+        known = target.device.gains
+    designed = axis.corrections[0].old if axis.corrections else axis.after
+    more = known.scaled(np.array(axis.after), PROBE, known.columns_of("velocity")[:1])
+    rows = [("before", axis.before), ("designed", designed)]
+    rows += [("corrected", one.new) for one in axis.corrections]
+    rows += [(f"velocity P x {PROBE:g}", tuple(more.tolist())), ("answer", axis.after)]
+    pictures = [
+        Image.fromarray(frame)
+        for name, gains in rows
+        for frame in move_frames(f"{name}: {in_words(known.titles, gains)}", np.array(gains)[None])
+    ]
     pictures += [pictures[-1]] * ANSWER
     pictures[0].save(
         ASSETS / "tuning.webp", save_all=True, append_images=pictures[1:], quality=60, method=6, loop=0,
@@ -95,20 +120,19 @@ def film_tuning() -> None:
     pictures[-1].save(ASSETS / "tuning_still.webp", quality=QUALITY, method=6)
 
 
-def trial_title(number: int, trial: TrialShown, titles: tuple[str, ...]) -> str:
-    """Return what stands above a trial: the gains that the tuner changes."""
-    gains = zip(titles, trial.gains[0], strict=True)
-    return f"trial {number}: " + ", ".join(f"{title} {gain}" for title, gain in gains if "torque" not in title)
+def in_words(titles: tuple[str, ...], gains: Iterable[int]) -> str:
+    """Return the gains of the outer loops, with their names."""
+    return ", ".join(f"{title} {gain}" for title, gain in zip(titles, gains, strict=True) if "torque" not in title)
 
 
-def trial_frames(title: str, gains: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+def move_frames(title: str, gains: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
     """Move the axis once with some gains, and draw it as it moves."""
     with EmulatedDrives(load="belt") as drives:
         write_gains(drives, gains)
         motion.enable(drives, mode="pp")
         recorder = Recorder(drives)
         motion.start_move(recorder, MOVE, relative=True)
-        recorder.advance(TRIAL)
+        recorder.advance(SHOWN)
         recording = recorder.recording(title)
     step = round(1.0 / (FILM.frames_per_second * SLOW * CYCLE))
     with Picture(drives.load, FILM) as picture:
@@ -123,7 +147,12 @@ def save(image: NDArray[np.uint8], path: Path) -> None:
     print(f"{path.relative_to(ASSETS.parent)}: {path.stat().st_size} bytes")
 
 
-JOBS: dict[str, Callable[[], None]] = {"loads": draw_loads, "environments": draw_environments, "film": film_tuning}
+JOBS: dict[str, Callable[[], None]] = {
+    "loads": draw_loads,
+    "environments": draw_environments,
+    "tasks": draw_tasks,
+    "film": film_tuning,
+}
 
 if __name__ == "__main__":
     for wanted in sys.argv[1:] or JOBS:

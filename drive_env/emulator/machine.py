@@ -215,6 +215,18 @@ class Machines:
         """Positions of the load's joints, in the order of its MJCF [rad or m], shape (num_machines, joints)."""
         return np.concatenate([group.load.joint_positions() for group in self._drives._groups])
 
+    def place(self, joint: int, angles: ArrayLike, where: Mask | None = None) -> None:
+        """Put a joint that no drive turns to another position, at rest.
+
+        Args:
+            joint: Number of the joint, as in `joint_positions`.
+            angles: From the load's zero [rad or m], shape (num_machines,).
+            where: Machines.
+        """
+        mask, chosen = self._mask(where), self._per_machine(angles, "angles")
+        for group in self._drives._groups:
+            group.load.place(joint, chosen[group.machines], mask[group.machines])
+
     @property
     def supply(self) -> Floats:
         """Open-circuit supply voltage [V], shape (num_axes,); set one value or one per axis.

@@ -1,96 +1,106 @@
 """The Gymnasium environments; `import drive_env` registers them, and each is imported only when one is made.
 
-Each has a file with its vector environment, a class of `vector_environment.VectorEnvironment`; the single environment
-is a view of it.
+Each of ENVIRONMENTS has a file with its vector environment, a class of `vector_environment.VectorEnvironment`; the
+single environment is a view of it. The tasks of the suite (`suite.TASKS`) are configurations of these.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
+
+from drive_env.envs.suite import TASKS, task_options
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
+    from drive_env.envs.vector_environment import VectorEnvironment
 
-class EnvironmentRow(NamedTuple):
-    """File and class of a vector environment, and the return from which Gymnasium's users count it as solved.
-
-    The steps of an episode are the configuration's: an environment tells them in its `spec` once it is made.
-    """
-
-    module: str
-    kind: str
-    reward_threshold: float | None = None
-
-
+# Name -> file and class of the vector environment.
 ENVIRONMENTS = {
-    "ServoDrive/GainTuning-v0": EnvironmentRow("gain_tuning", "GainTuning"),
-    "ServoDrive/GainScheduling-v0": EnvironmentRow("gain_scheduling", "GainScheduling"),
-    "ServoDrive/Tracking-v0": EnvironmentRow("tracking", "Tracking"),
+    "ServoDrive/GainTuning-v0": ("gain_tuning", "GainTuning"),
+    "ServoDrive/GainScheduling-v0": ("gain_scheduling", "GainScheduling"),
+    "ServoDrive/Tracking-v0": ("tracking", "Tracking"),
 }
+# What a vector environment takes beside its configuration's options.
+_AROUND = ("config", "drives", "sensor", "reach", "autoreset_mode", "render_mode", "reward")
 
 
 def register() -> None:
-    """Register the environments with Gymnasium, once."""
-    for name, row in ENVIRONMENTS.items():
+    """Register the environments and the tasks of the suite with Gymnasium, once."""
+    for name in (*ENVIRONMENTS, *TASKS):
         if name not in gymnasium.registry:
+            task = TASKS.get(name)
             gymnasium.register(
                 name,
-                entry_point=f"drive_env.envs:make_{row.module}",
-                vector_entry_point=f"drive_env.envs.{row.module}:{row.kind}",
-                reward_threshold=row.reward_threshold,
+                entry_point="drive_env.envs:make_single",
+                vector_entry_point="drive_env.envs:make_vector",
+                reward_threshold=None if task is None else task.solved * task.steps,
+                kwargs={"name": name},
             )
+
+
+def environment_of(name: str) -> str:
+    """Return the configurable environment that a name stands for: a task's own, or itself.
+
+    Raises:
+        ValueError: For a name that is none.
+    """
+    if name in TASKS:
+        return TASKS[name].environment
+    if name in ENVIRONMENTS:
+        return name
+    from mechanics.near_names import did_you_mean  # not before `commands` has looked whose `mechanics` that is
+
+    known = (*ENVIRONMENTS, *TASKS)
+    raise ValueError(f"there is no environment {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}")
+
+
+def make_vector(num_envs: int = 1, *, name: str, **options: Any) -> VectorEnvironment:
+    """Return a vector environment.
+
+    Args:
+        num_envs: Number of environments.
+        name: Of a configurable environment or of a task of the suite.
+        options: drives, sensor, reach, autoreset_mode, render_mode and reward as the environment takes them, and those
+            of its configuration; of a task num_threads alone.
+
+    Raises:
+        ValueError: For a name or an option that is none.
+    """
+    module, kind = ENVIRONMENTS[environment_of(name)]
+    if name in TASKS:
+        around = {key: options.pop(key) for key in _AROUND[1:] if key in options}
+        options = around | task_options(name, options)
+    made: VectorEnvironment = getattr(importlib.import_module(f"drive_env.envs.{module}"), kind)(num_envs, **options)
+    return made
+
+
+def make_single(*, name: str, **options: Any) -> gymnasium.Env[Any, Any]:
+    """Return a single environment; arguments as `make_vector` takes them."""
+    from drive_env.envs.vector_environment import SingleEnvironment
+
+    return SingleEnvironment(make_vector(1, name=name, autoreset_mode="Disabled", **options))
 
 
 def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
     """Return a VecEnv of Stable-Baselines3, with the episodes' returns for its log.
 
     Args:
-        name: As it is registered, e.g. "ServoDrive/Tracking-v0".
+        name: As it is registered, e.g. "ServoDrive/GantryBeam-v1".
         num_envs: Number of environments.
         options: Of the environment.
 
     Raises:
         ValueError: For a name that is none; ImportError without Stable-Baselines3 (the extra `agents`).
     """
-    if name not in ENVIRONMENTS:
-        from mechanics.near_names import did_you_mean  # not before `commands` has looked whose `mechanics` that is
-
-        near = did_you_mean(name, ENVIRONMENTS)
-        raise ValueError(f"there is no environment {name!r}{near}; there are {', '.join(ENVIRONMENTS)}")
+    environment_of(name)
     try:
         from stable_baselines3.common.vec_env import VecMonitor
 
         from drive_env.envs.stable_baselines import DriveVecEnv
     except ImportError as error:
         raise ImportError(f"make_vec_env needs Stable-Baselines3 ({error}): pip install 'drive-env[agents]'") from None
-    row = ENVIRONMENTS[name]
-    lanes = getattr(importlib.import_module(f"drive_env.envs.{row.module}"), row.kind)
-    return VecMonitor(DriveVecEnv(lanes(num_envs, autoreset_mode="SameStep", **options)))
-
-
-def make_gain_tuning(**options: Any) -> gymnasium.Env[Any, Any]:
-    """Return a single GainTuning environment."""
-    from drive_env.envs.gain_tuning import GainTuning
-    from drive_env.envs.vector_environment import SingleEnvironment
-
-    return SingleEnvironment(GainTuning(1, autoreset_mode="Disabled", **options))
-
-
-def make_gain_scheduling(**options: Any) -> gymnasium.Env[Any, Any]:
-    """Return a single GainScheduling environment."""
-    from drive_env.envs.gain_scheduling import GainScheduling
-    from drive_env.envs.vector_environment import SingleEnvironment
-
-    return SingleEnvironment(GainScheduling(1, autoreset_mode="Disabled", **options))
-
-
-def make_tracking(**options: Any) -> gymnasium.Env[Any, Any]:
-    """Return a single Tracking environment."""
-    from drive_env.envs.tracking import Tracking
-    from drive_env.envs.vector_environment import SingleEnvironment
-
-    return SingleEnvironment(Tracking(1, autoreset_mode="Disabled", **options))
+    return VecMonitor(DriveVecEnv(make_vector(num_envs, name=name, autoreset_mode="SameStep", **options)))

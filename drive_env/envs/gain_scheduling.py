@@ -419,27 +419,27 @@ class GainScheduling(VectorEnvironment):
         return np.asarray(self._bus.act(sent), np.int64)
 
     def _run(self, targets: Integers) -> dict[tuple[int, int], Integers]:
-        """Let the step pass; gains are written when they arrive, between two cycles."""
+        """Let the step pass; gains act when they arrive, between two cycles."""
         wanted = self._gains_of(self._action)
-        arriving = np.broadcast_to(wanted, (self._cycles, *wanted.shape))
-        if self._gain_bus.is_there:
-            by_lane = arriving.reshape(self._cycles, self.num_envs, -1)
-            arriving = self._gain_bus.act_unlatched(by_lane).reshape(arriving.shape)
+        play = {TARGETS[self.config.mode]: targets.reshape(self._cycles, -1)}
+        if self._machines is None:  # on a bus no PDO carries them
+            for key, values in zip(self._gain_objects, wanted.T, strict=True):
+                self.drives.write(key, values)
+        else:
+            sent = np.broadcast_to(wanted, (self._cycles, *wanted.shape))
+            by_lane = self._gain_bus.act_unlatched(sent.reshape(self._cycles, self.num_envs, -1))
+            arriving = by_lane.reshape(sent.shape)
+            play |= {key: arriving[:, :, k] for k, key in enumerate(self._gain_objects)}
         objects = (POSITION, VELOCITY, CURRENT, STATUSWORD)
-        played = targets.reshape(self._cycles, -1)
         # A picture looks at every cycle.
-        apart = self._pictures is not None and self._pictures.is_looking
-        changed = np.any(arriving[1:] != arriving[:-1], axis=(1, 2))
-        begins = [k for k in range(self._cycles) if k == 0 or apart or changed[k - 1]]
+        at_once = 1 if self._pictures is not None and self._pictures.is_looking else self._cycles
         traces = []
         with warnings.catch_warnings():
             # A machine that leaves physics ends its environment; who steps it is told so by `info`.
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
-            for begin, end in zip(begins, [*begins[1:], self._cycles], strict=True):
-                for k, key in enumerate(self._gain_objects):
-                    self.drives.write(key, arriving[begin][:, k])
-                play = {TARGETS[self.config.mode]: played[begin:end]}
-                traces.append(self.drives.record(objects, (end - begin) * CYCLE, play=play))
+            for begin in range(0, self._cycles, at_once):
+                part = {key: values[begin : begin + at_once] for key, values in play.items()}
+                traces.append(self.drives.record(objects, at_once * CYCLE, play=part))
                 if self._pictures is not None:
                     self._pictures.look()
         return {name: np.concatenate([trace[name] for trace in traces]) for name in objects}

@@ -17,14 +17,15 @@ from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import counts_per_ampere
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import Drives, device_of, machine_of
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines
+from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
+from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
 from drive_env.envs.vector_environment import (
     Floats,
@@ -37,6 +38,8 @@ from drive_env.envs.vector_environment import (
     check_choice,
 )
 from drive_env.motors import Motor, find_motor
+from mechanics.loads import find_load
+from mechanics.shaft import one, way
 
 CYCLE = 0.001  # s, one communication cycle
 
@@ -50,9 +53,10 @@ SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, ci
 # Of a stepper, which is not asked for a current: how far the rotor is behind its steps tells the torque.
 SAMPLED_OF_STEPPERS = (*SAMPLED[:3], cia402.POSITION_DEMAND)
 ENCODER, ENCODER_OFF = 0, -1  # of 606Ah
-WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
+WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "carried": 0.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
 RATES = (500, 1000)
-ACTIONS = ("direct", "offset")
+WITHIN_TRAVEL = 0.8  # of an axis' travel to its end stops: what a trajectory uses at most
+ACTIONS = ("direct", "offset", "ramp")
 RETURN_SPEED = 0.25  # of the trajectory's, back to the start on a bus
 RESTARTS = 3  # tries to go back to the start on a bus: what brakes in haste may trip once more
 RESET_PAUSE, RESET_TIME = 0.1, 2.0  # s between two fault resets, and in all: a filled DC link empties slowly
@@ -68,7 +72,9 @@ class Task:
     amplitude: Of the trajectory, and the scale of positions [rev of the motor].
     speed: Its highest, and the scale of velocities [rev/s].
     joint: Number of the load's joint that a sensor of the master's own sees; None for no such sensor.
+    length: Of its pendulum, from the pivot to the bob [m].
     fall: Angle of that joint that ends the episode [rad].
+    together: Whether all axes follow one trajectory, as the ends of one beam must.
     """
 
     mode: str
@@ -76,12 +82,14 @@ class Task:
     amplitude: float
     speed: float
     joint: int | None = None
+    length: float = 0.3
     fall: float = np.inf
+    together: bool = False
 
 
 TASKS = {
     "two_mass": Task("cst", "moves", 2.0, 20.0),
-    "gantry": Task("csv", "moves", 3.0, 15.0),
+    "gantry": Task("csv", "moves", 3.0, 15.0, together=True),
     "cart_pendulum": Task("csv", "moves", 5.0, 15.0, joint=1),
     "inverted_pendulum": Task("csv", "hold", 5.0, 25.0, joint=1, fall=0.6),
 }
@@ -104,13 +112,17 @@ class TrackingConfig:
     action: "direct": the action is the target, of a full scale: current limit, 1.25 times speed or amplitude.
         "offset": the target follows the profile, and the action is 60B0h, 60B1h or 60B2h besides, up to `offset` times
         that full scale. The profile of cst is the current that the commissioned inertia needs.
+        "ramp": the target changes by the action times `ramp`, within the full scale: what explores does not leap.
     offset: Share of full scale.
+    ramp: Most that the target changes by [full scales per second].
     rate: Actions per second [Hz], 500 or 1000.
     duration: Of an episode [s].
     delay: From the drive's sample to the action's effect [communication cycles], 1 or more: an agent on a real bus
         has one cycle to answer.
-    trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode. "hold": the start;
-        "moves": to random places within the amplitude, with rests of up to 0.1 s; "sines": three sines of 0.5 to 5 Hz.
+    trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode, within 80 % of an axis'
+        travel. "hold": the start;
+        "moves": to random places within the amplitude, with rests of up to 0.1 s; "sines": three sines of 0.5 to 5 Hz;
+        "run": on at `speed` from the first moment. Each axis has its own, the ends of a gantry the same.
         A function of your own is called with the environment's generator, the number of samples and their period [s],
         and returns position [rev], velocity [rev/s] and acceleration [rev/s^2], shape (3, samples).
         None: hold, 5 rev and 25 rev/s for inverted_pendulum, else moves: two_mass 2 and 20, gantry 3 and 15,
@@ -118,7 +130,11 @@ class TrackingConfig:
     distributions: What else is drawn anew in each episode, as `randomisation.Distributions` takes it; None: noise
         alone, on the machine with its default parameters.
     stage: Of its curriculum, 0...1.
+    tilt: Least and greatest angle of the pendulum's joint at the start, drawn evenly [rad].
+    fall: Angle of that joint that ends the episode [rad], inf for none; None: 0.6 for inverted_pendulum.
     weights: Of the reward's terms; those left out keep theirs.
+    margins: Errors that are worth 0.1 of a term (tracking [amplitude], speed [speed], load [rad], effort [current
+        limit], smoothness [1]); those left out keep theirs.
     num_threads: As `EmulatedDrives` takes it.
     """
 
@@ -129,6 +145,7 @@ class TrackingConfig:
     mode: str | None = None
     action: str = "direct"
     offset: float = 0.3
+    ramp: float = 5.0
     rate: int = 1000
     duration: float = 1.0
     delay: int = 1
@@ -137,14 +154,17 @@ class TrackingConfig:
     speed: float | None = None
     distributions: Any = None
     stage: float = 1.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+    fall: float | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
+    margins: Mapping[str, float] = field(default_factory=dict)
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.motor is None:
             object.__setattr__(self, "motor", find_device(self.device).default_motor)
         task = self.task
-        for name in ("mode", "trajectory", "amplitude", "speed"):
+        for name in ("mode", "trajectory", "amplitude", "speed", "fall"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(task, name))
         check_choice("mode", self.mode, tuple(OBJECTS))
@@ -155,13 +175,31 @@ class TrackingConfig:
         for name in self.weights:
             check_choice("a weight's name", name, tuple(WEIGHTS))
         object.__setattr__(self, "weights", {**WEIGHTS, **self.weights})
-        for name in ("offset", "duration", "amplitude", "speed"):
+        for name, margin in self.margins.items():
+            check_choice("a margin's name", name, tuple(cycle.MARGINS))
+            if not 0.0 < margin < np.inf:
+                raise ValueError(f"the margin of {name} must be above 0 and finite, not {margin:g}")
+        object.__setattr__(self, "margins", {**cycle.MARGINS, **self.margins})
+        object.__setattr__(self, "tilt", self._checked_tilt())
+        for name in ("offset", "ramp", "duration", "amplitude", "speed"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be above 0 and finite, not {getattr(self, name):g}")
         if not 1 <= self.delay <= cycle.LONGEST_DELAY or self.delay != int(self.delay):
             raise ValueError(f"delay is 1...{cycle.LONGEST_DELAY} communication cycles, not {self.delay}")
         if not 0.0 <= self.stage <= 1.0:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
+
+    def _checked_tilt(self) -> tuple[float, float]:
+        low, high = map(float, self.tilt)
+        if not -2.0 * np.pi <= low <= high <= 2.0 * np.pi:
+            raise ValueError(f"tilt is [low, high] within a turn, in order, not {list(self.tilt)}")
+        if (low, high) != (0.0, 0.0) and self.task.joint is None:
+            raise ValueError(f"tilt is of a pendulum, and load {self.load!r} has none; leave it out")
+        if not float(self.fall or 0.0) > max(abs(low), abs(high)):
+            raise ValueError(
+                f"fall ({self.fall:g} rad) must be beyond the greatest tilt, {max(abs(low), abs(high)):g} rad"
+            )
+        return low, high
 
     @property
     def task(self) -> Task:
@@ -236,9 +274,10 @@ class Tracking(VectorEnvironment):
 
     | term | value | weight |
     | --- | --- | --- |
-    | tracking | g(position error, 0.25 amplitude) | 1 |
+    | tracking | g(position error, 0.25 amplitude), or the configuration's margin, as below | 1 |
     | speed | g(velocity error, 0.5 speed) | 0.2 |
     | load | g(angle of the pendulum, 0.2 rad); 0 of a load without sensor | 1 |
+    | carried | g(error of where the bob is, 0.25 amplitude); 0 of a load without sensor | 0 |
     | effort | g(torque actual value, current limit) | 0.05 |
     | smoothness | g(change of the action, 1) | 0.05 |
     | trip | 1 in the step in which a drive tripped or the pole fell | 10, subtracted |
@@ -331,6 +370,8 @@ class Tracking(VectorEnvironment):
         """Return the emulated machines, as they are drawn; None on a bus, whose drives must tell what is observed."""
         distributions, machine = self.config.distributions, self.drives.machine
         if machine is not None:
+            if isinstance(distributions, str) and distributions in shipped():
+                distributions = laws_of(distributions, device_of(self.drives), machine.parameters)
             return RandomMachines(machine.drives, Distributions.load(distributions or {"parameters": {}}))
         if distributions is not None:
             raise ValueError("distributions are of emulated machines; leave them out on a bus")
@@ -358,11 +399,10 @@ class Tracking(VectorEnvironment):
         scales[:, 1] = config.speed * counts
         scales[:, 2] = per_turn / drives.read(Role.FULL_STEPS) if self._is_stepper else drives.read(Role.CURRENT_LIMIT)
         full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": scales[:, 2]}
-        scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
-        self._per_turn = per_turn.reshape(n, -1)[:, 0]
-        self._speed_counts = counts.reshape(n, -1)[:, 0]
+        scales[:, 3] = full[str(config.mode)] * (config.offset if config.action == "offset" else 1.0)
+        self._per_turn, self._speed_counts = per_turn, counts
         target, offset = OBJECTS[str(config.mode)]
-        play = (target,) if config.action == "direct" else (target, offset)
+        play = (target, offset) if config.action == "offset" else (target,)
         self._acts_on_position = play[-1] == cia402.TARGET_POSITION
         self._control = cyclic_control(drives, self._sampled, play, config.cycles, CYCLE)
         self._bus = BusDelays(n, 2 * cycle.LONGEST_DELAY)
@@ -374,23 +414,30 @@ class Tracking(VectorEnvironment):
             actions=self._bus.actions,
             observations=self._bus.observations,
             message=np.zeros((n, len(SAMPLED) * self._axes + 1)),
-            reference=np.zeros((n, 3, config.steps * config.cycles + cycle.PREVIEW + 1)),
+            target=np.zeros(drives.num_axes),
+            slope=config.ramp * config.cycles * CYCLE,
+            reference=np.zeros((drives.num_axes, 3, config.steps * config.cycles + cycle.PREVIEW + 1)),
             profile_scale=self._profile_scales(),
             last=np.zeros((drives.num_axes, 2)),
             played=self._control.played,
             sampled=self._control.sampled,
             angles=np.zeros(n),
-            weights=np.array([config.weights[name] for name in cycle.TERMS]),
+            arm=np.zeros(n),
+            weights=np.array([config.weights[name] for name in TERMS], float),
+            margins=np.array([config.margins[name] for name in cycle.MARGINS], float),
             observation=np.zeros((n, *(self.single_observation_space.shape or ())), np.float32),
             reward=np.zeros(n),
-            terms=np.zeros((len(cycle.TERMS), n)),
+            terms=np.zeros((len(TERMS), n)),
             ended=np.zeros((2, n), bool),
-            kind=cycle.KINDS[str(config.mode), config.action == "direct"],
-            fall=config.task.fall,
+            kind=cycle.KINDS[str(config.mode), config.action],
+            fall=float(config.fall or np.inf),
             lags=int(self._is_stepper),
         )
         self._control.hooks = Hooks(cycle.act, cycle.observe, own)
         self._start = np.zeros(drives.num_axes, np.int64)
+        turning = way(one(find_load(config.load)))
+        room = WITHIN_TRAVEL * np.minimum(-turning.low, turning.high) / (2.0 * np.pi)
+        self._amplitudes = np.minimum(float(config.amplitude or 0.0), room).tolist()
         period = config.cycles * CYCLE
         self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
 
@@ -404,7 +451,7 @@ class Tracking(VectorEnvironment):
         motor = find_motor(config.motor)
         inertia = cycle.COMMISSIONED_INERTIA * motor.inertia
         per_rad = counts_per_ampere(drives) * inertia / motor.torque_constant
-        return np.asarray(per_rad * 2.0 * np.pi / np.repeat(self._per_turn, self._axes))
+        return np.asarray(per_rad * 2.0 * np.pi / self._per_turn)
 
     # --- an episode -----------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
@@ -417,6 +464,7 @@ class Tracking(VectorEnvironment):
             if self._is_stepper:
                 self.drives.write(cia402.SENSOR_SELECTION, ENCODER, where=axes)
             motion.enable(self.drives, mode=self.config.mode, where=axes)
+            self._tilt(mask)
         else:
             self._return_to_start(axes)
         self.drives.emergencies()
@@ -425,6 +473,7 @@ class Tracking(VectorEnvironment):
         own.origin[axes] = samples[1][axes]
         neutral = samples[1] if self._acts_on_position else np.zeros(len(axes), np.int64)
         own.last[axes] = 0.0
+        own.target[axes] = 0.0
         # What is seen until the first sample comes: the drives at rest, of no cycle yet.
         seen = np.full((self.num_envs, len(SAMPLED) * self._axes + 1), -1.0)
         if self._is_stepper:
@@ -432,6 +481,7 @@ class Tracking(VectorEnvironment):
         seen[:, :-1] = samples.T.reshape(self.num_envs, -1)
         self._bus.reset(self._delays(), self.rngs, neutral.reshape(self.num_envs, -1), seen, mask)
         if self._sensor is not None:
+            own.arm[mask] = self._arms()[mask]
             own.angles[mask] = np.asarray(self._sensor(), float)[mask]
             own.lanes["angle"][mask] = own.angles[mask]
         if self._pictures is not None:
@@ -444,6 +494,22 @@ class Tracking(VectorEnvironment):
         if self._machines is None:
             return observation, {}
         return observation, {"parameters": {name: values.copy() for name, values in self._machines.values.items()}}
+
+    def _arms(self) -> Floats:
+        """Return how far the bobs are beside their axes at a right angle [inc], shape (num_envs,)."""
+        machine = self.drives.machine
+        length = self.config.task.length if machine is None else machine.parameters["load.length"]
+        per_metre = find_load(self.config.load).gears[0] / (2.0 * np.pi)
+        return np.asarray(length * per_metre * self._per_turn.reshape(self.num_envs, -1)[:, 0])
+
+    def _tilt(self, mask: Mask) -> None:
+        """Let go of the pendulums at angles that are drawn."""
+        joint, (low, high) = self.config.task.joint, self.config.tilt
+        if joint is not None and high > low:
+            angles = np.zeros(self.num_envs)
+            for lane in np.flatnonzero(mask):
+                angles[lane] = self.rngs[lane].uniform(low, high)
+            machine_of(self.drives).place(joint, angles, mask)
 
     def _act(self, action: Any) -> bool:
         """Make a step; return whether any drive went into fault or a pole fell."""
@@ -460,13 +526,13 @@ class Tracking(VectorEnvironment):
         """Return the reference for how the drives stand now: position [inc] and velocity, (num_axes,) each."""
         own = self._episodes
         at = np.clip(own.lanes["step"] * self.config.cycles, 0, own.reference.shape[2] - 1)
-        position, velocity = np.repeat(own.reference[np.arange(self.num_envs), :2, at], self._axes, axis=0).T
+        position, velocity = own.reference[np.arange(len(own.reference)), :2, np.repeat(at, self._axes)].T
         return own.origin + position, velocity
 
     def _step_environments(self, action: Any) -> Stepped:
         some, own = self._act(action), self._episodes
         terms, ended = own.terms.copy(), own.ended.copy()
-        info: Info = {"reward_terms": dict(zip(cycle.TERMS, terms, strict=True))}
+        info: Info = {"reward_terms": dict(zip(TERMS, terms, strict=True))}
         if some:
             info["fault"] = self._faults(ended[0])
             info["_fault"] = ended[0]
@@ -474,7 +540,7 @@ class Tracking(VectorEnvironment):
 
     def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
         some, own = self._act(action), self._episodes
-        info: Info = {"reward_terms": dict(zip(cycle.TERMS, own.terms[:, 0].tolist(), strict=True))}
+        info: Info = {"reward_terms": dict(zip(TERMS, own.terms[:, 0].tolist(), strict=True))}
         if some:
             info["fault"] = self._faults(own.ended[0])[0]
         terminated, truncated = own.ended[:, 0].tolist()
@@ -487,14 +553,16 @@ class Tracking(VectorEnvironment):
         length = own.reference.shape[2]
         kind = config.trajectory if given is None else given
         if not (isinstance(kind, str) or callable(kind)):
-            rows = checked(kind, (3, length), (self.num_envs, 3, length))
+            rows = checked(kind, (3, length), (len(own.reference), 3, length))
         for lane in np.flatnonzero(mask):
-            if isinstance(kind, str) or callable(kind):
-                turns = draw(kind, self.rngs[lane], length, CYCLE, float(config.amplitude), float(config.speed))
-            else:
-                turns = rows if rows.ndim == 2 else rows[lane]
-            own.reference[lane] = turns * self._per_turn[lane]
-            own.reference[lane, 1] = turns[1] * self._speed_counts[lane]
+            for axis in range(lane * self._axes, (lane + 1) * self._axes):
+                if not (isinstance(kind, str) or callable(kind)):
+                    turns = rows if rows.ndim == 2 else rows[axis]
+                elif axis == lane * self._axes or not config.task.together:
+                    turns = draw(kind, self.rngs[lane], length, CYCLE, self._amplitudes[axis % self._axes],
+                                 float(config.speed or 0.0))  # fmt: skip
+                own.reference[axis] = turns * self._per_turn[axis]
+                own.reference[axis, 1] = turns[1] * self._speed_counts[axis]
         own.lanes["step"][mask] = 0
         own.lanes["steps"][mask] = config.steps
 

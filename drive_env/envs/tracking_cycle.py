@@ -17,20 +17,20 @@ from mechanics.compiled import cached, inlined, stage
 # An environment's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
 LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("angle", "f8"), ("fallen", "i8")])
 
-AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 1.0])  # of the entries of an axis, -low as well
+AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 1.0])  # of the entries of an axis, -low as well
 LOAD_HIGH = np.array([np.pi, 50.0])
 PREVIEW = 10  # cycles
 LONGEST_DELAY = 10  # cycles, and as many of jitter
 COMMISSIONED_INERTIA = 3.0  # rotor inertias: what the presets were computed for
 
-TERMS = ("tracking", "speed", "load", "effort", "smoothness", "trip")
 # Where an error is worth 0.1 of a term: of amplitude, of speed, rad, of the current limit, of the action.
-TRACKING_MARGIN, SPEED_MARGIN, LOAD_MARGIN, EFFORT_MARGIN, SMOOTHNESS_MARGIN = 0.25, 0.5, 0.2, 1.0, 1.0
+MARGINS = {"tracking": 0.25, "speed": 0.5, "load": 0.2, "effort": 1.0, "smoothness": 1.0}
 
-# (mode, direct) -> how set-points are made.
-DIRECT, DIRECT_POSITION, OFFSET_POSITION, OFFSET_VELOCITY, OFFSET_TORQUE = range(5)
-KINDS = {("csp", True): DIRECT_POSITION, ("csv", True): DIRECT, ("cst", True): DIRECT,
-         ("csp", False): OFFSET_POSITION, ("csv", False): OFFSET_VELOCITY, ("cst", False): OFFSET_TORQUE}  # fmt: skip
+# (mode, action) -> how set-points are made.
+DIRECT, DIRECT_POSITION, OFFSET_POSITION, OFFSET_VELOCITY, OFFSET_TORQUE, RAMP, RAMP_POSITION = range(7)
+KINDS = {("csp", "direct"): DIRECT_POSITION, ("csv", "direct"): DIRECT, ("cst", "direct"): DIRECT,
+         ("csp", "offset"): OFFSET_POSITION, ("csv", "offset"): OFFSET_VELOCITY, ("cst", "offset"): OFFSET_TORQUE,
+         ("csp", "ramp"): RAMP_POSITION, ("csv", "ramp"): RAMP, ("cst", "ramp"): RAMP}  # fmt: skip
 OPERATION_ENABLED = cia402.OPERATION_ENABLED
 
 
@@ -60,13 +60,17 @@ class Episodes(Bundle):
     actions: Line  # raw values on their way to the drives, one for each of an environment's axes
     observations: Line  # status, position, velocity, torque of each axis on their way, and their cycle's number
     message: Matrix  # scratch, (n, as many as an observation)
-    reference: Cube  # position [inc], velocity [inc/s], acceleration [inc/s^2], (n, 3, cycles)
+    target: Vector  # what actions of kind RAMP have added up to, raw, (axes,)
+    slope: float  # most that such a target changes by in a step, of its full scale
+    reference: Cube  # position [inc], velocity [inc/s], acceleration [inc/s^2], (axes, 3, cycles)
     profile_scale: Vector  # raw units of the target per unit of the reference, (axes,)
     last: Matrix  # last action and the one before, (axes, 2)
     played: NumberCube  # written: with an offset the profile's set-points, then the actions', (1 or 2, cycles, axes)
     sampled: NumberCube  # statusword, position, velocity, torque or position demand, (4, cycles, axes)
     angles: Vector  # the pendulums' [rad], (n,)
+    arm: Vector  # how far the bob is beside the axis at a right angle [inc], (n,)
     weights: Vector  # of TERMS
+    margins: Vector  # of MARGINS
     observation: Annotated[NDArray[np.float32], types.float32[:, ::1]]  # written, (n, entries)
     reward: Vector  # written, (n,)
     terms: Matrix  # written, (terms, n)
@@ -94,8 +98,13 @@ def act(address, first, count):
         for a in range(axes):
             axis = k * axes + a
             given = limited(action[axis], 1.0)
-            value = np.rint(given * scales[axis, 3])
-            if kind == DIRECT_POSITION:
+            full = scales[axis, 3]
+            if kind >= RAMP:
+                own.target[axis] = limited(own.target[axis] + given * own.slope * full, full)
+                value = np.rint(own.target[axis])
+            else:
+                value = np.rint(given * full)
+            if kind in (DIRECT_POSITION, RAMP_POSITION):
                 value += origin[axis]
             message[k, a] = value
             last[axis, 1] = last[axis, 0]
@@ -107,11 +116,11 @@ def act(address, first, count):
                 axis = k * axes + a
                 raw[c, axis] = np.int64(held[k, a])
                 if kind == OFFSET_POSITION:
-                    played[0, c, axis] = np.int64(np.rint(origin[axis] + reference[k, 0, now]))
+                    played[0, c, axis] = np.int64(np.rint(origin[axis] + reference[axis, 0, now]))
                 elif kind == OFFSET_VELOCITY:
-                    played[0, c, axis] = np.int64(np.rint(reference[k, 1, now]))
+                    played[0, c, axis] = np.int64(np.rint(reference[axis, 1, now]))
                 elif kind == OFFSET_TORQUE:
-                    wanted = reference[k, 2, now] * profile_scale[axis]
+                    wanted = reference[axis, 2, now] * profile_scale[axis]
                     played[0, c, axis] = np.int64(np.rint(limited(wanted, scales[axis, 2])))
     return 0
 
@@ -121,6 +130,12 @@ def position_error(reference, position, origin):
     """Return reference - position from the origin [inc], across the end of the counter of 32 bits too."""
     error = reference - (position - origin)
     return error - 4294967296.0 * np.floor((error + 2147483648.0) / 4294967296.0)
+
+
+@inlined
+def within_a_turn(angle):
+    """Return an angle [rad] as the one of -pi...pi that points the same way."""
+    return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
 
 
 @inlined
@@ -141,20 +156,20 @@ def describe(own, k):
     for a in range(axes):
         axis = k * axes + a
         amplitude, speed = scales[axis, 0], scales[axis, 1]
-        error = position_error(reference[k, 0, at], held[k, 4 * a + 1], origin[axis])
+        error = position_error(reference[axis, 0, at], held[k, 4 * a + 1], origin[axis])
         velocity, felt = held[k, 4 * a + 2], held[k, 4 * a + 3]
         row = 8 * a
         observation[k, row] = limited(error / amplitude, AXIS_HIGH[0])
-        observation[k, row + 1] = limited((reference[k, 1, at] - velocity) / speed, AXIS_HIGH[1])
-        observation[k, row + 2] = limited((reference[k, 0, at] - error) / amplitude, AXIS_HIGH[2])
+        observation[k, row + 1] = limited((reference[axis, 1, at] - velocity) / speed, AXIS_HIGH[1])
+        observation[k, row + 2] = limited((reference[axis, 0, at] - error) / amplitude, AXIS_HIGH[2])
         observation[k, row + 3] = limited(velocity / speed, AXIS_HIGH[3])
         observation[k, row + 4] = limited(felt / scales[axis, 2], AXIS_HIGH[4])
-        observation[k, row + 5] = limited(reference[k, 1, at] / speed, AXIS_HIGH[5])
-        observation[k, row + 6] = limited(reference[k, 1, soon] / speed, AXIS_HIGH[6])
+        observation[k, row + 5] = limited(reference[axis, 1, at] / speed, AXIS_HIGH[5])
+        observation[k, row + 6] = limited(reference[axis, 1, soon] / speed, AXIS_HIGH[6])
         observation[k, row + 7] = last[axis, 0]
     if observation.shape[1] > 8 * axes:
         rate = (angles[k] - lane.angle) / (cycles * 1e-3)
-        observation[k, 8 * axes] = limited(angles[k], LOAD_HIGH[0])
+        observation[k, 8 * axes] = within_a_turn(angles[k])
         observation[k, 8 * axes + 1] = limited(rate, LOAD_HIGH[1])
         lane.angle = angles[k]
 
@@ -174,7 +189,7 @@ def observe(address, first, count):
     own = episodes_at(address)
     lanes, sampled, reference, observations = own.lanes, own.sampled, own.reference, own.observations
     scales, origin, last, angles, weights = own.scales, own.origin, own.last, own.angles, own.weights
-    reward, terms, ended, message = own.reward, own.terms, own.ended, own.message
+    reward, terms, ended, message, margins = own.reward, own.terms, own.ended, own.message, own.margins
     cycles, axes = sampled.shape[1], sampled.shape[2] // lanes.shape[0]
     length, width = reference.shape[2], 4 * axes + 1
     has_angle = own.observation.shape[1] > 8 * axes
@@ -182,7 +197,7 @@ def observe(address, first, count):
         lane = lanes[k]
         begun = lane.step * cycles
         tripped = False
-        tracking, slow, effort, smooth = 0.0, 0.0, 0.0, 0.0
+        tracking, slow, carried, effort, smooth = 0.0, 0.0, 0.0, 0.0, 0.0
         at = min(begun + cycles - 1, length - 1)
         for c in range(cycles):
             for a in range(axes):
@@ -196,24 +211,26 @@ def observe(address, first, count):
         for axis in range(k * axes, (k + 1) * axes):
             status, position, velocity = sampled[0, c, axis], sampled[1, c, axis], sampled[2, c, axis]
             tripped |= status & OPERATION_ENABLED[0] != OPERATION_ENABLED[1]
-            error = position_error(reference[k, 0, at], float(position), origin[axis])
-            tracking += tolerance(error / scales[axis, 0], TRACKING_MARGIN)
-            slow += tolerance((reference[k, 1, at] - velocity) / scales[axis, 1], SPEED_MARGIN)
+            error = position_error(reference[axis, 0, at], float(position), origin[axis])
+            tracking += tolerance(error / scales[axis, 0], margins[0])
+            carried += tolerance((error - own.arm[k] * np.sin(angles[k])) / scales[axis, 0], margins[0])
+            slow += tolerance((reference[axis, 1, at] - velocity) / scales[axis, 1], margins[1])
             felt = torque(own.lags, sampled[3, c, axis], sampled[1, c, axis])
-            effort += tolerance(felt / scales[axis, 2], EFFORT_MARGIN)
-            smooth += tolerance(last[axis, 0] - last[axis, 1], SMOOTHNESS_MARGIN)
+            effort += tolerance(felt / scales[axis, 2], margins[3])
+            smooth += tolerance(last[axis, 0] - last[axis, 1], margins[4])
         fallen = abs(angles[k]) > own.fall
         lane.fallen = 1 if fallen else 0
         terms[0, k] = tracking / axes
         terms[1, k] = slow / axes
-        terms[2, k] = tolerance(angles[k], LOAD_MARGIN) if has_angle else 0.0
-        terms[3, k] = effort / axes
-        terms[4, k] = smooth / axes
-        terms[5, k] = 1.0 if tripped or fallen else 0.0
+        terms[2, k] = tolerance(within_a_turn(angles[k]), margins[2]) if has_angle else 0.0
+        terms[3, k] = carried / axes if has_angle else 0.0
+        terms[4, k] = effort / axes
+        terms[5, k] = smooth / axes
+        terms[6, k] = 1.0 if tripped or fallen else 0.0
         total = 0.0
         for term in range(terms.shape[0] - 1):
             total += weights[term] * terms[term, k]
-        reward[k] = total - weights[5] * terms[5, k]
+        reward[k] = total - weights[6] * terms[6, k]
         lane.step += 1
         ended[0, k] = tripped or fallen
         ended[1, k] = lane.step >= lane.steps

@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 # Generator, number of samples, their period [s] -> what `draw` returns.
 Trajectory = Callable[[np.random.Generator, int, float], ArrayLike]
 
-TRAJECTORIES = ("hold", "moves", "sines")
+TRAJECTORIES = ("hold", "moves", "sines", "run")
 SINES = 3
 FREQUENCIES = (0.5, 5.0)  # Hz
 SOFT_START = 0.1  # s
@@ -26,8 +26,9 @@ def draw(
     """Return position [rev], velocity [rev/s], acceleration [rev/s^2], shape (3, length); it begins at rest at 0.
 
     Args:
-        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines. A function returns
-            all of it as it likes, of generator, length and period.
+        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines; "run" goes on at
+            the speed from the first moment, faster than a load can follow. A function returns all of it as it likes,
+            of generator, length and period.
         rng: Where chance comes from.
         length: Samples.
         period: Of the samples [s].
@@ -41,6 +42,9 @@ def draw(
         return checked(kind(rng, length, period), (3, length))
     if kind == "hold":
         return np.zeros((3, length))
+    if kind == "run":
+        t = np.arange(length) * period
+        return np.stack([speed * t, np.full(length, speed), np.zeros(length)])
     if kind == "moves":
         return _moves(rng, length, period, amplitude, speed)
     return _sines(rng, length, period, amplitude, speed)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.loops.sampled import STILL, closed_loops, open_loops, step_overshoot, window
+from drive_env.loops.sampled import STILL, ClosedLoops, closed_loops, open_loops, step_overshoot, window
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def _by_text(text: str) -> Dynamics:
 
 
 def loop_clearance(
-    dynamics: Dynamics, rates: LoopRates, machines: LinearMachines, gains: CascadeGains
+    dynamics: Dynamics, rates: LoopRates, machines: LinearMachines, gains: CascadeGains, variants: int = 1
 ) -> tuple[Floats, Floats]:
     """Return the clearance of machines' outer loops, the least of all, and how far csp steps overshoot.
 
@@ -170,9 +170,11 @@ def loop_clearance(
         rates: Of the drive.
         machines: The machines.
         gains: Theirs.
+        variants: How many of them in a row are one machine as it is and may become: its step is as it is.
 
     Returns:
-        Clearance, -1 to 0 where a machine is unstable, and the largest overshoot over the step; (machines,) each.
+        Clearance, -1 to 0 where a machine is unstable, (machines,), and the largest overshoot over the step,
+        (machines / variants,).
     """
     one = window(rates, machines, gains)
     closed = closed_loops(rates, machines, gains, one)
@@ -188,4 +190,6 @@ def loop_clearance(
     least = np.minimum(dynamics.clearance(loops.velocity), dynamics.clearance(loops.position)).min(axis=-1)
     unstable = np.clip(-growth * rates.velocity_rate / UNSTABLE, -1.0, 0.0)
     found = np.where(growth > STILL, unstable, least)
-    return np.nan_to_num(found, nan=-1.0), step_overshoot(rates, closed).max(axis=-1)
+    as_is = ClosedLoops(*(part[::variants] for part in closed))
+    overshoot = step_overshoot(rates, as_is, growth=growth[::variants]).max(axis=-1)
+    return np.nan_to_num(found, nan=-1.0), overshoot

@@ -317,26 +317,40 @@ def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains
     return ClosedLoops(A, B, place)
 
 
-def step_overshoot(rates: LoopRates, closed: ClosedLoops, duration: float = 0.3) -> Floats:
+def step_overshoot(
+    rates: LoopRates, closed: ClosedLoops, duration: float = 0.3, growth: Floats | None = None
+) -> Floats:
     """Return how far each axis goes beyond a step of its set-point in csp, over the step, (machines, axes).
 
     The larger of two steps counts: of its own set-point alone, and of all axes together, as a gantry moves, whose
     bridge otherwise holds each axis at the other one. The set-point moves there within a communication cycle, as csp
     interpolates it, and the angle is looked at once a cycle. Of an unstable machine it is infinite.
+
+    Args:
+        rates: Of the drive.
+        closed: The machines.
+        duration: How long it is looked at [s].
+        growth: That of `closed`, computed by default.
     """
     cycle = round(rates.velocity_rate / rates.communication_rate)
-    A, ramp, constant = np.broadcast_to(np.eye(closed.A.shape[-1]), closed.A.shape), 0.0 * closed.B, 0.0 * closed.B
+    (count, states, axes), cycles = closed.B.shape, round(duration * rates.communication_rate)
+    A, ramp, constant = np.broadcast_to(np.eye(states), closed.A.shape), 0.0 * closed.B, 0.0 * closed.B
     for k in range(cycle):
         ramp = closed.A @ ramp + closed.B * (k + 1) / cycle
         constant = closed.A @ constant + closed.B
         A = closed.A @ A
-    state, most = ramp, np.zeros((len(A), closed.B.shape[-1]))
+    # With the set-points as states, and each look at the angles for as many cycles again as there are looks.
+    size, unit = states + axes, np.broadcast_to(np.eye(axes), (count, axes, axes))
+    ahead = np.zeros((count, size, size))
+    ahead[:, :states, :states], ahead[:, :states, states:], ahead[:, states:, states:] = A, constant, unit
+    looks = np.concatenate([closed.C, 0.0 * unit], axis=2)
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(round(duration * rates.communication_rate)):
-            moved = closed.C @ state  # by axis that moves and axis whose set-point does
-            most = np.fmax(most, np.fmax(np.einsum("maa->ma", moved), moved.sum(axis=-1)))
-            state = A @ state + constant
-    stable = closed.growth[:, None] <= STILL
+        while looks.shape[1] < cycles * axes:
+            looks, ahead = np.concatenate([looks, looks @ ahead], axis=1), ahead @ ahead
+        # By cycle, axis that moves and axis whose set-point does.
+        moved = (looks[:, : cycles * axes] @ np.concatenate([ramp, unit], axis=1)).reshape(count, cycles, axes, axes)
+        most = np.fmax(np.einsum("mkaa->mka", moved), moved.sum(axis=-1)).max(axis=1)
+    stable = (closed.growth if growth is None else growth)[:, None] <= STILL
     return np.where(stable & np.isfinite(most), np.maximum(most - 1.0, 0.0), np.inf)
 
 

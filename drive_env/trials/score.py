@@ -378,9 +378,9 @@ class RobustScore(Saved):
         raw = device.gains.with_velocity_p(self._spread(np.asarray(gains, np.int64)), self._factors)
         raw = raw.reshape(machines * runs, axes, -1)[chosen]
         linear = LinearMachines(*(values[chosen] for values in self._loops))
-        found = loop_clearance(self.dynamics, LoopRates.of(device), linear, CascadeGains.of(device, raw))
-        clearance, overshoot = (values.reshape(-1, variants) for values in found)
-        return clearance, overshoot[:, 0]
+        cascade = CascadeGains.of(device, raw)
+        clearance, overshoot = loop_clearance(self.dynamics, LoopRates.of(device), linear, cascade, variants)
+        return clearance.reshape(-1, variants), overshoot
 
     def close(self) -> None:
         """Close the drives."""

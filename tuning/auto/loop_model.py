@@ -170,8 +170,8 @@ class LoopModel:
         raw = np.repeat(gains, count, axis=0).reshape(-1, gains.shape[-1])
         raw = self.device.gains.with_velocity_p(raw, np.tile(np.repeat(self._velocity_p[:count], self.axes), sets))
         cascade = CascadeGains.of(self.device, raw.reshape(sets * count, self.axes, -1))
-        clearance, overshoot = loop_clearance(dynamics, LoopRates.of(self.device), machines, cascade)
-        return clearance.reshape(sets, count), overshoot.reshape(sets, count)[:, 0]
+        clearance, overshoot = loop_clearance(dynamics, LoopRates.of(self.device), machines, cascade, count)
+        return clearance.reshape(sets, count), overshoot
 
     def margins(self, gains: Integers) -> list[dict[str, Margins]]:
         """Return the margins of the outer loops of each axis as the machine is, with gains, raw, (axes, count)."""

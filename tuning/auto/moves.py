@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.load_step import NOISE, SWING, load_step
-from tuning.auto.loop_margins import MEASURED, measured_axis
+from tuning.auto.loop_margins import measured_axis
+from tuning.auto.loop_model import loop_models
 from tuning.auto.proving import RESTLESS, without_noise
 
 if TYPE_CHECKING:
@@ -171,18 +172,23 @@ def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Record
 def keep_what_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Keep the gains before on machines whose loops keep the dynamics as well with them, and that moved better.
 
-    A machine counts as its worst axis. Loops are judged as they were measured; where they were not, nothing is kept.
+    A machine counts as its worst axis. Loops are judged as they were measured, and by the model as load, shaft and gain
+    may become; where they were not measured, nothing is kept. What a measurement is off is the same for both gains.
     """
     assert recorded.shown is not None and recorded.earlier is not None, "both moves are recorded"
     shown, earlier, axes = recorded.shown, recorded.earlier, bench.target.axes_per_machine
-    slack = np.full(len(where), -np.inf)
+    slack = np.full(len(where), np.nan)
     for k in map(int, np.flatnonzero(where)):
         if (measured := measured_axis(bench, basis, recorded, k)) is not None:
             slack[k] = measured.slack(bench.dynamics, basis.before[k][None])[0]
+    of_before, of_new = slack.copy(), recorded.slack.copy()
+    for model, own in loop_models(bench.target, basis.identified, recorded, where, bench.dynamics):
+        for known, gains in ((of_before, basis.before), (of_new, recorded.gains)):
+            known[own] = np.minimum(known[own], model.slack(bench.dynamics, gains[own][None])[0])
     now, before = (np.repeat(one.cost.reshape(-1, axes).max(axis=1), axes) for one in (shown, earlier))
     # Gains with which an axis shakes at rest are nobody's choice.
     kept = where & (before < now) & ~np.repeat(earlier.restless.reshape(-1, axes).any(axis=1), axes)
-    kept = bench.whole_machines(kept & (slack >= np.fmin(recorded.slack, 0.0) - MEASURED))
+    kept = bench.whole_machines(kept & (of_before >= np.fmin(of_new, 0.0)))
     if not kept.any():
         return recorded
     for k in map(int, np.flatnonzero(kept)):

@@ -118,12 +118,13 @@ def collect(
     for k, journal in enumerate(bench.journals):
         gains = bench.before[k] if journal.reason else recorded.gains[k]
         reason = late_first(bench.target.drives, journal.reason)
+        corrections = _outcomes(journal.corrections, recorded, k)
         axes.append(
             AxisResult(
                 tuple(map(int, bench.before[k])), tuple(map(int, gains)), reason, tuple(journal.reservations),
-                tuple(journal.notes), identified.found[k], identified.plants[k], float(recorded.cost[k]),
-                float(recorded.proof[k]), verdict.verified[k], verdict.margins[k], verdict.at_least[k],
-                float(recorded.slack[k]), float(recorded.overshoot[k]), _outcomes(journal.corrections, recorded, k),
+                _with_outcomes(journal.notes, corrections), identified.found[k], identified.plants[k],
+                float(recorded.cost[k]), float(recorded.proof[k]), verdict.verified[k], verdict.margins[k],
+                verdict.at_least[k], float(recorded.slack[k]), float(recorded.overshoot[k]), corrections,
                 bool(recorded.kept[k]),
             )
         )  # fmt: skip
@@ -133,6 +134,17 @@ def collect(
         tuple(axes), bench.spent, *counts, recorded.shown, recorded.earlier, recorded.response, recorded.loaded,
         bench.dynamics, file, kept,
     )  # fmt: skip
+
+
+def _with_outcomes(notes: Sequence[str], corrections: Sequence[Correction]) -> tuple[str, ...]:
+    """Return notes of an axis; of gains that were designed again and did not stay they say so."""
+    left, told = list(corrections), []
+    for note in notes:
+        one = next((one for one in left if note.endswith(f"measured: {one.reason}")), None)
+        if one is not None:
+            left.remove(one)
+        told.append(note if one is None or one.outcome == TAKEN else f"{note}; {one.outcome}")
+    return tuple(told)
 
 
 def _outcomes(corrections: Sequence[Correction], recorded: RecordedGains, k: int) -> tuple[Correction, ...]:

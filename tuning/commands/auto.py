@@ -12,6 +12,7 @@ from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     DynamicsOption,
+    InertiaRangeOption,
     Json,
     TargetOptions,
     asked_dynamics,
@@ -31,14 +32,7 @@ if TYPE_CHECKING:
 def auto(
     drive: TargetOptions,
     dynamics: DynamicsOption = None,
-    inertia_range: Annotated[
-        str | None,
-        typer.Option(
-            "--inertia-range",
-            help="Load inertia that the tuned axis must bear with weaker margins, over that of tuning: LOW/HIGH.",
-            show_default="0.5/2",
-        ),
-    ] = None,
+    inertia_range: InertiaRangeOption = None,
     store: Annotated[
         bool,
         typer.Option("--store/--no-store", help="Drives on a bus store the gains, so that they survive a power cycle."),
@@ -53,9 +47,9 @@ def auto(
     Of an open-loop stepper it sets the phase currents, the StallGuard threshold and CoolStep, and writes
     stepper-certificate.json in place of certificate.json and report.html.
 
-    The motor turns, for 10 to 40 s an axis. The verdict is accepted, accepted with reservations, which are listed, or
-    rejected. Writes before.toml, with which `drive-tune undo` restores the state before, certificate.json and
-    report.html. Exit code 1 if an axis was rejected; the reason is printed.
+    The motor turns, for 9 to 20 s an axis, longer where a stepper's loop is closed. The verdict is accepted, accepted
+    with reservations, which are listed, or rejected. Writes before.toml, with which `drive-tune undo` restores the
+    state before, certificate.json and report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
         from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files

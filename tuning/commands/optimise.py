@@ -16,6 +16,7 @@ from tuning.commands.options import (
     Cluster,
     DriveOptions,
     DynamicsOption,
+    InertiaRangeOption,
     Json,
     Resume,
     Workers,
@@ -59,6 +60,7 @@ def optimise(
         ),
     ] = None,
     dynamics: DynamicsOption = None,
+    inertia_range: InertiaRangeOption = None,
     sampler: Annotated[str, typer.Option(help="random, grid, tpe, cmaes or gp.")] = "tpe",
     trials: Annotated[int, typer.Option(help="Trials of the search; each takes 0.75 s of drive time.")] = 30,
     objectives: Annotated[
@@ -147,7 +149,7 @@ def optimise(
         device = find_device(drive.device)
         searched = tuple(gains) if gains else device.gains.outer
         check_tried(device, searched)  # before anything moves
-        asked = asked_dynamics(dynamics, drive.device)
+        asked = asked_dynamics(dynamics, drive.device, inertia_range)
         settings = Settings(
             sampler=sampler,
             trials=trials,
@@ -158,6 +160,7 @@ def optimise(
             journal=journal,
             subject=_subject(drive),
             dynamics=asked.name if has_linear_model(device) else None,
+            inertia_range=inertia_range,
             **({} if width is None else {"width": width}),
         )
         if drive.bus:

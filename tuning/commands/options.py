@@ -55,6 +55,14 @@ DYNAMICS = (
     "phase margin/gain margin/Ms as 50/10/1.8."
 )
 DynamicsOption = Annotated[str | None, typer.Option("--dynamics", help=DYNAMICS, show_default="standard")]
+InertiaRangeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--inertia-range",
+        help="Load inertia that the tuned axis must bear with weaker margins, over that of tuning: LOW/HIGH.",
+        show_default="0.5/2",
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
 Bus = Annotated[

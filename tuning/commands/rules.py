@@ -14,6 +14,7 @@ from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     DynamicsOption,
+    InertiaRangeOption,
     Json,
     TargetOptions,
     ask,
@@ -47,6 +48,7 @@ def rules(
         bool, typer.Option("--relay", help="Also make the axis swing by relay feedback, and show the gains from that.")
     ] = (False),
     dynamics: DynamicsOption = None,
+    inertia_range: InertiaRangeOption = None,
     apply: Annotated[str | None, typer.Option("--apply", help="Write this rule's gains to the drive.")] = None,
     store: Annotated[
         bool, typer.Option("--store", help="Store them in the drive, so that they survive a power cycle.")
@@ -83,7 +85,7 @@ def rules(
             raise ValueError("--snapshot is the file for the state before --apply; add --apply RULE, or leave it out")
         drive.check()
         drive.check_linear_model()
-        asked = asked_dynamics(dynamics, drive.device)
+        asked = asked_dynamics(dynamics, drive.device, inertia_range)
         file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
         if drive.bus:
             check_place(file)  # written before the motor turns; of emulated drives, before their gains change

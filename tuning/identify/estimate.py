@@ -79,7 +79,6 @@ class Identification:
         fit: The linear model fitted to the frequency response, None where none was measured or it is another axis's.
         together: Total inertia at the rotor that the axis pushes while all axes of its machine accelerate alike, as
             "inertia" [kg*m^2]; nan where it was not measured.
-        doubt: Why a model made of this is not to be relied on beside what the drive itself shows; "" where it is.
     """
 
     estimates: Mapping[str, Estimate]
@@ -88,7 +87,6 @@ class Identification:
     wiring: Settings = field(default_factory=dict)
     fit: PlantFit | None = None
     together: float = math.nan
-    doubt: str = ""
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was not identified."""

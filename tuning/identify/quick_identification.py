@@ -88,15 +88,12 @@ class _Brief(Experiments):
         # What is told of each axis where `found` has a guess.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
         self._together = np.full(target.num_axes, math.nan)
-        self._doubt = [""] * target.num_axes
 
     def run(self) -> list[Identification]:
-        every = zip(super().run(), self._told, self._together.tolist(), self._doubt, strict=True)
+        every = zip(super().run(), self._told, self._together.tolist(), strict=True)
         return [
-            replace(
-                one, told={name: told.get(name, one.estimates[name]) for name in NAMES}, together=together, doubt=doubt
-            )
-            for one, told, together, doubt in every
+            replace(one, told={name: told.get(name, one.estimates[name]) for name in NAMES}, together=together)
+            for one, told, together in every
         ]
 
     def turn(self, working: Working) -> None:
@@ -183,8 +180,7 @@ class _Brief(Experiments):
                 continue
             if ratio < LOOSE and not target.linked:
                 # Within the play of a gear the motor turns alone, and a small shaking does not leave it.
-                self._doubt[k] = loose(ratio)
-                self._no_response(k, self._doubt[k])
+                self._no_response(k, loose(ratio))
                 continue
             moved = self.found[k]["inertia"]
             self.found[k] |= _guessed(fit)

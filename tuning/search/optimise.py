@@ -63,6 +63,7 @@ class Settings:
         journal: File of Optuna's journal, in which the search is kept and from which it goes on.
         subject: What is searched, as text: a journal of something else is refused.
         dynamics: What the outer loops must keep by their model, as `find_dynamics` takes it; None asks for nothing.
+        inertia_range: Least and greatest load inertia that they must bear, likewise.
     """
 
     sampler: str = "tpe"
@@ -75,12 +76,13 @@ class Settings:
     journal: Path | None = None
     subject: str = ""
     dynamics: str | None = None
+    inertia_range: str | None = None
 
     def __post_init__(self) -> None:
         _check("sampler", [self.sampler], SAMPLERS)
         _check("objective", self.objectives, (COST, *OBJECTIVES))
         if self.dynamics is not None:
-            find_dynamics(self.dynamics)
+            find_dynamics(self.dynamics, self.inertia_range)
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.width <= math.log(RAW_MAX):
@@ -201,7 +203,7 @@ def optimise(
             began = target.drives.read(cia402.POSITION_ACTUAL)
             # Copies of one machine are known by the first one.
             where = np.arange(target.num_axes) < (target.axes_per_machine if shared else target.num_axes)
-            known = ModelMargins(watched, find_dynamics(settings.dynamics), where)
+            known = ModelMargins(watched, find_dynamics(settings.dynamics, settings.inertia_range), where)
             watched = watched if anew else here(watched, began)
         bench = TrialBench(watched, anew=anew, gains=chosen)
         load(settings.sampler)
@@ -498,7 +500,9 @@ class _Search:
             generation=len(self._members[k]),
             journal=settings.journal,
             study=Study(
-                f"machine {k}", f"{settings.subject}\n{settings.gains} {settings.objectives} {settings.dynamics}"
+                f"machine {k}",
+                f"{settings.subject}\n{settings.gains} {settings.objectives} {settings.dynamics} "
+                f"{settings.inertia_range or ''}".rstrip(),
             ),
         )
 

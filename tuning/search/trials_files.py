@@ -48,7 +48,7 @@ PID_MEANINGS = MEANINGS | {
 }
 
 HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
-_SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed", "dynamics")
+_SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed", "dynamics", "inertia_range")
 _MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "copies", "searches", "interface", "channel",
             "nodes", "bitrate", "lockstep", "pace")  # fmt: skip
 

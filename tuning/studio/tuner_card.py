@@ -49,7 +49,7 @@ class TunerCard:
         with panel.card("Tune automatically", "tuner"):
             ui.label(
                 "auto identifies the axes, searches gains, tries and verifies them; gains that fail a check are rolled "
-                "back. The motor turns for 10 to 40 s an axis. Quick stop ends it, and the gains before come back."
+                "back. The motor turns for 9 to 20 s an axis. Quick stop ends it, and the gains before come back."
             ).classes("studio-hint")
             with ui.row().classes("studio-buttons"):
                 ui.button("Run auto", icon="auto_fix_high", on_click=self._auto).props(

@@ -16,7 +16,9 @@ from typing import Any
 
 import yaml
 
-from agents.training.tasks import ENVIRONMENTS, environment_name
+from agents.training.tasks import environment_name, row_of
+from drive_env.envs import environment_of
+from drive_env.envs.suite import TASKS
 from mechanics.untrusted import check_table, read_text
 
 FOLDER = Path(__file__).parent
@@ -62,7 +64,8 @@ def load(
     Raises:
         HyperparameterError: If there is no such file or section, or it cannot be read.
     """
-    name = environment_name(environment)
+    task = environment_name(environment)
+    name = environment_of(task)
     if preset not in PRESETS:
         raise HyperparameterError(f"there is no preset {preset!r}; there are {', '.join(PRESETS)}")
     file = _file(name, algorithm, path)
@@ -71,10 +74,14 @@ def load(
         raise HyperparameterError(f"{file} has no section {name}; it has {', '.join(map(str, table))}")
     found: dict[str, Any] = {}
     chosen = [name, preset] if section is None else [name, preset, section, f"{section}/{preset}"]
+    if task != name and task in table:
+        chosen.append(task)
     if section is not None and section not in table:
         raise HyperparameterError(f"{file} has no section {section}; it has {', '.join(map(str, table))}")
     for key in chosen:
         merge(found, {name: read_value(value) for name, value in (table.get(key) or {}).items()})
+    if task in TASKS:
+        found.pop("env_kwargs", None)  # the task has its own
     for key in ("n_envs", "n_timesteps", "policy"):
         if found.get(key) is None:
             raise HyperparameterError(f"{file}: {key} is missing in section {name}")
@@ -88,7 +95,7 @@ def load(
 
 def sections(environment: str, algorithm: str, path: str | Path | None = None) -> tuple[str, ...]:
     """Return the sections of a file (the one that ships) that are of loads, not of the environment or a preset."""
-    name = environment_name(environment)
+    name = environment_of(environment_name(environment))
     table = _read(_file(name, algorithm, path))
     return tuple(key for key in table if key not in (name, *PRESETS) and "/" not in key)
 
@@ -158,7 +165,7 @@ def _whole(file: Path, key: str, value: Any) -> int:
 def _file(environment: str, algorithm: str, path: str | Path | None) -> Path:
     if algorithm not in ALGORITHMS:
         raise HyperparameterError(f"there is no algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
-    return FOLDER / f"{ENVIRONMENTS[environment].short}_{algorithm}.yaml" if path is None else Path(path)
+    return FOLDER / f"{row_of(environment).short}_{algorithm}.yaml" if path is None else Path(path)
 
 
 def _read(file: Path) -> dict[str, Any]:

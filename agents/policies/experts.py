@@ -1,0 +1,213 @@
+"""Experts of the suite's tasks: what a motion engineer would program, given the machine as an identification tells it.
+
+An expert is told the parameters of each machine when its episode begins (`told`); where none are known, on a bus, it
+takes the nominal ones. What it must cope with all the same: delays of the bus, flexibility, sensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.motors import find_motor
+from mechanics.loads import find_load
+
+Floats = NDArray[np.float64]
+
+AXIS_ENTRIES = 8
+ERROR, SPEED_ERROR, POSITION, SPEED, TORQUE, WANTED_SPEED, WANTED_SPEED_LATER = range(7)  # of an axis in Tracking
+PREVIEW = 0.01  # s, how much later
+GRAVITY = 9.81  # m/s^2
+
+
+class Expert:
+    """Base of the experts.
+
+    Args:
+        configuration: Of Tracking.
+    """
+
+    def __init__(self, configuration: Any) -> None:
+        self.configuration = configuration
+        self._machine: dict[str, Floats] = {}
+
+    def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
+        """Take the parameters of the machines whose episodes begin where the mask is true, (environments,) each."""
+        for name, values in parameters.items():
+            kept = self._machine.setdefault(name, np.array(values, float))
+            kept[mask] = np.asarray(values, float)[mask]
+        self.reset(mask)
+
+    def parameter(self, name: str, nominal: float) -> Floats:
+        """Return a parameter of all machines; where it was not told, the nominal one."""
+        return np.asarray(self._machine.get(name, nominal), float)
+
+    def reset(self, mask: Any = None) -> None:
+        """Forget what belongs to episodes that have ended."""
+
+    def act(self, observation: Any) -> NDArray[np.float32]:
+        """Return the action for one observation, or one for each environment."""
+        rows = np.atleast_2d(np.asarray(observation, float))
+        action = np.clip(self.actions(rows), -1.0, 1.0).astype(np.float32)
+        found: NDArray[np.float32] = action[0] if np.ndim(observation) == 1 else action
+        return found
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return actions, shape (environments, actions)."""
+        raise NotImplementedError
+
+
+class ComputedTorque(Expert):
+    """Torque by the identified inertia and friction, with proportional and derivative feedback, of one axis in cst.
+
+    Rigid-body feed-forward as in Siciliano et al., Robotics (2009), section 8.5. The bandwidth is what the bus' longest
+    delay leaves on most machines, found by trying.
+    """
+
+    BANDWIDTH, DAMPING, FRICTION_SPEED = 25.0, 0.9, 2.0  # rad/s, 1, rad/s
+    LIMIT = 2.0  # of the motor's rated current: what the drive is commissioned with
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the torque, of the current limit."""
+        motor, configuration = find_motor(self.configuration.motor), self.configuration
+        amplitude, speed = (2.0 * np.pi * value for value in (configuration.amplitude, configuration.speed))
+        constant = motor.torque_constant * self.parameter("motor.psi_m", motor.psi_m) / motor.psi_m
+        inertia = self.parameter("motor.inertia", motor.inertia) + self.parameter("load.inertia", 2.0 * motor.inertia)
+        coulomb = self.parameter("motor.coulomb", motor.coulomb) + self.parameter("load.coulomb", 0.0)
+        viscous = self.parameter("motor.viscous", motor.viscous) + self.parameter("load.viscous", 0.0)
+        wanted = speed * rows[:, WANTED_SPEED]
+        acceleration = speed * (rows[:, WANTED_SPEED_LATER] - rows[:, WANTED_SPEED]) / PREVIEW
+        feedback = self.BANDWIDTH**2 * amplitude * rows[:, ERROR]
+        feedback += 2.0 * self.DAMPING * self.BANDWIDTH * speed * rows[:, SPEED_ERROR]
+        torque = inertia * (acceleration + feedback)
+        torque += coulomb * np.tanh(wanted / self.FRICTION_SPEED) + viscous * wanted
+        return np.asarray(torque / (constant * self.LIMIT * motor.rated_current))[:, None]
+
+
+class Pendulum(Expert):
+    """A linear-quadratic regulator of cart and pendulum about the flat feed-forward, through the cart's acceleration.
+
+    Flat output is where the bob is (Fliess et al. 1995).
+    """
+
+    WEIGHTS = np.diag([1000.0, 30.0, 0.0, 0.0])  # bob's position and speed, angle and its rate
+    EFFORT = 0.05
+
+    def __init__(self, configuration: Any) -> None:
+        super().__init__(configuration)
+        self._stands = configuration.load == "inverted_pendulum"
+        self._lead = 2.0 * np.pi / find_load(configuration.load).gears[0]  # m per revolution
+        self._gains: dict[float, Floats] = {}
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the cart's speed, of the greatest."""
+        configuration, lead = self.configuration, self._lead
+        amplitude, speed = lead * configuration.amplitude, lead * configuration.speed
+        greatest = 1.25 * configuration.ramp * speed  # m/s^2
+        sign = 1.0 if self._stands else -1.0
+        length = np.broadcast_to(self.parameter("load.length", configuration.task.length), len(rows))
+        angle, rate = rows[:, AXIS_ENTRIES], rows[:, AXIS_ENTRIES + 1]
+        wanted = speed * (rows[:, WANTED_SPEED_LATER] - rows[:, WANTED_SPEED]) / PREVIEW
+        leaning = sign * wanted / GRAVITY
+        state = np.stack(
+            [length * leaning - amplitude * rows[:, ERROR], -speed * rows[:, SPEED_ERROR], angle - leaning, rate], 1
+        )
+        gains = np.stack([self._gain(round(float(one), 4), sign) for one in length])
+        acceleration = wanted - np.sum(gains * state, axis=1)
+        return np.asarray(acceleration / greatest)[:, None]
+
+    def _gain(self, length: float, sign: float) -> Floats:
+        """Return the regulator's gains on position [m], speed, angle [rad] and rate, for a pendulum's length [m]."""
+        if length not in self._gains:
+            from scipy.linalg import expm, solve_discrete_are
+
+            model = np.zeros((5, 5))
+            model[0, 1] = model[2, 3] = model[1, 4] = 1.0
+            model[3, 2], model[3, 4] = sign * GRAVITY / length, -1.0 / length
+            discrete = expm(model / self.configuration.rate)
+            a, b = discrete[:4, :4], discrete[:4, 4:]
+            bob = np.eye(4)
+            bob[0, 2] = bob[1, 3] = length
+            cost = solve_discrete_are(a, b, bob.T @ self.WEIGHTS @ bob, np.array([[self.EFFORT]]))
+            self._gains[length] = np.linalg.solve(self.EFFORT + b.T @ cost @ b, b.T @ cost @ a)[0]
+        return self._gains[length]
+
+
+class SwingUp(Pendulum):
+    """Pumps energy into a hanging pole (Astrom and Furuta 2000) and has the regulator catch it."""
+
+    WEIGHTS = np.diag([100.0, 10.0, 10.0, 1.0])
+    CATCH = 0.5  # rad from upright, within which the regulator acts
+    PUMP, CENTRE, BRAKE, MOST = 10.0, 10.0, 4.0, 0.8  # 1/m, 1/s^2, 1/s, of the greatest acceleration
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the cart's speed, of the greatest."""
+        configuration, lead = self.configuration, self._lead
+        greatest = 1.25 * configuration.ramp * lead * configuration.speed
+        length = self.parameter("load.length", configuration.task.length)
+        angle, rate = rows[:, AXIS_ENTRIES], rows[:, AXIS_ENTRIES + 1]
+        energy = 0.5 * (length * rate) ** 2 + GRAVITY * length * (np.cos(angle) - 1.0)  # J/kg, 0 upright
+        pumped = self.PUMP * energy * np.sign(rate * np.cos(angle))
+        pumped = np.clip(pumped, -self.MOST * greatest, self.MOST * greatest)
+        pumped -= self.CENTRE * lead * configuration.amplitude * rows[:, POSITION]
+        pumped -= self.BRAKE * lead * configuration.speed * rows[:, SPEED]
+        return np.where((np.abs(angle) < self.CATCH)[:, None], super().actions(rows), (pumped / greatest)[:, None])
+
+
+class SpeedCurve(Expert):
+    """The ramp of a stepper: an acceleration that falls towards the speed at which its torque is used up.
+
+    The field's way (Acarnley, Stepping Motors, 4th edition, section 6.4): from the pull-out torque, which falls with
+    speed, and from the inertia; here its two numbers were found by trying, for the nominal inertia.
+    """
+
+    ACCELERATION, SPEED = 110.0, 12.3  # rev/s^2 of the nominal inertia, rev/s
+    NOMINAL_INERTIA = 1.68e-5  # kg*m^2, of rotor and load
+
+    def __init__(self, configuration: Any) -> None:
+        super().__init__(configuration)
+        self._speed: Any = 0.0
+
+    def reset(self, mask: Any = None) -> None:
+        """Begin at rest."""
+        self._speed = 0.0 if mask is None or np.ndim(self._speed) == 0 else np.where(mask, 0.0, self._speed)
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the step rate, of the greatest."""
+        inertia = self.parameter("motor.inertia", 6.8e-6) + self.parameter("load.inertia", 1e-5)
+        acceleration = self.ACCELERATION * self.NOMINAL_INERTIA / inertia * (1.0 - self._speed / self.SPEED)
+        self._speed = self._speed + acceleration / self.configuration.rate
+        greatest = 1.25 * self.configuration.ramp * self.configuration.speed
+        return np.broadcast_to(acceleration / greatest, len(rows))[:, None]
+
+
+class CarriageServo(Expert):
+    """The cascade of a carriage that knows nothing of its pendulum: position and speed follow, through acceleration."""
+
+    BANDWIDTH = 10.0  # rad/s
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the carriage's speed, of the greatest."""
+        configuration = self.configuration
+        wanted = configuration.speed * (rows[:, WANTED_SPEED_LATER] - rows[:, WANTED_SPEED]) / PREVIEW
+        wanted = wanted + self.BANDWIDTH**2 * configuration.amplitude * rows[:, ERROR]
+        wanted = wanted + 2.0 * self.BANDWIDTH * configuration.speed * rows[:, SPEED_ERROR]
+        return np.asarray(wanted / (1.25 * configuration.ramp * configuration.speed))[:, None]
+
+
+class TorqueCascade(ComputedTorque):
+    """Position and speed loop in the master without feed-forward, for the nominal machine."""
+
+    BANDWIDTH = 60.0
+
+    def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
+        """Take no notice of the machine."""
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the torque, of the current limit."""
+        still = rows.copy()
+        still[:, WANTED_SPEED] = still[:, WANTED_SPEED_LATER] = 0.0
+        return super().actions(still)

@@ -1,0 +1,96 @@
+"""The suite of learning tasks, `ServoDrive/...-v1`: each is a configuration of an environment that never changes.
+
+A task has everything in it: device, load, mode, action, distributions, horizon and reward. Its reward per step lies in
+0...1: hardly anything for a motor at rest, nothing after a fall or a trip, which end the episode, and 1 for what is
+perfect. The score of an episode is the sum over the horizon's steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, pi
+from typing import Any
+
+TERMS = ("tracking", "speed", "load", "carried", "effort", "smoothness", "trip")  # of Tracking's reward
+
+
+@dataclass(frozen=True)
+class SuiteTask:
+    """A task of the suite.
+
+    environment: The configurable environment that it is a configuration of.
+    about: What an agent does there.
+    steps: Actions of an episode.
+    solved: Score above which an agent does what the expert cannot, 0...1; the reward threshold is that times `steps`.
+    options: The configuration.
+    """
+
+    environment: str
+    about: str
+    steps: int
+    solved: float
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _tracking(about: str, solved: float, reward: str, load: str, duration: float, **options: Any) -> SuiteTask:
+    """Return a task of Tracking, on machines of the load's set, with one term as the reward."""
+    weights = dict.fromkeys(TERMS, 0.0) | {reward: 1.0}
+    own = {"load": load, "distributions": load, "duration": duration, "weights": weights}
+    steps = round(options.get("rate", 1000) * duration)
+    return SuiteTask("ServoDrive/Tracking-v0", about, steps, solved, own | options)
+
+
+TASKS: dict[str, SuiteTask] = {
+    "ServoDrive/TorqueTracking-v1": _tracking(
+        "moves of a disc on an elastic shaft by torque alone: inertia, stiffness, friction and the bus' delays differ",
+        0.80, "tracking", "two_mass", 1.0, mode="cst", margins={"tracking": 0.06},
+    ),
+    "ServoDrive/GantryBeam-v1": _tracking(
+        "two drives pull one beam along a trajectory: the agent leads both set-points, the drives close the loops",
+        0.90, "tracking", "gantry", 1.0, mode="csp", action="offset", margins={"tracking": 0.02},
+    ),
+    "ServoDrive/Crane-v1": _tracking(
+        "a load on a rope follows a trajectory: the agent accelerates the carriage; rope and mass differ",
+        0.80, "carried", "cart_pendulum", 4.0, rate=500, mode="csv", action="ramp", ramp=12.0, trajectory="moves",
+        amplitude=5.0, speed=5.0, margins={"tracking": 0.05},
+    ),
+    "ServoDrive/PoleBalance-v1": _tracking(
+        "a pole that begins up to 0.2 rad beside its balance stands over the middle of the rail; a fall ends it",
+        0.85, "carried", "inverted_pendulum", 3.0, rate=500, mode="csv", action="ramp", ramp=8.0, tilt=(-0.2, 0.2),
+        trajectory="hold", amplitude=3.0, speed=25.0, margins={"tracking": 0.1},
+    ),
+    "ServoDrive/PoleSwingUp-v1": _tracking(
+        "a hanging pole is swung up and held, on a rail that ends",
+        0.80, "load", "inverted_pendulum", 8.0, rate=500, mode="csv", action="ramp", ramp=8.0,
+        tilt=(pi - 0.25, pi + 0.25), fall=inf, trajectory="hold", amplitude=5.0, speed=25.0, margins={"load": 1.0},
+    ),
+    "ServoDrive/ArmPath-v1": _tracking(
+        "six joints of an arm follow a path under gravity with an unknown tool: the agent leads their set-points",
+        0.82, "tracking", "robot", 2.0, mode="csp", action="offset", offset=0.05, amplitude=12.0, speed=20.0,
+        margins={"tracking": 0.007},
+    ),
+    "ServoDrive/StepperRun-v1": _tracking(
+        "a stepper runs as fast as it can: the agent changes the step rate; steps lost end the episode",
+        0.85, "speed", "inertia", 2.0, device="tmcm6212", mode="csv", action="ramp", ramp=8.64, trajectory="run",
+        amplitude=20.0, speed=12.5, margins={"speed": 0.7},
+    ),
+}  # fmt: skip
+
+FREE = ("num_threads",)  # options that change nothing but the time that a task takes
+
+
+def task_options(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a task's configuration with the options of a run that may be given besides.
+
+    Raises:
+        ValueError: For an option that is the task's own.
+    """
+    task = TASKS[name]
+    for option in given:
+        if option not in FREE:
+            raise ValueError(
+                f"{name} is frozen and takes no {option!r}; for other options take {task.environment}, whose "
+                "configuration this task is (drive_env.envs.suite.TASKS)"
+            )
+    return {**task.options, **given}
