@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.gains import read_gains
@@ -21,12 +20,9 @@ from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.proving import ProvingGround
     from tuning.target import DriveTime, Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
 # record; and one from where a response has ended.

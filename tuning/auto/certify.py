@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
@@ -35,11 +34,10 @@ from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Floats
     from tuning.auto.proving import Shown
     from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
 
 LOOPS = ("velocity", "position")
 # Of a loop whose margins are not known: its lines are shown as what they are.

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
@@ -27,13 +26,10 @@ from tuning.auto.twin import WORLDS, Known, Twins, known_of
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis, TriedGains
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"

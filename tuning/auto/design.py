@@ -13,7 +13,6 @@ from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_constants
 from drive_env.trials.score import robust_cost
@@ -22,12 +21,10 @@ from tuning.auto.twin import least_gains
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
+    from tuning.arrays import Floats, Integers
     from tuning.auto.loop_model import LinkedAxis, LoopModel
     from tuning.auto.measured_margins import MeasuredAxis
     from tuning.auto.twin import Twins
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
 # bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import bandwidth_gains, rule_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
+from tuning.arrays import Integers, Mask
 from tuning.auto.checks import unsafe_gains, wrong_wiring
 from tuning.auto.stages import Basis, IdentifiedAxes
 from tuning.identify.estimate import TITLES
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.identify.estimate import Identification
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Identify = Callable[[Target, NDArray[np.bool_]], "list[Identification]"]  # of the axes where the mask is true
+Identify = Callable[[Target, Mask], "list[Identification]"]  # of the axes where the mask is true
 
 # The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4

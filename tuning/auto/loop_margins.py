@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
@@ -27,12 +26,10 @@ from tuning.response.model_bounds import at_least_by_model, why_unbounded
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.margins import Margins
+    from tuning.arrays import Integers, Mask
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MEASURED = 0.08  # relative: what a measured slack may be off
 # What a measured margin may be off, one standard deviation of repeated measurements at most.

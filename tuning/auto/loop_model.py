@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.dynamics import INERTIA_RANGE, loop_clearance
 from drive_env.loops.margins import margins
@@ -30,13 +29,10 @@ if TYPE_CHECKING:
     from drive_env.loops.margins import Margins
     from drive_env.loops.sampled import OuterLoops
     from drive_env.motors import Motor
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.identify.estimate import Identification
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 AT_ONCE = 512  # machines that are computed at once
 TWIST = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of two inertias on one spring

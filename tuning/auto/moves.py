@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
@@ -15,12 +14,10 @@ from tuning.auto.loop_margins import MEASURED, measured_axis
 from tuning.auto.proving import RESTLESS, without_noise
 
 if TYPE_CHECKING:
+    from tuning.arrays import Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STEP_TIME = 0.6  # s of drive time for a step of the set-point
 CALMING = 0.5  # s after a load step that did not end, with gains that hold

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
@@ -46,11 +46,8 @@ from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does not pass
 # Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.

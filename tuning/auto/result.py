@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuning.certificate.certificate import TAKEN, verdict
 from tuning.lateness import late_first
@@ -19,16 +18,13 @@ if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.auto.stages import Basis, RecordedGains, Verdict
     from tuning.certificate.certificate import Correction, StepResponse
     from tuning.identify.estimate import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
@@ -17,12 +16,10 @@ from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
+    from tuning.arrays import Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import IdentifiedAxes
     from tuning.target import Target
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
 

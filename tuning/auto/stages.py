@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuning.auto.bench import LOOK_BACK_TIME
 from tuning.link_energy import trial_reach
@@ -15,15 +14,12 @@ from tuning.link_energy import trial_reach
 if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.certificate.certificate import StepResponse
     from tuning.identify.estimate import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
@@ -16,12 +15,9 @@ from tuning.auto.stages import TriedGains
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
 SLOWER = 0.6  # what gains that fail their trial are lowered to

@@ -26,10 +26,8 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
+    from tuning.arrays import Floats, Integers
     from tuning.identify.estimate import Identification
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
 # quarter of a second that the robust cost looks at.
@@ -261,7 +259,7 @@ class _Part:
         robust: RobustScore,
         device: Device,
         motor: Motor,
-        axes: NDArray[np.int64],
+        axes: Integers,
         known: Sequence[Known],
         scaler: Floats,
         sets: int,

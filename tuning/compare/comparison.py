@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
@@ -34,11 +33,10 @@ from tuning.search.trial_bench import read_gains
 from tuning.target import Target
 
 if TYPE_CHECKING:
+    from tuning.arrays import Integers
     from tuning.identify.estimate import Identification
     from tuning.runs.pools import Pool
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
 NEAR_PHASE, NEAR_GAIN = 5.0, 1.0  # degrees and dB by which margins may be missed and still be near

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -31,9 +30,6 @@ from tuning.identify.linked_axes import are_linked
 from tuning.runs.inputs import files_of, is_path, is_shipped, taken
 from tuning.target import Target
 from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 SHIPPED = Path(__file__).parent / "suites"
 FRICTION = "stribeck"

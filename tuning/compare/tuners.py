@@ -13,7 +13,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
 from drive_env.loops.dynamics import DEFAULT
@@ -25,10 +24,8 @@ from tuning.target import Target, timed
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Integers
     from tuning.identify.estimate import Identification
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 ENTRY_POINTS = "drive_env.tuners"
 
