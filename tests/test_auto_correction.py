@@ -19,7 +19,7 @@ from tuning.auto.bench import Journal
 from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocity_p, _short, correct
 from tuning.auto.identified import calm_gains
 from tuning.auto.proving import RESTLESS, Proof, ProvingGround
-from tuning.auto.stages import TriedGains
+from tuning.auto.stages import RecordedGains
 from tuning.auto.twin import FrictionGuess, Known
 from tuning.target import emulated
 
@@ -75,7 +75,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
         verified.append(recorded.gains[:, VELOCITY_P].tolist())
         texts = [failed(p) if failed else "" for p in recorded.gains[:, VELOCITY_P]]
         swing = 2.0 * RESTLESS * np.array([bool(text) for text in texts])
-        return vary(recorded, failed=tuple(texts), swing=swing)
+        return vary(recorded, failed=np.array(texts, object), swing=swing)
 
     def measure(bench, basis, recorded, where):
         return vary(recorded, slack=np.array([slack(p) if slack else 0.5 for p in recorded.gains[:, VELOCITY_P]]))
@@ -92,7 +92,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
     axis = SimpleNamespace(slack=lambda dynamics, gains: np.array([slack(p) for p in gains[:, VELOCITY_P]]))
     monkeypatch.setattr(correction, "measured_axis", lambda *given: axis if measured else None)
     bench = bench_of(axes, Ground(fails), seconds, time_waits)
-    tried = TriedGains(np.array([FIRST] * axes), np.ones(axes), ("by a move",) * axes, np.ones(axes))
+    tried = vary(RecordedGains.only(np.array([FIRST] * axes)), proof=np.ones(axes), cost=np.ones(axes))
     found = correct(bench, basis(tried.gains), tried, bench.target, lambda what, share: None)
     return found, bench, verified
 
@@ -261,7 +261,7 @@ def test_axes_of_one_machine_are_corrected_and_kept_together(monkeypatch):
 # --- by what ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("known", "text"), [
     ({}, ""),
-    ({"failed": ("it swung",)}, "it swung"),
+    ({"failed": np.array(["it swung"], object)}, "it swung"),
     ({"slack": np.array([-0.25])}, "its measured loops keep 75 % of the margins asked for"),
     ({"slack": np.array([-3.0])}, "its measured loops keep 0 % of the margins asked for"),
     ({"slack": np.array([np.nan])}, ""),  # not measured

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
-    from tuning.auto.stages import Basis, TriedGains
+    from tuning.auto.stages import Basis
     from tuning.target import Target
 
 CORRECTIONS = 2
@@ -66,9 +66,9 @@ def design_axes(
     """
     target, axes = bench.target, np.flatnonzero(where).tolist()
     gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
+    most = np.full(target.num_axes, np.inf) if most is None else most
     if not axes:
         return gains, cost, present
-    most = np.full(target.num_axes, np.inf) if most is None else most
     known = [_known(bench, basis, recorded, k, restless=bool(np.isfinite(most[k]))) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
     # The response of a linked axis was measured without the other one; what both say is in their model.
@@ -77,7 +77,6 @@ def design_axes(
         (model, np.searchsorted(axes, of))
         for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
     ]
-    most = np.full(target.num_axes, np.inf) if most is None else most
 
     def judge(**more: Any) -> Judge:
         twins = Twins(target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics, **more)
@@ -117,21 +116,21 @@ def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> 
 
 
 def correct(
-    bench: AutoBench, basis: Basis, tried: TriedGains, target: Target, say: Callable[[str, float], None]
+    bench: AutoBench, basis: Basis, tried: RecordedGains, target: Target, say: Callable[[str, float], None]
 ) -> RecordedGains:
     """Verify gains by a move, a frequency response and a load step, and correct the design by what these show.
 
     Args:
         bench: The drives.
         basis: What was identified.
-        tried: The gains.
+        tried: The gains, and what their trials showed.
         target: The drives, whose time is not counted.
         say: Called with the present step and the share done.
 
     Returns:
         The best of what was verified; an axis whose gains cannot stay is out of the run.
     """
-    recorded, changed = RecordedGains.of(tried), bench.going
+    recorded, changed = tried, bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
     column = cascade_columns(bench.target.device)[2]
@@ -157,7 +156,8 @@ def correct(
         for k in map(int, np.flatnonzero(bench.going)):
             if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
                 gains[k] = recorded.gains[k]
-        changed = bench.whole_machines((gains != recorded.gains).any(axis=1) | _others(bench, gains, recorded))
+        # All axes of machines some of whose axes get other gains.
+        changed = bench.going & ~bench.whole_machines((gains == recorded.gains).all(axis=1))
         changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
         if not changed.any():
             break
@@ -172,20 +172,13 @@ def correct(
     return final
 
 
-def _others(bench: AutoBench, gains: Integers, recorded: RecordedGains) -> Mask:
-    """Return all axes of machines some of whose axes get other gains, (num_axes,)."""
-    per_machine = bench.target.axes_per_machine
-    differs = (gains != recorded.gains).any(axis=1).reshape(-1, per_machine).any(axis=1)
-    return np.asarray(np.repeat(differs, per_machine)) & bench.going
-
-
 def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
     """Return the cost of verified gains by J and margins, of each machine its worst axis, (num_axes,)."""
-    failed = np.array([bool(why) for why in recorded.failed])
     # What was not measured is worth less than what is known to keep the dynamics.
     slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
     slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot, 1.0) / bench.dynamics.overshoot)
-    cost = np.where(failed, 2.0 * TRIP + recorded.swing, robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack))
+    cost = robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack)
+    cost = np.where(recorded.failed != "", 2.0 * TRIP + recorded.swing, cost)
     per_machine = bench.target.axes_per_machine
     return np.asarray(np.repeat(cost.reshape(-1, per_machine).max(axis=1), per_machine))
 
@@ -202,7 +195,7 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
     # Of what failed its move no loop was looked at yet; what was looked at and not seen asks for more margin.
-    looked_at = bench.going & np.array([not text for text in recorded.failed])
+    looked_at = bench.going & (recorded.failed == "")
     blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
@@ -226,7 +219,7 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
 def _short(bench: AutoBench, recorded: RecordedGains, k: int) -> str:
     """Return which requirement the gains of an axis miss; "" if they meet all."""
     if recorded.failed[k]:
-        return recorded.failed[k]
+        return str(recorded.failed[k])
     if recorded.slack[k] < 0.0:
         return f"its measured loops keep {100.0 * (1.0 + max(recorded.slack[k], -1.0)):.0f} % of the margins asked for"
     if recorded.overshoot[k] > bench.dynamics.overshoot:
@@ -253,7 +246,6 @@ def _try(
     bench: AutoBench, recorded: RecordedGains, gains: Integers, where: Mask, why: Sequence[str]
 ) -> tuple[RecordedGains, Mask]:
     """Try corrected gains; return what is known with those that passed, and which axes have them."""
-    assert bench.ground is not None, "trying makes it"
     try:
         with bench.spending(bench.target.together(where)):
             proof = bench.ground.run(gains, where)
@@ -268,9 +260,8 @@ def _try(
         reason = why[k] or "as its other axes were"
         bench.journals[k].note(f"gains designed again from what was measured: {reason}")
         bench.journals[k].correct(recorded.gains[k], gains[k], reason)
-    unknown = np.full(len(where), np.nan)
     fresh = replace(
-        recorded, gains=gains, proof=proof.cost, cost=unknown, failed=("",) * len(where), swing=np.zeros(len(where)),
-        slack=unknown, overshoot=unknown,
+        RecordedGains.only(gains), proof=proof.cost, verified=recorded.verified, unseen=recorded.unseen,
+        loaded=recorded.loaded,
     )  # fmt: skip
     return recorded.mixed(fresh, passed), passed

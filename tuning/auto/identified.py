@@ -65,14 +65,14 @@ def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
     """Return the reference gains, calm gains, and whether the gains before are safe."""
     target = bench.target
     reference = np.ones_like(bench.before)
-    calm, unsafe = reference.copy(), ["not checked"] * target.num_axes
+    calm, unsafe = reference.copy(), np.full(target.num_axes, "not checked", object)
     for axis in map(int, np.flatnonzero(bench.going)):
         (plant, found), before = identified.known(axis), bench.before[axis]
         inertia = found.together if math.isfinite(found.together) else plant.inertia
         reference[axis] = rule_gains(target.device, target.motor, inertia, supply=plant.supply)[0]
         unsafe[axis] = unsafe_gains(target.device, plant, before)
         calm[axis] = calm_gains(target, plant)
-    return Basis(identified, bench.before, reference, calm, tuple(unsafe))
+    return Basis(identified, bench.before, reference, calm, unsafe)
 
 
 def calm_gains(target: Target, plant: Plant) -> Integers:
