@@ -20,7 +20,7 @@ from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocit
 from tuning.auto.identified import calm_gains
 from tuning.auto.proving import RESTLESS, Proof, ProvingGround
 from tuning.auto.stages import RecordedGains
-from tuning.auto.twin import FrictionGuess, Known
+from tuning.auto.twin import Known
 from tuning.target import emulated
 
 DEVICE, STANDARD = find_device("tmcm1636"), find_dynamics("standard")
@@ -169,15 +169,13 @@ def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(fa
 @pytest.mark.parametrize(("restless", "share"), [(False, 1.0), (True, 0.4)])
 def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless, share, monkeypatch):
     monkeypatch.setattr(correction, "fitted_plant", lambda *given: ("plant", "found"))
-    monkeypatch.setattr(
-        correction, "known_of", lambda plant, found, reach: Known(plant, FrictionGuess(0.5, 0.01), reach)
-    )
+    monkeypatch.setattr(correction, "known_of", lambda plant, found, reach: Known(plant, reach, 0.5, 0.01))
     bench = SimpleNamespace(target=SimpleNamespace(linked=False))
     basis_ = SimpleNamespace(
         trial_reach=lambda bench: np.array([2.0]), identified=SimpleNamespace(known=lambda k: ("plant", "found"))
     )
     found = correction._known(bench, basis_, None, 0, restless)
-    assert found.friction == FrictionGuess(pytest.approx(0.5 * share), 0.01) and found.reach == 2.0
+    assert (found.coulomb, found.viscous, found.reach) == (pytest.approx(0.5 * share), 0.01, 2.0)
 
 
 def test_there_are_two_corrections_at_most(monkeypatch):

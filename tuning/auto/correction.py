@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -78,11 +80,9 @@ def design_axes(
         for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
     ]
 
-    def judge(**more: Any) -> Judge:
-        twins = Twins(target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics, **more)
-        return Judge(twins, models, measured)
-
-    with judge(worlds=WORLDS[:1]) as coarse, judge(repeats=RUNS) as fine:
+    twins = partial(Twins, target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics)
+    with closing(twins(worlds=WORLDS[:1])) as one_world, closing(twins(repeats=RUNS)) as all_worlds:
+        coarse, fine = (Judge(one, models, measured) for one in (one_world, all_worlds))
         found = design(coarse, fine, [one.plant for one in known], say, most[axes])
         if recorded is not None:
             present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
@@ -103,8 +103,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
         return known_of(rigid, found, reach)
     plant, found = fitted_plant(basis.identified, recorded, k)
     known = known_of(plant, found, reach)
-    still = STILL_FRICTION if restless else 1.0
-    return known._replace(friction=known.friction._replace(coulomb=still * known.friction.coulomb))
+    return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known
 
 
 def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:

@@ -60,7 +60,10 @@ class Judge(NamedTuple):
 
     def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
         """Return how far they keep the constraints of the loops, relative; `nominal` of the axes as they are alone."""
-        slack = self._measured_slack(gains)
+        slack = np.full(gains.shape[:2], np.inf)
+        for k, one in enumerate(self.measured):
+            if one is not None:
+                slack[k] = one.slack(self.twins.dynamics, gains[k])
         for model, axes in self.models:
             of_machine = model.slack(self.twins.dynamics, np.moveaxis(gains[axes], 0, 1), nominal=nominal)
             slack[axes] = np.minimum(of_machine, slack[axes].min(axis=0))
@@ -77,23 +80,6 @@ class Judge(NamedTuple):
         for _, axes in self.models:
             whole[axes] = reduce(values[axes], axis=0)
         return whole
-
-    def _measured_slack(self, gains: Integers) -> Floats:
-        slack = np.full(gains.shape[:2], np.inf)
-        for k, one in enumerate(self.measured):
-            if one is not None:
-                slack[k] = one.slack(self.twins.dynamics, gains[k])
-        return slack
-
-    def close(self) -> None:
-        """Close the emulated machines."""
-        self.twins.close()
-
-    def __enter__(self) -> Judge:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class Designed(NamedTuple):
