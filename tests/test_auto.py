@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from auto_stages import designs, short_designs
 from test_parity import served
+from test_suite import open_machines
 from thinning import part
 
 from drive_env import EmulatedDrives, motion
@@ -35,7 +36,7 @@ from tuning.auto.loop_margins import MS_ERROR
 from tuning.auto.one_button import BUDGET, auto
 from tuning.auto.proving import ProvingGround
 from tuning.compare.oracle import digest, read_oracles
-from tuning.compare.suite import load_suite, open_machines
+from tuning.compare.suite import load_suite
 from tuning.compare.yardstick import Yardstick
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.quick_identification import identify_briefly

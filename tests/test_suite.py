@@ -23,7 +23,6 @@ from tuning.compare.suite import (
     groups,
     load_suite,
     open_group,
-    open_machines,
 )
 from tuning.toml_tables import ExperimentError
 
@@ -50,6 +49,13 @@ def small(tmp_path):
         return path
 
     return write
+
+
+def open_machines(machines, num_threads=None):
+    """Yield machines ready to be tuned, those of one load and motor as one target, and their indices."""
+    for indices in groups(machines):
+        with open_group([machines[k] for k in indices], num_threads) as target:
+            yield target, indices
 
 
 # --- the public part ----------------------------------------------------------------------------------------------
@@ -354,21 +360,3 @@ def test_a_machine_is_sound_that_can_be_made_without_a_warning_of_its_inertia(er
     monkeypatch.setattr(module, "EmulatedDrives", made)
     assert module._sound("tmcm1636", "inertia", "qbl4208", {"a": 1}) is sound
     assert closed == ([1] if sound else [])
-
-
-def test_machines_are_opened_kind_by_kind(monkeypatch):
-    opened = []
-
-    class Opened:
-        def __init__(self, machines, num_threads):
-            opened.append(([one.name for one in machines], num_threads))
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *error):
-            opened.append("closed")
-
-    monkeypatch.setattr(module, "open_group", Opened)
-    assert [indices for _, indices in open_machines(ROW, 3)] == [[0, 2, 3], [1, 4]]
-    assert opened == [(["a0", "a1", "a2"], 3), "closed", (["b0", "b1"], 3), "closed"]

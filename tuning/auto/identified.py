@@ -13,7 +13,7 @@ from drive_env.loops.linear_model import Plant
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.arrays import Integers, Mask
-from tuning.auto.checks import unsafe_gains, wrong_wiring
+from tuning.auto.checks import identified_plant, unsafe_gains
 from tuning.auto.stages import Basis, IdentifiedAxes
 from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
@@ -32,32 +32,27 @@ CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
 def identify(bench: AutoBench, experiments: Identify) -> IdentifiedAxes:
     """Check the wiring and identify; take out axes that cannot be tuned."""
     target, going = bench.target, bench.going
-    found: list[Identification | None] = [None] * target.num_axes
-    plants: list[Plant | None] = [None] * target.num_axes
-    if not going.any():
-        return IdentifiedAxes(tuple(found), tuple(plants))
+    every: list[Identification] = []
     try:
-        with bench.spending(going), swinging_allowed(target.drives):
-            every = experiments(target, going)
+        if going.any():
+            with bench.spending(going), swinging_allowed(target.drives):
+                every = experiments(target, going)
     except (SafetyError, RuntimeError, TimeoutError) as error:
         if isinstance(error, BusError):
             raise
-        bench.stop(bench.going, f"identification was stopped: {error}")
-        return IdentifiedAxes(tuple(found), tuple(plants))
-    for k in map(int, np.flatnonzero(going)):
-        journal, found[k] = bench.journals[k], every[k]
-        journal.stop(wrong_wiring(target, every[k]))
-        if not journal.reason:
-            try:
-                plants[k] = Plant.from_identification(target.device, target.motor, float(target.supply[k]), every[k])
-            except ValueError as error:
-                journal.stop(str(error))
+        bench.stop(going, f"identification was stopped: {error}")
+    found: list[Identification | None] = [None] * target.num_axes
+    plants: list[Plant | None] = [None] * target.num_axes
+    for k in map(int, np.flatnonzero(going) if every else ()):
+        found[k] = every[k]
+        plants[k], why = identified_plant(target, k, every[k])
+        bench.journals[k].stop(why)
         unknown: dict[str, list[str]] = {}
         for name, estimate in every[k].estimates.items():
-            if estimate.reason and name not in ("inertia",):
+            if estimate.reason and name != "inertia":
                 unknown.setdefault(estimate.reason, []).append(TITLES[name])
         for reason, titles in unknown.items():
-            journal.note(f"{', '.join(titles)} not identified: {reason}")
+            bench.journals[k].note(f"{', '.join(titles)} not identified: {reason}")
     return IdentifiedAxes(tuple(found), tuple(plants))
 
 
