@@ -14,7 +14,7 @@ from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, step_overshoot, window
 from drive_env.loops.true_plant import true_machines, true_plant
 from drive_env.safety.envelope import SafetyError
-from tuning.auto import correction
+from tuning.auto import correction, design
 from tuning.auto.bench import Journal
 from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocity_p, _short, correct
 from tuning.auto.identified import calm_gains
@@ -168,13 +168,13 @@ def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(fa
 
 @pytest.mark.parametrize(("restless", "share"), [(False, 1.0), (True, 0.4)])
 def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless, share, monkeypatch):
-    monkeypatch.setattr(correction, "fitted_plant", lambda *given: ("plant", "found"))
-    monkeypatch.setattr(correction, "known_of", lambda plant, found, reach: Known(plant, reach, 0.5, 0.01))
+    monkeypatch.setattr(design, "fitted_plant", lambda *given: ("plant", "found"))
+    monkeypatch.setattr(design, "known_of", lambda plant, found, reach: Known(plant, reach, 0.5, 0.01))
     bench = SimpleNamespace(target=SimpleNamespace(linked=False))
     basis_ = SimpleNamespace(
         trial_reach=lambda bench: np.array([2.0]), identified=SimpleNamespace(known=lambda k: ("plant", "found"))
     )
-    found = correction._known(bench, basis_, None, 0, restless)
+    found = design._known(bench, basis_, None, 0, restless)
     assert (found.coulomb, found.viscous, found.reach) == (pytest.approx(0.5 * share), 0.01, 2.0)
 
 

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
-from tuning.auto.design import Judge, design
+from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, measure, measured_axis
-from tuning.auto.loop_model import fitted_plant, loop_models
 from tuning.auto.moves import load, show, step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.stages import RecordedGains
-from tuning.auto.twin import WORLDS, Known, Twins, known_of
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.loops.dynamics import Dynamics
     from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
@@ -35,75 +28,13 @@ if TYPE_CHECKING:
 
 CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
-SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
 # Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
 # lowered to where an axis does not rest; position P likewise where a step overshoots.
 CALMER, LEAST_CALMER = 0.9, 0.5
-STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
 # Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
-
-
-def design_axes(
-    bench: AutoBench,
-    basis: Basis,
-    where: Mask,
-    say: Callable[[float], None] = lambda share: None,
-    recorded: RecordedGains | None = None,
-    dynamics: Dynamics | None = None,
-    most: Floats | None = None,
-) -> tuple[Integers, Floats, Floats]:
-    """Return the best gains of axes by their twins, (num_axes, count), and the robust cost of these and of the present.
-
-    Args:
-        bench: The drives.
-        basis: What was identified.
-        where: Axes, (num_axes,); the others have gains of 1.
-        say: Called with the share done.
-        recorded: The present gains, and what was measured with them; nothing by default.
-        dynamics: What the loops must keep; those of the run by default.
-        most: The greatest velocity P with which an axis may rest, raw, (num_axes,); infinite by default.
-    """
-    target, axes = bench.target, np.flatnonzero(where).tolist()
-    gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
-    most = np.full(target.num_axes, np.inf) if most is None else most
-    if not axes:
-        return gains, cost, present
-    known = [_known(bench, basis, recorded, k, restless=bool(np.isfinite(most[k]))) for k in axes]
-    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
-    # The response of a linked axis was measured without the other one; what both say is in their model.
-    measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
-    models = [
-        (model, np.searchsorted(axes, of))
-        for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
-    ]
-
-    twins = partial(Twins, target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics)
-    with closing(twins(worlds=WORLDS[:1])) as one_world, closing(twins(repeats=RUNS)) as all_worlds:
-        coarse, fine = (Judge(one, models, measured) for one in (one_world, all_worlds))
-        found = design(coarse, fine, [one.plant for one in known], say, most[axes])
-        if recorded is not None:
-            present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
-    gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
-    return gains, cost, present
-
-
-def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
-    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
-
-    What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
-    """
-    plant, found = basis.identified.known(k)
-    reach = float(basis.trial_reach(bench)[k])
-    if bench.target.linked:
-        # The ends of one part move it together, each its share, and then nothing twists.
-        rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
-        return known_of(rigid, found, reach)
-    plant, found = fitted_plant(basis.identified, recorded, k)
-    known = known_of(plant, found, reach)
-    return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known
 
 
 def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:

@@ -2,7 +2,14 @@
 
 Everything acts through the Drives interface, on all axes of a target at the same time, inside a transaction
 (snapshot.py): the state before is in a file before anything is changed, and an axis that fails a check gets it back.
-Gains are designed on digital twins (twin.py), which costs no drive time, and corrected by what the drives show.
+Gains are designed on digital twins, which costs no drive time, and corrected by what the drives show. `auto` calls the
+stages in this order, and what they hand on is in stages.py:
+
+1. identify: identified.py, with the wiring and the motor's parameters (settings.py) and checks (checks.py);
+2. design: design.py, on twins (twin.py) and their linear models (loop_model.py);
+3. try: trying.py, in trials on the drives (proving.py);
+4. verify and correct: correction.py, by moves (moves.py) and measured loops (loop_margins.py, measured_margins.py);
+5. certify: certify.py, of the result (result.py).
 """
 
 from __future__ import annotations
@@ -19,7 +26,8 @@ from drive_env.gains import check_linear_model
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
-from tuning.auto.correction import correct, design_axes
+from tuning.auto.correction import correct
+from tuning.auto.design import design_axes
 from tuning.auto.identified import identify, prepare
 from tuning.auto.loop_margins import judge
 from tuning.auto.moves import look_back
