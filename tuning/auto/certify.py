@@ -10,6 +10,7 @@ from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from tuning.auto.load_step import NOISE, SWING
 from tuning.auto.loop_margins import OVERSHOOT_ERROR, AskedMargin, asked_margins
+from tuning.auto.measured_margins import LOOPS
 from tuning.auto.proving import STEP_SIZE
 from tuning.certificate.certificate import (
     CROSSOVERS,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
 
-LOOPS = ("velocity", "position")
 # Of a loop whose margins are not known: its lines are shown as what they are.
 UNKNOWN = Margins(*(np.nan,) * len(Margins._fields))
 MODEL_LOW, MODEL_HIGH, MODEL_POINTS = 2.0, 1000.0, 200  # frequencies of a loop that is a model's alone [Hz]

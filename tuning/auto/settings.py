@@ -99,17 +99,15 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
     other = going & (bench.modes != 0) & (drives.read(cia402.MODE) != bench.modes)
     if other.any():
         drives.write(cia402.MODE, bench.modes, where=other)
-    kept = dict(zip(bench.target.device.gains.keys, gains.T, strict=True))
+    wiring, roles = list(findings(bench.target.device)), bench.target.device.roles
+    commissioned = [*wiring, *_commissioning(bench.target)]
+    if Role.LIMIT_SWITCHES in roles:
+        commissioned.append(roles[Role.LIMIT_SWITCHES])
     axes = []
     for k, values in enumerate(transaction.before.axes):
-        wanted = dict(values)
-        if fresh[k]:
-            commissioned = list(_commissioning(bench.target))
-            if Role.LIMIT_SWITCHES in bench.target.device.roles:
-                commissioned.append(bench.target.device.roles[Role.LIMIT_SWITCHES])
-            wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
-        wanted |= {key: int(drives.read(key)[k]) for key in findings(bench.target.device) if key in values}
-        axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
+        stays = [key for key in (commissioned if fresh[k] else wiring) if key in values]
+        own = dict(zip(bench.target.device.gains.keys, map(int, gains[k]), strict=True))
+        axes.append({**values, **{key: int(drives.read(key)[k]) for key in stays}, **own})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
     return going
 

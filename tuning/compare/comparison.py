@@ -261,15 +261,6 @@ def _rows_in(log: ShardLog | None) -> dict[int, list[MachineRow]]:
     return {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
 
 
-class _Tuned(NamedTuple):
-    """What came of a tuner on the machines of a group: its outcome, or why there is none and the gains it left."""
-
-    outcome: Outcome | None
-    gains: Integers
-    failure: str
-    audit: DriveAudit
-
-
 class _Bench:
     """The machines of a task's group, which tuners tune one after the other, each time fresh from the box."""
 
@@ -282,7 +273,8 @@ class _Bench:
         """Give the yardstick's machines back."""
         self._yardstick.close()
 
-    def _tune(self, name: str, tuner: Tuner) -> _Tuned:
+    def _tune(self, name: str, tuner: Tuner) -> tuple[Outcome | None, Integers, str, DriveAudit]:
+        """Return a tuner's outcome, or None and why; the gains it left, and what was counted meanwhile."""
         with open_group(self.task.group, self._num_threads) as target:
             audit = DriveAudit(target)
             watched = replace(target, drives=ObservedDrives(target.drives, audit))
@@ -295,9 +287,9 @@ class _Bench:
                         outcome, audit = self._propose(tuner, watched, audit)
                     else:
                         outcome = tuner(watched, rng)
-                    return _Tuned(outcome, _checked_gains(outcome, target), "", audit)
+                    return outcome, _checked_gains(outcome, target), "", audit
                 except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
-                    return _Tuned(None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit)
+                    return None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit
 
     def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
         """Return what a rule proposes, and the audit of the identification, which is the same for all rules."""
