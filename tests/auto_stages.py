@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace as vary
+
 import numpy as np
 
 from tuning.auto import correction, design, one_button
-from tuning.auto.stages import Basis, IdentifiedAxes, RecordedGains, TriedGains, Verdict
+from tuning.auto.stages import Basis, IdentifiedAxes, RecordedGains
 
 
 def basis(reference, *, before=None, plant=None, found=None):
@@ -13,12 +15,12 @@ def basis(reference, *, before=None, plant=None, found=None):
     reference = np.asarray(reference)
     n = len(reference)
     before = reference if before is None else np.asarray(before)
-    return Basis(IdentifiedAxes((found,) * n, (plant,) * n), before, reference, reference, ("",) * n)
+    return Basis(IdentifiedAxes((found,) * n, (plant,) * n), before, reference, reference, np.full(n, "", object))
 
 
 def recorded(gains, **known):
     """Return gains, (num_axes, count), of which nothing more than this is known."""
-    return RecordedGains(**(vars(RecordedGains.of(TriedGains.only(np.asarray(gains)))) | known))
+    return vary(RecordedGains.only(np.asarray(gains)), **known)
 
 
 def designs(replace, gains, again=None):
@@ -45,7 +47,7 @@ def skip_stages(replace, gains):
     n = len(gains)
     replace(one_button, "identify", lambda bench, experiments: IdentifiedAxes((None,) * n, (None,) * n))
     replace(one_button, "prepare", lambda bench, identified: basis(gains, before=bench.before))
-    replace(one_button, "on_twins", lambda bench, basis, say: TriedGains.only(gains.copy()))
-    replace(one_button, "correct", lambda bench, basis, tried, target, say: RecordedGains.of(tried))
+    replace(one_button, "on_twins", lambda bench, basis, say: RecordedGains.only(gains.copy()))
+    replace(one_button, "correct", lambda bench, basis, tried, target, say: tried)
     replace(one_button, "look_back", lambda bench, basis, recorded: recorded)
-    replace(one_button, "judge", lambda bench, basis, recorded: Verdict(({},) * n, ({},) * n, recorded.verified))
+    replace(one_button, "judge", lambda bench, basis, recorded: recorded)

@@ -294,7 +294,7 @@ def test_the_dynamics_asked_for_are_the_agents_and_the_verifications(tmp_path, m
         asked.update(options)
         raise RuntimeError("as far as this test goes")
 
-    monkeypatch.setattr("tuning.auto.one_button.prove_found", proven)
+    monkeypatch.setattr("tuning.auto.one_button.auto", proven)
     policy = open_tuner("gain_tuning", "tmcm1636", None, "50/10/1.8")
     assert policy.bundle.configuration["dynamics"] == "50/10/1.8"
     with emulated("tmcm1636", "inertia", "qbl4208") as target, pytest.raises(RuntimeError, match="as far as"):

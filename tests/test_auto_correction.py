@@ -14,13 +14,13 @@ from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, step_overshoot, window
 from drive_env.loops.true_plant import true_machines, true_plant
 from drive_env.safety.envelope import SafetyError
-from tuning.auto import correction
+from tuning.auto import correction, design
 from tuning.auto.bench import Journal
 from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocity_p, _short, correct
 from tuning.auto.identified import calm_gains
 from tuning.auto.proving import RESTLESS, Proof, ProvingGround
-from tuning.auto.stages import TriedGains
-from tuning.auto.twin import FrictionGuess, Known
+from tuning.auto.stages import RecordedGains
+from tuning.auto.twin import Known
 from tuning.target import emulated
 
 DEVICE, STANDARD = find_device("tmcm1636"), find_dynamics("standard")
@@ -42,8 +42,7 @@ class Ground:
         self.tried.append(gains[:, VELOCITY_P].tolist())
         n = len(gains)
         reason = tuple("it shook" if self.fails(p) else "" for p in gains[:, VELOCITY_P])
-        none = np.zeros(n)
-        return Proof(np.ones(n), none > 0, none > 0, reason, none, none, none)
+        return Proof(np.ones(n), reason)
 
 
 def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=None, overshoot=None, axes=1,
@@ -75,7 +74,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
         verified.append(recorded.gains[:, VELOCITY_P].tolist())
         texts = [failed(p) if failed else "" for p in recorded.gains[:, VELOCITY_P]]
         swing = 2.0 * RESTLESS * np.array([bool(text) for text in texts])
-        return vary(recorded, failed=tuple(texts), swing=swing)
+        return vary(recorded, failed=np.array(texts, object), swing=swing)
 
     def measure(bench, basis, recorded, where):
         return vary(recorded, slack=np.array([slack(p) if slack else 0.5 for p in recorded.gains[:, VELOCITY_P]]))
@@ -92,7 +91,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
     axis = SimpleNamespace(slack=lambda dynamics, gains: np.array([slack(p) for p in gains[:, VELOCITY_P]]))
     monkeypatch.setattr(correction, "measured_axis", lambda *given: axis if measured else None)
     bench = bench_of(axes, Ground(fails), seconds, time_waits)
-    tried = TriedGains(np.array([FIRST] * axes), np.ones(axes), ("by a move",) * axes, np.ones(axes))
+    tried = vary(RecordedGains.only(np.array([FIRST] * axes)), proof=np.ones(axes), cost=np.ones(axes))
     found = correct(bench, basis(tried.gains), tried, bench.target, lambda what, share: None)
     return found, bench, verified
 
@@ -169,16 +168,14 @@ def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(fa
 
 @pytest.mark.parametrize(("restless", "share"), [(False, 1.0), (True, 0.4)])
 def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless, share, monkeypatch):
-    monkeypatch.setattr(correction, "fitted_plant", lambda *given: ("plant", "found"))
-    monkeypatch.setattr(
-        correction, "known_of", lambda plant, found, reach: Known(plant, FrictionGuess(0.5, 0.01), reach)
-    )
+    monkeypatch.setattr(design, "fitted_plant", lambda *given: ("plant", "found"))
+    monkeypatch.setattr(design, "known_of", lambda plant, found, reach: Known(plant, reach, 0.5, 0.01))
     bench = SimpleNamespace(target=SimpleNamespace(linked=False))
     basis_ = SimpleNamespace(
         trial_reach=lambda bench: np.array([2.0]), identified=SimpleNamespace(known=lambda k: ("plant", "found"))
     )
-    found = correction._known(bench, basis_, None, 0, restless)
-    assert found.friction == FrictionGuess(pytest.approx(0.5 * share), 0.01) and found.reach == 2.0
+    found = design._known(bench, basis_, None, 0, restless)
+    assert (found.coulomb, found.viscous, found.reach) == (pytest.approx(0.5 * share), 0.01, 2.0)
 
 
 def test_there_are_two_corrections_at_most(monkeypatch):
@@ -261,7 +258,7 @@ def test_axes_of_one_machine_are_corrected_and_kept_together(monkeypatch):
 # --- by what ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("known", "text"), [
     ({}, ""),
-    ({"failed": ("it swung",)}, "it swung"),
+    ({"failed": np.array(["it swung"], object)}, "it swung"),
     ({"slack": np.array([-0.25])}, "its measured loops keep 75 % of the margins asked for"),
     ({"slack": np.array([-3.0])}, "its measured loops keep 0 % of the margins asked for"),
     ({"slack": np.array([np.nan])}, ""),  # not measured

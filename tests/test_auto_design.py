@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ from drive_env.motors import find_motor
 from tuning.auto import design as module
 from tuning.auto.design import LEAST_TORQUE, Judge, _around, _of_each, design
 from tuning.auto.loop_model import LoopModel, one_axis
-from tuning.auto.twin import WORLDS, FrictionGuess, Known, Spread, Twins, least_gains
+from tuning.auto.twin import UNCERTAIN, WORLDS, Known, Twins, least_gains
 from tuning.target import emulated
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -26,7 +27,8 @@ def known(load):
     """Return an axis as a good identification has it, and 2058h."""
     with emulated(load=load, num_threads=1) as target:
         plant = true_plant(target.drives)
-    return Known(plant, FrictionGuess(0.1, 1e-4), math.inf, Spread(0.03, 0.03, 0.03, 0.1)), np.array([65536.0])
+    spread = dict(zip(UNCERTAIN, (0.03, 0.03, 0.03, 0.1), strict=True))
+    return Known(plant, math.inf, 0.1, 1e-4, spread=spread), np.array([65536.0])
 
 
 def both_twins(load):
@@ -42,7 +44,7 @@ def both_twins(load):
 def designed(request):
     """Twins of a load, its plant, and the design on them."""
     coarse, fine, plant = both_twins(request.param)
-    with coarse, fine:
+    with closing(coarse.twins), closing(fine.twins):
         yield coarse, fine, plant, design(coarse, fine, [plant])
 
 

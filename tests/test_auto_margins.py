@@ -148,7 +148,7 @@ def test_beyond_stiff_dynamics_gains_are_rejected_and_between_there_is_a_reserva
     (journal,) = bench.journals
     reserved, rejected = bool(journal.reservations), bool(journal.reason)
     assert ("rejected" if rejected else "reserved" if reserved else "accepted") == verdict, vars(journal)
-    assert told.margins == (found,) and "velocity loop Ms 1.5" in told.verified[0]
+    assert told.margins == {0: found} and "velocity loop Ms 1.5" in told.verified[0]
 
 
 def test_gains_before_that_are_kept_are_not_rejected_for_what_they_were(monkeypatch):

@@ -303,14 +303,13 @@ def test_axes_that_pull_at_one_thing_move_together_or_not_at_all(what):
 
 
 @pytest.mark.slow
-def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tmp_path):
+def test_a_machine_that_one_joint_stops_gets_other_gains_for_all_joints(monkeypatch, tmp_path):
     """One joint of an arm is given wild gains: a machine passes as a whole, so that all joints get other ones."""
     with emulated(load="robot", num_machines=1, num_threads=1) as target:
         wanted = fitted(target)
         wanted[3, 2:] = 32767
         proof = proving(target, fitted(target)).run(wanted, np.ones(6, bool))
-        assert proof.stopped.all()
-        assert proof.culprit.tolist() == [False, False, False, True, False, False]
+        assert all(reason.startswith("stopped in the") for reason in proof.reason)
         designs(monkeypatch.setattr, wanted)
         result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
@@ -339,8 +338,7 @@ def test_an_axis_that_still_turns_is_stopped_before_gains_are_judged_on_it():
         ground = ProvingGround(target, plants, (target.low, target.high), slow, good)
         proof = ground.run(good, np.ones(2, bool))
     assert proof.reason == ("", "")
-    assert proof.ripple[0] == pytest.approx(proof.ripple[1], abs=0.02)
-    assert proof.overshoot[0] == pytest.approx(proof.overshoot[1], abs=0.05)
+    assert proof.cost[0] == pytest.approx(proof.cost[1], rel=0.1)
 
 
 STIFF, SOFT = (4021, 1573, 806, 1233, 1172), (4021, 1573, 445, 329, 118)

@@ -132,10 +132,9 @@ def test_a_correction_says_what_gave_way_why_and_whether_it_stayed(steps, final,
         journals=[journal], before=np.ones((1, 5), np.int64), ground=None, spent=np.zeros(1), dynamics=STANDARD,
         target=SimpleNamespace(num_axes=1, drives=SimpleNamespace(time_waits=True, bus=None, observers=())),
     )  # fmt: skip
-    basis = SimpleNamespace(identified=SimpleNamespace(found=(None,), plants=(None,)))
-    verdict = SimpleNamespace(verified=("",), margins=({},), at_least=({},))
+    identified = SimpleNamespace(found=(None,), plants=(None,))
     left = recorded(np.array([final]), kept=np.array([is_kept]))
-    (axis,) = collect(bench, basis, left, verdict, Path("before.toml"), False).axes
+    (axis,) = collect(bench, identified, left, Path("before.toml"), False).axes
     assert [(c.old, c.new, c.reason, c.outcome) for c in axis.corrections] == [
         (old, new, OVERSHOT, outcome) for (old, new), outcome in zip(steps, outcomes, strict=True)
     ]

@@ -26,7 +26,7 @@ from drive_env.commands.cli import app as drive_env
 from drive_env.devices import find_device
 from drive_env.whole_file import files_to_be, write_whole
 from tuning.auto import one_button as auto_module
-from tuning.auto.stages import TriedGains
+from tuning.auto.stages import RecordedGains
 from tuning.commands.cli import app as drive_tune
 from tuning.runs import provenance
 from tuning.search import trials_files
@@ -54,7 +54,7 @@ def gains(machine):
 def quick(monkeypatch):
     """Have auto, and a trained tuner, find gains at once."""
     skip_stages(monkeypatch.setattr, NEW)
-    monkeypatch.setattr(tuning_run, "make_trials", lambda bench, basis, policy, show: TriedGains.only(NEW.copy()))
+    monkeypatch.setattr(tuning_run, "make_trials", lambda bench, basis, policy, show: RecordedGains.only(NEW.copy()))
 
 
 def tune(program, bus, out):

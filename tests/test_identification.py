@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from test_parity import served
+from test_suite import open_machines
 
 from drive_env import cia402, motion
 from drive_env.devices import find_device
@@ -23,7 +24,7 @@ from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import write_gains
 from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
-from tuning.compare.suite import load_suite, open_group, open_machines
+from tuning.compare.suite import load_suite, open_group
 from tuning.identify.estimate import NAMES, refused
 from tuning.identify.experiments import current_bandwidth
 from tuning.identify.identification import identify

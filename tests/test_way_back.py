@@ -75,7 +75,7 @@ def pressed(*arguments):
 )
 def test_ctrl_c_at_any_stage_ends_with_what_the_drives_have(monkeypatch, tmp_path, program, stage, words):
     skip_stages(monkeypatch.setattr, NEW)
-    monkeypatch.setattr(tuning_run, "make_trials", lambda bench, basis, *more: auto_module.TriedGains.only(NEW.copy()))
+    monkeypatch.setattr(tuning_run, "make_trials", lambda *given: auto_module.RecordedGains.only(NEW.copy()))
     owner, _, name = stage.rpartition(".")
     monkeypatch.setattr(getattr(auto_module, owner) if owner else auto_module, name, pressed)
     app = drive_tune if program == "auto" else drive_agent

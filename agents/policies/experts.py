@@ -1,6 +1,6 @@
 """Experts of the suite's tasks: what a motion engineer would program, given the machine as an identification tells it.
 
-An expert is told the parameters of each machine when its episode begins (`told`); where none are known, on a bus, it
+An expert knows the parameters of each machine when its episode begins (`told`); where none are known, on a bus, it
 takes the nominal ones. What it must cope with all the same: delays of the bus, flexibility, sensors.
 """
 

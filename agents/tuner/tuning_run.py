@@ -17,7 +17,7 @@ from drive_env.loops.dynamics import DEFAULT
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.auto.result import Result
-    from tuning.auto.stages import Basis, TriedGains
+    from tuning.auto.stages import Basis, RecordedGains
     from tuning.certificate.certificate import Certificate
     from tuning.target import Target
 
@@ -64,7 +64,7 @@ def run(
             a file that cannot be written.
     """
     from tuning.auto.certify import certificate
-    from tuning.auto.one_button import prove_found
+    from tuning.auto.one_button import auto
 
     trials: list[TrialShown] = []
 
@@ -72,7 +72,7 @@ def run(
         trials.append(trial)
         show(trial)
 
-    def find(bench: AutoBench, basis: Basis, _: Any) -> TriedGains:
+    def find(bench: AutoBench, basis: Basis, _: Any) -> RecordedGains:
         for doubt in doubts:
             bench.reserve(bench.going, doubt)
         say("trials")
@@ -89,25 +89,25 @@ def run(
         return files(certificates[0])
 
     asked = policy.bundle.configuration.get("dynamics", DEFAULT)
-    result = prove_found(
-        target, file, find, dynamics=asked, keep=keep, progress=told, budget=math.inf, files=written
+    result = auto(
+        target, file, find=find, dynamics=asked, keep=keep, progress=told, budget=math.inf, files=written
     )  # fmt: skip
     return TunerRun(result, certificates[0], tuple(trials))
 
 
-def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> TriedGains:
+def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> RecordedGains:
     """Make the policy's trials; return its answer, and set where moves start."""
     from dataclasses import replace
 
     from agents.tuner.kept_margins import KeptMargins
     from drive_env.safety.envelope import SafetyError, swinging_allowed
-    from tuning.auto.stages import TriedGains
+    from tuning.auto.stages import RecordedGains
     from tuning.auto.trying import BY_TRIAL, proving_ground, watch_following
 
     target, going = bench.target, bench.going
     if not going.all():
         bench.stop(going, "another axis was rejected, and an agent tunes all of them or none")
-        return TriedGains.only(basis.before)
+        return RecordedGains.only(basis.before)
     low, high = bench.room()
     try:
         # The trials stop by themselves what oscillates, within 50 ms, and go on.
@@ -118,13 +118,13 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
             )  # fmt: skip
     except SafetyError as error:
         bench.stop(going, f"the envelope stopped the trials: {error}")
-        return TriedGains.only(basis.before)
-    lanes, tried = target.axes_per_machine, TriedGains.only(tuned.gains)
+        return RecordedGains.only(basis.before)
+    lanes, tried = target.axes_per_machine, RecordedGains.only(tuned.gains)
     ground = proving_ground(bench, basis)
     ground.aborts += np.repeat(np.sum([trial.aborted for trial in tuned.trials], axis=0), lanes)
     ground.moves += tuned.moves
     watch_following(bench, going)
-    proof, verified = tried.proof, list(tried.verified)
+    proof, verified = tried.proof.copy(), tried.verified.copy()
     for machine in range(target.num_axes // lanes):
         own = slice(machine * lanes, (machine + 1) * lanes)
         answer = tuned.trials[int(tuned.answers[machine])]
@@ -138,11 +138,11 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
             for journal in bench.journals[own]:
                 journal.note(f"{lowered} of the agent's {len(tuned.trials) - 1} proposals broke {bench.dynamics.name} "
                              "dynamics by the identified plant, and lower gains were tried")  # fmt: skip
-        proof[own], verified[own] = float(answer.measured[machine]), [BY_TRIAL] * lanes
+        proof[own], verified[own] = float(answer.measured[machine]), BY_TRIAL
         if tuned.overruled[machine]:
             for journal in bench.journals[own]:
                 journal.note(
                     "the agent's own choice was stopped in its trial, or breaks the dynamics by the identified plant; "
                     "the best trial that was not and does not is kept"
                 )
-    return replace(tried, proof=proof, verified=tuple(verified))
+    return replace(tried, proof=proof, verified=verified)

@@ -257,7 +257,7 @@ class Tracking(VectorEnvironment):
     | 8a + 1 | reference velocity - velocity actual value (606Ch) | speed | -4 | 4 |
     | 8a + 2 | position actual value, from the episode's start | amplitude | -4 | 4 |
     | 8a + 3 | velocity actual value | speed | -4 | 4 |
-    | 8a + 4 | torque actual value (6077h) | current limit (2003h) | -2 | 2 |
+    | 8a + 4 | torque actual value (6077h) | current limit (2003h) | -4 | 4 |
     | 8a + 5 | reference velocity | speed | -2 | 2 |
     | 8a + 6 | reference velocity 10 ms later | speed | -2 | 2 |
     | 8a + 7 | last action | 1 | -1 | 1 |

@@ -45,10 +45,7 @@ Mask = NDArray[np.bool_]
 
 PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial
-HEAVIER = 1.3  # inertia that a last phase stands for, where one is asked for, over that of the machine
-PHASE_TITLES = (  # as messages name them
-    "move", "reversal", f"move with {PROBE:g} times velocity P", f"move with velocity P over {HEAVIER:g}"
-)  # fmt: skip
+PHASE_TITLES = "move", "reversal", f"move with {PROBE:g} times velocity P"  # as messages name them
 
 # The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
 RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]
@@ -71,8 +68,6 @@ class Identified(NamedTuple):
 class Trial(NamedTuple):
     """What a trial showed; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
 
-    The phases are those of `PHASES`, and where it was asked for one as with a heavier load.
-
     following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
     error: demand less actual of the move over its size, shape (TRIAL, num_axes).
     culprit: Axes that oscillated or went into fault themselves when their machine was stopped, (num_axes,): others of
@@ -91,8 +86,7 @@ class Trial(NamedTuple):
         Args:
             softness: `softness` of the trial's gains over that of the rule's, (num_axes,), for E_d/E_0.
         """
-        # A heavier load leaves the integrators as they are.
-        disturbance = np.stack([softness, softness, softness / PROBE, softness][: len(self.aborted)])
+        disturbance = np.stack([softness, softness, softness / PROBE])
         return cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
 
 
@@ -174,7 +168,6 @@ class Trials(Saved):
         origin: Integers,
         direction: Integers,
         where: Mask,
-        heavier: bool = False,
     ) -> Trial:
         """Try gains, raw integers of shape (num_axes, count), in a move from the origin [inc], back, and there again.
 
@@ -188,20 +181,17 @@ class Trials(Saved):
             origin: Where the axes are [inc].
             direction: 1 to move as planned, -1 the other way, shape (num_axes,).
             where: Axes that take part; the others' figures mean nothing.
-            heavier: Whether a last phase back to the origin shows what a heavier load would make of the gains: its
-                loop gain is that of a lower velocity P.
         """
         drives = self._drives
         away = origin + direction * move.distance
         count = drives.num_axes
-        shape = (len(PHASES) + heavier, count)
+        shape = (len(PHASES), count)
         aborted = np.zeros(shape, bool)
         stopped, culprit = np.zeros((2, count), bool)
         settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
         first_error = np.zeros((TRIAL, count))
         write_profile(drives, move, where)
-        probe, weaker = (device_of(drives).gains.with_velocity_p(gains, factor) for factor in (PROBE, 1.0 / HEAVIER))
-        phases = ((away, gains), (origin, gains), (away, probe), (origin, weaker))[: shape[0]]
+        phases = ((away, gains), (origin, gains), (away, device_of(drives).gains.with_velocity_p(gains, PROBE)))
         for phase, (target, tried) in enumerate(phases):
             write_gains(drives, np.where(stopped[:, None], incumbent, tried), where)
             position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)

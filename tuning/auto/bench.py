@@ -10,23 +10,19 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.gains import read_gains
-from drive_env.trials.positioning import longer_way, wrapped
+from drive_env.trials.positioning import wrapped
 from tuning.certificate.certificate import TAKEN, Correction
 from tuning.identify.wiring import Key, write_wiring
 from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.proving import ProvingGround
     from tuning.target import DriveTime, Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
 # record; and one from where a response has ended.
@@ -81,11 +77,13 @@ class AutoBench:
         journals: The remarks about each axis.
         before: Raw gains of the drives before the run, (num_axes, count).
         modes: 6060h as the drives came, (num_axes,).
-        ground: Where gains are tried, None before.
+        ground: Where gains are tried; there is none before.
         response_time: Drive time of a frequency response of all axes of a machine [s].
         spent: Of each axis, what passed while it took part [s]: axes that are through wait for others at no cost of
             their own.
     """
+
+    ground: ProvingGround
 
     def __init__(self, target: Target, clock: DriveTime, budget: float, dynamics: Dynamics) -> None:
         drives = target.drives
@@ -94,7 +92,6 @@ class AutoBench:
         self.journals = tuple(Journal() for _ in range(target.num_axes))
         self.before: Integers = read_gains(drives)
         self.modes: Integers = drives.read(cia402.MODE)
-        self.ground: ProvingGround | None = None
         # Axes of one machine are shaken one after the other.
         self.response_time = RESPONSE_TIME * target.axes_per_machine
         self.spent: Floats = np.zeros(target.num_axes)
@@ -133,11 +130,6 @@ class AutoBench:
         here = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - self._origin) / target.increments()
         return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
 
-    def reach(self) -> Floats:
-        """Return how far the rotors may turn the longer way, with the sign [rad], (num_axes,)."""
-        low, high = self.room()
-        return longer_way(low, high)
-
     def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
         """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""
         self.target, self._origin = write_wiring(self.target, self._origin, values)
@@ -161,6 +153,17 @@ class AutoBench:
         faulted = self.going & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         causes = stop_causes(drives)
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
+
+    def recover(self, where: Mask) -> None:
+        """Reset faults of axes, and hold them with gains known to be stable."""
+        with self.spending(self.target.together(where)):
+            self.ground.recover(where)
+
+    def recover_faults(self, faults: Mapping[int, str], meanwhile: str) -> None:
+        """Reset faults of axes; one that stays in its fault is taken out of the run, with the reason."""
+        if faults:
+            self.recover(np.isin(np.arange(self.target.num_axes), list(faults)))
+            self.drop_faults(f"{meanwhile}, and the fault cannot be reset")
 
     def drop_faults(self, meanwhile: str) -> None:
         """Take axes that went into fault out of the run, with the reason."""

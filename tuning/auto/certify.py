@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from tuning.auto.load_step import NOISE, SWING
 from tuning.auto.loop_margins import OVERSHOOT_ERROR, AskedMargin, asked_margins
+from tuning.auto.measured_margins import LOOPS
 from tuning.auto.proving import STEP_SIZE
 from tuning.certificate.certificate import (
     CROSSOVERS,
@@ -35,13 +35,11 @@ from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Floats
     from tuning.auto.proving import Shown
     from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
-
-LOOPS = ("velocity", "position")
 # Of a loop whose margins are not known: its lines are shown as what they are.
 UNKNOWN = Margins(*(np.nan,) * len(Margins._fields))
 MODEL_LOW, MODEL_HIGH, MODEL_POINTS = 2.0, 1000.0, 200  # frequencies of a loop that is a model's alone [Hz]
@@ -170,47 +168,36 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
 
 def _responses(target: Target, result: Result, axis: int, outcome: AxisResult) -> tuple[FrequencyResponse, ...]:
     """Return both outer loops: measured with the new gains, or by the model, and computed with the gains before."""
-    response = result.response
-    if response is None or not np.isfinite(response.open_loop[:, axis]).any():
-        return _modelled(target, outcome)
-    loops = response.loops(outcome.after, axis, plant=outcome.plant, refined=False)
-    changed = not np.array_equal(response.gains[axis], outcome.after)
-    sources = {
-        "velocity": "multisine, 1 kHz samples"
-        + (", with other gains, converted to the new gains by the linear model" if changed else ""),
-        "position": "computed from the measured velocity loop and position P",
-    }
-    shown = []
-    for name, L in (("velocity", loops.velocity), ("position", loops.position)):
-        if name == "position" and name not in outcome.margins and name not in outcome.at_least:
-            continue  # too few coherent lines, or one of linked axes
-        shown += [
-            *_before(target, outcome, name, response.f),
-            frequency_response(
-                f"{name} loop",
-                response.f,
-                L,
-                outcome.margins.get(name, UNKNOWN),
-                at_least=outcome.at_least.get(name),
-                tuned=True,
-                coherence=response.coherence[:, axis],
-                source=sources[name],
-            ),
-        ]
-    return tuple(shown)
-
-
-def _modelled(target: Target, outcome: AxisResult) -> tuple[FrequencyResponse, ...]:
-    """Return both outer loops by the linear model where nothing was measured; their margins are bounds."""
-    f, shown = np.geomspace(MODEL_LOW, MODEL_HIGH, MODEL_POINTS), []
-    for name, least in outcome.at_least.items():
-        assert outcome.plant is not None, "what has a bound has a model"
-        L = OPEN_LOOPS[name](target.device, outcome.plant, outcome.after, f)
+    response, coherence, plant = result.response, None, outcome.plant
+    names = [name for name in LOOPS if name in outcome.margins or name in outcome.at_least]
+    if response is not None and np.isfinite(response.open_loop[:, axis]).any():
+        # Of the position loop there may be too few coherent lines, and of linked axes it is another.
+        names = ["velocity", *(name for name in names if name != "velocity")]
+        f, coherence = response.f, response.coherence[:, axis]
+        measured = response.loops(outcome.after, axis, plant=plant, refined=False)
+        loops = {name: getattr(measured, name) for name in names}
+        changed = not np.array_equal(response.gains[axis], outcome.after)
+        sources = {
+            "velocity": "multisine, 1 kHz samples"
+            + (", with other gains, converted to the new gains by the linear model" if changed else ""),
+            "position": "computed from the measured velocity loop and position P",
+        }
+    else:  # their margins are bounds
+        names = [name for name in names if name in outcome.at_least and plant is not None]
+        f = np.geomspace(MODEL_LOW, MODEL_HIGH, MODEL_POINTS)
+        loops = {name: OPEN_LOOPS[name](target.device, plant, outcome.after, f) for name in names if plant is not None}
         source = "linear model of the identified axis, not measured; margins are bounds within its 95 % intervals"
-        shown += [
-            *_before(target, outcome, name, f),
-            frequency_response(f"{name} loop", f, L, UNKNOWN, at_least=least, tuned=True, source=source),
-        ]
+        sources = dict.fromkeys(names, source)
+    shown: list[FrequencyResponse] = []
+    for name in names:
+        found, least = outcome.margins.get(name, UNKNOWN), outcome.at_least.get(name)
+        shown += _before(target, outcome, name, f)
+        shown.append(
+            frequency_response(
+                f"{name} loop", f, loops[name], found, at_least=least, tuned=True, coherence=coherence,
+                source=sources[name],
+            )
+        )  # fmt: skip
     return tuple(shown)
 
 

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.dictionary.roles import Role
-from drive_env.loops.linear_model import OPEN_LOOPS
+from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from drive_env.devices import Device
-    from drive_env.loops.linear_model import Plant
     from tuning.identify.estimate import Identification
     from tuning.target import Target
 
@@ -38,6 +37,16 @@ def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
                 "degrees are needed"
             )
     return ""
+
+
+def identified_plant(target: Target, axis: int, identified: Identification) -> tuple[Plant | None, str]:
+    """Return the model of an axis; None, and why, where its wiring is wrong or too little was identified."""
+    if wrong := wrong_wiring(target, identified):
+        return None, wrong
+    try:
+        return Plant.from_identification(target.device, target.motor, float(target.supply[axis]), identified), ""
+    except ValueError as error:
+        return None, str(error)
 
 
 def wrong_wiring(target: Target, identified: Identification) -> str:

@@ -2,114 +2,39 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
-from tuning.auto.design import Judge, design
+from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, measure, measured_axis
-from tuning.auto.loop_model import fitted_plant, loop_models
 from tuning.auto.moves import load, show, step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.stages import RecordedGains
-from tuning.auto.twin import WORLDS, Known, Twins, known_of
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
-    from tuning.auto.stages import Basis, TriedGains
+    from tuning.auto.stages import Basis
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
-SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
 # Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
 # lowered to where an axis does not rest; position P likewise where a step overshoots.
 CALMER, LEAST_CALMER = 0.9, 0.5
-STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
 # Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
-
-
-def design_axes(
-    bench: AutoBench,
-    basis: Basis,
-    where: Mask,
-    say: Callable[[float], None] = lambda share: None,
-    recorded: RecordedGains | None = None,
-    dynamics: Dynamics | None = None,
-    most: Floats | None = None,
-) -> tuple[Integers, Floats, Floats]:
-    """Return the best gains of axes by their twins, (num_axes, count), and the robust cost of these and of the present.
-
-    Args:
-        bench: The drives.
-        basis: What was identified.
-        where: Axes, (num_axes,); the others have gains of 1.
-        say: Called with the share done.
-        recorded: The present gains, and what was measured with them; nothing by default.
-        dynamics: What the loops must keep; those of the run by default.
-        most: The greatest velocity P with which an axis may rest, raw, (num_axes,); infinite by default.
-    """
-    target, axes = bench.target, np.flatnonzero(where).tolist()
-    gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
-    if not axes:
-        return gains, cost, present
-    most = np.full(target.num_axes, np.inf) if most is None else most
-    known = [_known(bench, basis, recorded, k, restless=bool(np.isfinite(most[k]))) for k in axes]
-    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
-    # The response of a linked axis was measured without the other one; what both say is in their model.
-    measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
-    models = [
-        (model, np.searchsorted(axes, of))
-        for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
-    ]
-    most = np.full(target.num_axes, np.inf) if most is None else most
-
-    def judge(**more: Any) -> Judge:
-        twins = Twins(target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics, **more)
-        return Judge(twins, models, measured)
-
-    with judge(worlds=WORLDS[:1]) as coarse, judge(repeats=RUNS) as fine:
-        found = design(coarse, fine, [one.plant for one in known], say, most[axes])
-        if recorded is not None:
-            present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
-    gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
-    return gains, cost, present
-
-
-def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
-    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
-
-    What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
-    """
-    plant, found = basis.identified.known(k)
-    reach = float(basis.trial_reach(bench)[k])
-    if bench.target.linked:
-        # The ends of one part move it together, each its share, and then nothing twists.
-        rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
-        return known_of(rigid, found, reach)
-    plant, found = fitted_plant(basis.identified, recorded, k)
-    known = known_of(plant, found, reach)
-    still = STILL_FRICTION if restless else 1.0
-    return known._replace(friction=known.friction._replace(coulomb=still * known.friction.coulomb))
 
 
 def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:
@@ -121,21 +46,21 @@ def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> 
 
 
 def correct(
-    bench: AutoBench, basis: Basis, tried: TriedGains, target: Target, say: Callable[[str, float], None]
+    bench: AutoBench, basis: Basis, tried: RecordedGains, target: Target, say: Callable[[str, float], None]
 ) -> RecordedGains:
     """Verify gains by a move, a frequency response and a load step, and correct the design by what these show.
 
     Args:
         bench: The drives.
         basis: What was identified.
-        tried: The gains.
+        tried: The gains, and what their trials showed.
         target: The drives, whose time is not counted.
         say: Called with the present step and the share done.
 
     Returns:
         The best of what was verified; an axis whose gains cannot stay is out of the run.
     """
-    recorded, changed = RecordedGains.of(tried), bench.going
+    recorded, changed = tried, bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
     column = cascade_columns(bench.target.device)[2]
@@ -161,7 +86,8 @@ def correct(
         for k in map(int, np.flatnonzero(bench.going)):
             if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
                 gains[k] = recorded.gains[k]
-        changed = bench.whole_machines((gains != recorded.gains).any(axis=1) | _others(bench, gains, recorded))
+        # All axes of machines some of whose axes get other gains.
+        changed = bench.going & ~bench.whole_machines((gains == recorded.gains).all(axis=1))
         changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
         if not changed.any():
             break
@@ -176,20 +102,13 @@ def correct(
     return final
 
 
-def _others(bench: AutoBench, gains: Integers, recorded: RecordedGains) -> Mask:
-    """Return all axes of machines some of whose axes get other gains, (num_axes,)."""
-    per_machine = bench.target.axes_per_machine
-    differs = (gains != recorded.gains).any(axis=1).reshape(-1, per_machine).any(axis=1)
-    return np.asarray(np.repeat(differs, per_machine)) & bench.going
-
-
 def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
     """Return the cost of verified gains by J and margins, of each machine its worst axis, (num_axes,)."""
-    failed = np.array([bool(why) for why in recorded.failed])
     # What was not measured is worth less than what is known to keep the dynamics.
     slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
     slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot, 1.0) / bench.dynamics.overshoot)
-    cost = np.where(failed, 2.0 * TRIP + recorded.swing, robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack))
+    cost = robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack)
+    cost = np.where(recorded.failed != "", 2.0 * TRIP + recorded.swing, cost)
     per_machine = bench.target.axes_per_machine
     return np.asarray(np.repeat(cost.reshape(-1, per_machine).max(axis=1), per_machine))
 
@@ -206,7 +125,7 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
     # Of what failed its move no loop was looked at yet; what was looked at and not seen asks for more margin.
-    looked_at = bench.going & np.array([not text for text in recorded.failed])
+    looked_at = bench.going & (recorded.failed == "")
     blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
@@ -230,7 +149,7 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
 def _short(bench: AutoBench, recorded: RecordedGains, k: int) -> str:
     """Return which requirement the gains of an axis miss; "" if they meet all."""
     if recorded.failed[k]:
-        return recorded.failed[k]
+        return str(recorded.failed[k])
     if recorded.slack[k] < 0.0:
         return f"its measured loops keep {100.0 * (1.0 + max(recorded.slack[k], -1.0)):.0f} % of the margins asked for"
     if recorded.overshoot[k] > bench.dynamics.overshoot:
@@ -257,7 +176,6 @@ def _try(
     bench: AutoBench, recorded: RecordedGains, gains: Integers, where: Mask, why: Sequence[str]
 ) -> tuple[RecordedGains, Mask]:
     """Try corrected gains; return what is known with those that passed, and which axes have them."""
-    assert bench.ground is not None, "trying makes it"
     try:
         with bench.spending(bench.target.together(where)):
             proof = bench.ground.run(gains, where)
@@ -272,9 +190,8 @@ def _try(
         reason = why[k] or "as its other axes were"
         bench.journals[k].note(f"gains designed again from what was measured: {reason}")
         bench.journals[k].correct(recorded.gains[k], gains[k], reason)
-    unknown = np.full(len(where), np.nan)
     fresh = replace(
-        recorded, gains=gains, proof=proof.cost, cost=unknown, failed=("",) * len(where), swing=np.zeros(len(where)),
-        slack=unknown, overshoot=unknown,
+        RecordedGains.only(gains), proof=proof.cost, verified=recorded.verified, unseen=recorded.unseen,
+        loaded=recorded.loaded,
     )  # fmt: skip
     return recorded.mixed(fresh, passed), passed

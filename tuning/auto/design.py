@@ -8,26 +8,32 @@ emulated machine, with friction, noise and counts; and what is best there is loo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_constants
 from drive_env.trials.score import robust_cost
-from tuning.auto.twin import least_gains
+from tuning.auto.loop_margins import measured_axis
+from tuning.auto.loop_model import fitted_plant, loop_models
+from tuning.auto.twin import WORLDS, Known, Twins, known_of, least_gains
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
+    from tuning.arrays import Floats, Integers, Mask
+    from tuning.auto.bench import AutoBench
     from tuning.auto.loop_model import LinkedAxis, LoopModel
     from tuning.auto.measured_margins import MeasuredAxis
-    from tuning.auto.twin import Twins
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+    from tuning.auto.stages import Basis, RecordedGains
 
 # The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
 # bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.
@@ -44,6 +50,67 @@ EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
 STEPS = (1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
+SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
+STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
+
+
+def design_axes(
+    bench: AutoBench,
+    basis: Basis,
+    where: Mask,
+    say: Callable[[float], None] = lambda share: None,
+    recorded: RecordedGains | None = None,
+    dynamics: Dynamics | None = None,
+    most: Floats | None = None,
+) -> tuple[Integers, Floats, Floats]:
+    """Return the best gains of axes by their twins, (num_axes, count), and the robust cost of these and of the present.
+
+    Args:
+        bench: The drives.
+        basis: What was identified.
+        where: Axes, (num_axes,); the others have gains of 1.
+        say: Called with the share done.
+        recorded: The present gains, and what was measured with them; nothing by default.
+        dynamics: What the loops must keep; those of the run by default.
+        most: The greatest velocity P with which an axis may rest, raw, (num_axes,); infinite by default.
+    """
+    target, axes = bench.target, np.flatnonzero(where).tolist()
+    gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
+    if not axes:
+        return gains, cost, present
+    known = [_known(bench, basis, recorded, k, restless=most is not None and bool(np.isfinite(most[k]))) for k in axes]
+    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
+    # The response of a linked axis was measured without the other one; what both say is in their model.
+    measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
+    models = [
+        (model, np.searchsorted(axes, of))
+        for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
+    ]
+
+    twins = partial(Twins, target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics)
+    with closing(twins(worlds=WORLDS[:1])) as one_world, closing(twins(repeats=RUNS)) as all_worlds:
+        coarse, fine = (Judge(one, models, measured) for one in (one_world, all_worlds))
+        found = design(coarse, fine, [one.plant for one in known], say, None if most is None else most[axes])
+        if recorded is not None:
+            present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
+    gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
+    return gains, cost, present
+
+
+def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
+    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
+
+    What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
+    """
+    plant, found = basis.identified.known(k)
+    reach = float(basis.trial_reach(bench)[k])
+    if bench.target.linked:
+        # The ends of one part move it together, each its share, and then nothing twists.
+        rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
+        return known_of(rigid, found, reach)
+    plant, found = fitted_plant(basis.identified, recorded, k)
+    known = known_of(plant, found, reach)
+    return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known
 
 
 class Judge(NamedTuple):
@@ -63,7 +130,10 @@ class Judge(NamedTuple):
 
     def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
         """Return how far they keep the constraints of the loops, relative; `nominal` of the axes as they are alone."""
-        slack = self._measured_slack(gains)
+        slack = np.full(gains.shape[:2], np.inf)
+        for k, one in enumerate(self.measured):
+            if one is not None:
+                slack[k] = one.slack(self.twins.dynamics, gains[k])
         for model, axes in self.models:
             of_machine = model.slack(self.twins.dynamics, np.moveaxis(gains[axes], 0, 1), nominal=nominal)
             slack[axes] = np.minimum(of_machine, slack[axes].min(axis=0))
@@ -80,23 +150,6 @@ class Judge(NamedTuple):
         for _, axes in self.models:
             whole[axes] = reduce(values[axes], axis=0)
         return whole
-
-    def _measured_slack(self, gains: Integers) -> Floats:
-        slack = np.full(gains.shape[:2], np.inf)
-        for k, one in enumerate(self.measured):
-            if one is not None:
-                slack[k] = one.slack(self.twins.dynamics, gains[k])
-        return slack
-
-    def close(self) -> None:
-        """Close the emulated machines."""
-        self.twins.close()
-
-    def __enter__(self) -> Judge:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class Designed(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary.entries import ObjectName
@@ -20,10 +20,7 @@ from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
 from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import WATCH
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from tuning.arrays import Floats, Integers, Mask
 
 WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good gains have had the second to calm it
 

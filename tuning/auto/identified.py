@@ -7,13 +7,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import bandwidth_gains, rule_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
-from tuning.auto.checks import unsafe_gains, wrong_wiring
+from tuning.arrays import Integers, Mask
+from tuning.auto.checks import identified_plant, unsafe_gains
 from tuning.auto.stages import Basis, IdentifiedAxes
 from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.identify.estimate import Identification
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Identify = Callable[[Target, NDArray[np.bool_]], "list[Identification]"]  # of the axes where the mask is true
+Identify = Callable[[Target, Mask], "list[Identification]"]  # of the axes where the mask is true
 
 # The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
@@ -34,32 +32,27 @@ CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
 def identify(bench: AutoBench, experiments: Identify) -> IdentifiedAxes:
     """Check the wiring and identify; take out axes that cannot be tuned."""
     target, going = bench.target, bench.going
-    found: list[Identification | None] = [None] * target.num_axes
-    plants: list[Plant | None] = [None] * target.num_axes
-    if not going.any():
-        return IdentifiedAxes(tuple(found), tuple(plants))
+    every: list[Identification] = []
     try:
-        with bench.spending(going), swinging_allowed(target.drives):
-            every = experiments(target, going)
+        if going.any():
+            with bench.spending(going), swinging_allowed(target.drives):
+                every = experiments(target, going)
     except (SafetyError, RuntimeError, TimeoutError) as error:
         if isinstance(error, BusError):
             raise
-        bench.stop(bench.going, f"identification was stopped: {error}")
-        return IdentifiedAxes(tuple(found), tuple(plants))
-    for k in map(int, np.flatnonzero(going)):
-        journal, found[k] = bench.journals[k], every[k]
-        journal.stop(wrong_wiring(target, every[k]))
-        if not journal.reason:
-            try:
-                plants[k] = Plant.from_identification(target.device, target.motor, float(target.supply[k]), every[k])
-            except ValueError as error:
-                journal.stop(str(error))
+        bench.stop(going, f"identification was stopped: {error}")
+    found: list[Identification | None] = [None] * target.num_axes
+    plants: list[Plant | None] = [None] * target.num_axes
+    for k in map(int, np.flatnonzero(going) if every else ()):
+        found[k] = every[k]
+        plants[k], why = identified_plant(target, k, every[k])
+        bench.journals[k].stop(why)
         unknown: dict[str, list[str]] = {}
         for name, estimate in every[k].estimates.items():
-            if estimate.reason and name not in ("inertia",):
+            if estimate.reason and name != "inertia":
                 unknown.setdefault(estimate.reason, []).append(TITLES[name])
         for reason, titles in unknown.items():
-            journal.note(f"{', '.join(titles)} not identified: {reason}")
+            bench.journals[k].note(f"{', '.join(titles)} not identified: {reason}")
     return IdentifiedAxes(tuple(found), tuple(plants))
 
 
@@ -67,14 +60,14 @@ def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
     """Return the reference gains, calm gains, and whether the gains before are safe."""
     target = bench.target
     reference = np.ones_like(bench.before)
-    calm, unsafe = reference.copy(), ["not checked"] * target.num_axes
+    calm, unsafe = reference.copy(), np.full(target.num_axes, "not checked", object)
     for axis in map(int, np.flatnonzero(bench.going)):
         (plant, found), before = identified.known(axis), bench.before[axis]
         inertia = found.together if math.isfinite(found.together) else plant.inertia
         reference[axis] = rule_gains(target.device, target.motor, inertia, supply=plant.supply)[0]
         unsafe[axis] = unsafe_gains(target.device, plant, before)
         calm[axis] = calm_gains(target, plant)
-    return Basis(identified, bench.before, reference, calm, tuple(unsafe))
+    return Basis(identified, bench.before, reference, calm, unsafe)
 
 
 def calm_gains(target: Target, plant: Plant) -> Integers:

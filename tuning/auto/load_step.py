@@ -10,7 +10,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import detrend
 
 from drive_env import cia402, motion
@@ -21,9 +20,8 @@ from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.certificate.certificate import StepResponse
 
 if TYPE_CHECKING:
+    from tuning.arrays import Mask
     from tuning.target import Target
-
-Mask = NDArray[np.bool_]
 
 NAME = "load step of 0.3 rated torque at standstill"
 SHARE = 0.3  # of the rated torque

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
@@ -19,7 +18,6 @@ from drive_env.safety.envelope import SafetyError
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.proving import STEP_SIZE
-from tuning.auto.stages import Verdict
 from tuning.auto.trying import BY_TRIAL, watch_following
 from tuning.response.measured_loop import GOOD_MISFIT, merged
 from tuning.response.model_bounds import at_least_by_model, why_unbounded
@@ -27,12 +25,10 @@ from tuning.response.model_bounds import at_least_by_model, why_unbounded
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.margins import Margins
+    from tuning.arrays import Integers, Mask
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MEASURED = 0.08  # relative: what a measured slack may be off
 # What a measured margin may be off, one standard deviation of repeated measurements at most.
@@ -50,7 +46,7 @@ FREE_WINDOW = 100  # turns of following error that trip a frequency response: it
 
 def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Measure the velocity loop's response of axes with their gains, and how far their loops keep the dynamics."""
-    going = where & bench.going & np.array([not why for why in recorded.failed])
+    going = where & bench.going & (recorded.failed == "")
     if bench.target.linked:
         return _with_slack(bench, basis, recorded, going)
     late = going & ~bench.affordable(bench.response_time)
@@ -83,11 +79,8 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         return _without_response(recorded, going, str(error))
     finally:
         watch_following(bench, going)
-    assert bench.ground is not None, "trying makes it"
     bench.ground.begin_here(going)
-    unseen = list(recorded.unseen)
-    whole = response if recorded.response is None else recorded.response.replaced(response, going)
-    recorded, faults = replace(recorded, response=whole), bench.faults()
+    unseen, faults = recorded.unseen.copy(), bench.faults()
     for k in map(int, np.flatnonzero(going)):
         seen = _seen(response, k)
         unseen[k] = ""
@@ -96,12 +89,9 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         elif seen < LEAST_LINES:
             why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
             unseen[k] = "; ".join([why, *response.notes[k]])
-    recorded = _with_slack(bench, basis, replace(recorded, unseen=tuple(unseen)), going)
-    faulted = np.isin(np.arange(bench.target.num_axes), list(faults))
-    if faulted.any():
-        with bench.spending(bench.target.together(faulted)):
-            bench.ground.recover(faulted)
-        bench.drop_faults("its frequency response was measured, and the fault cannot be reset")
+    response = response if recorded.response is None else recorded.response.replaced(response, going)
+    recorded = _with_slack(bench, basis, replace(recorded, response=response, unseen=unseen), going)
+    bench.recover_faults(faults, "its frequency response was measured")
     return recorded
 
 
@@ -152,49 +142,48 @@ def _seen(response: MeasuredLoop, k: int) -> int:
 
 
 def _without_response(recorded: RecordedGains, where: Mask, why: str) -> RecordedGains:
-    unseen = tuple(why if late else told for late, told in zip(where, recorded.unseen, strict=True))
+    unseen = np.where(where, why, recorded.unseen)
     return replace(recorded, unseen=unseen, slack=np.where(where, np.nan, recorded.slack))
 
 
-def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Verdict:
-    """Return what the final gains are worth: their margins as measured, or a lower bound."""
-    response, n = recorded.response, bench.target.num_axes
-    margins: list[dict[str, Margins]] = [{} for _ in range(n)]
+def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
+    """Return what the final gains are worth, too: their margins as measured, or a lower bound."""
     for model, axes in loop_models(bench.target, basis.identified, recorded, bench.going, bench.dynamics):
         for k in map(int, axes):
             known = measured_axis(bench, basis, recorded, k) is not None
             _tell_variants(bench, bench.journals[k], model, recorded.gains[axes], known)
-    at_least: list[dict[str, AtLeast]] = [{} for _ in range(n)]
-    verified = list(recorded.verified)
+    margins: dict[int, Mapping[str, Margins]] = {}
+    at_least: dict[int, Mapping[str, AtLeast]] = {}
+    verified = recorded.verified.copy()
     for k in map(int, np.flatnonzero(bench.going)):
-        journal, gains = bench.journals[k], recorded.gains[k]
+        journal, response = bench.journals[k], recorded.response
         tell_overshoot(bench, journal, float(recorded.overshoot[k]))
         measured = measured_axis(bench, basis, recorded, k)
         if measured is None:
             why = recorded.unseen[k] or (NO_PART if bench.target.linked else "no response was measured")
             journal.reserve(f"margins not measured: {why}; the gains were verified {BY_TRIAL} instead")
-            at_least[k], bounds = _by_model(bench, basis, k, gains, LOOPS)
+            at_least[k], bounds = _by_model(bench, basis, k, recorded.gains[k], LOOPS)
             journal.reserve(bounds)
             continue
-        margins[k] = measured.margins(gains)
+        margins[k] = found = measured.margins(recorded.gains[k])
         how = "by"
         if response is None:
             journal.note(BOTH)
         else:
-            at_least[k] = _told_bounds(bench, basis, journal, k, gains, response, margins[k])
+            at_least[k] = _told_bounds(bench, basis, k, recorded.gains[k], response, found)
             for note in [note for note in response.notes[k] if note not in journal.notes]:
                 journal.note(note)
-            if not np.array_equal(gains, response.gains[k]):
+            if not np.array_equal(recorded.gains[k], response.gains[k]):
                 how = "by margins computed for these gains from"
-        for text in short_of(bench.dynamics, margins[k]):
+        for text in short_of(bench.dynamics, found):
             journal.reserve(text)
-        if (beyond := short_of(find_dynamics("stiff"), margins[k])) and not recorded.kept[k]:
+        if (beyond := short_of(find_dynamics("stiff"), found)) and not recorded.kept[k]:
             journal.stop(f"its loops are too near to instability: {'; '.join(beyond)}")
         verified[k] = (
             f"{verified[k] or BY_TRIAL}; and {how} the measured frequency response of the velocity loop: "
-            + ", ".join(f"{loop} loop Ms {one.ms:.1f}" for loop, one in margins[k].items())
+            + ", ".join(f"{loop} loop Ms {one.ms:.1f}" for loop, one in found.items())
         )
-    return Verdict(tuple(margins), tuple(at_least), tuple(verified))
+    return replace(recorded, margins=margins, at_least=at_least, verified=verified)
 
 
 def _tell_variants(bench: AutoBench, journal: Journal, model: LoopModel, gains: Integers, was_measured: bool) -> None:
@@ -209,15 +198,18 @@ def _tell_variants(bench: AutoBench, journal: Journal, model: LoopModel, gains: 
 
 
 def _told_bounds(
-    bench: AutoBench, basis: Basis, journal: Journal, k: int, gains: Integers, response: MeasuredLoop,
-    found: Mapping[str, Margins],
-) -> dict[str, AtLeast]:  # fmt: skip
+    bench: AutoBench, basis: Basis, k: int, gains: Integers, response: MeasuredLoop, found: Mapping[str, Margins]
+) -> dict[str, AtLeast]:
     """Return lower bounds of an axis's margins; tell of those that stand for one that was not measured."""
-    least = {loop: response.at_least(loop, gains, k) for loop in LOOPS}
-    blank = [loop for loop in LOOPS if _is_blank(found[loop], least[loop])]
-    for loop in LOOPS:
-        if loop not in blank:
-            tell_bounds(journal, bench.dynamics, loop, found[loop], least[loop])
+    journal, least, blank = bench.journals[k], {loop: response.at_least(loop, gains, k) for loop in LOOPS}, []
+    for loop, one in least.items():
+        # A margin that was not measured, and of which the response has no bound.
+        if any(
+            math.isnan(getattr(one, name)) and not math.isfinite(getattr(found[loop], name)) for name in one._fields
+        ):
+            blank.append(loop)
+        else:
+            tell_bounds(journal, bench.dynamics, loop, found[loop], one)
     if blank:
         more, bounds = _by_model(bench, basis, k, gains, blank)
         least |= more
@@ -279,12 +271,6 @@ def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
     return texts
 
 
-def _is_blank(found: Margins, least: AtLeast) -> bool:
-    """Return whether a margin was not measured, and the response has no bound for it."""
-    pairs = ((found.phase_deg, least.phase_deg), (found.gain_db, least.gain_db))
-    return any(math.isnan(bound) and not math.isfinite(value) for value, bound in pairs)
-
-
 def _by_model(
     bench: AutoBench, basis: Basis, k: int, gains: Integers, loops: Sequence[str]
 ) -> tuple[dict[str, AtLeast], str]:
@@ -312,13 +298,11 @@ def _in_words(least: AtLeast) -> str:
 
 def tell_bounds(journal: Journal, dynamics: Dynamics, loop: str, found: Margins, least: AtLeast) -> None:
     """Add notes, or reservations if they are small, of the lower bounds of margins that were not measured."""
-    for name, value, bound, unit, asked in (
-        ("phase", found.phase_deg, least.phase_deg, "degrees", dynamics.phase_deg),
-        ("gain", found.gain_db, least.gain_db, "dB", dynamics.gain_db),
-    ):
-        if not math.isfinite(value) and math.isfinite(bound):
-            tell = journal.reserve if bound < asked else journal.note
+    for asked in asked_margins(dynamics):
+        bound = getattr(least, asked.field, math.nan)
+        if not math.isfinite(getattr(found, asked.field)) and math.isfinite(bound):
+            tell = journal.reserve if bound < asked.limit else journal.note
             tell(
-                f"the {loop} loop's {name} margin was not measured; it is at least {bound:.0f} {unit} by the model "
-                "fitted to the response, with its 95 % intervals"
+                f"the {loop} loop's {asked.name} was not measured; it is at least {bound:.0f} {asked.unit} by the "
+                "model fitted to the response, with its 95 % intervals"
             )

@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.dynamics import INERTIA_RANGE, loop_clearance
 from drive_env.loops.margins import margins
@@ -30,13 +29,10 @@ if TYPE_CHECKING:
     from drive_env.loops.margins import Margins
     from drive_env.loops.sampled import OuterLoops
     from drive_env.motors import Motor
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.identify.estimate import Identification
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 AT_ONCE = 512  # machines that are computed at once
 TWIST = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of two inertias on one spring
@@ -145,8 +141,9 @@ class LoopModel:
         """
         count = 1 if nominal else len(self._velocity_p)
         size = max(AT_ONCE // count, 1)
-        parts = [self._slack(dynamics, gains[k : k + size], count) for k in range(0, len(gains), size)]
-        return np.concatenate(parts)
+        parts = [self._clearance(dynamics, gains[k : k + size], count) for k in range(0, len(gains), size)]
+        clearance, overshoot = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
 
     def kept(self, dynamics: Dynamics, gains: Integers) -> dict[str, float]:
         """Return how much of the dynamics the machine keeps as it may become, by the name of what is different.
@@ -158,10 +155,6 @@ class LoopModel:
         clearance, _ = self._clearance(dynamics, gains[None], len(self._variants))
         rows = zip(self._variants[1:], clearance[0, 1:].tolist(), strict=True)
         return {variant.name: max(kept, 0.0) for variant, kept in rows}
-
-    def _slack(self, dynamics: Dynamics, gains: Integers, count: int) -> Floats:
-        clearance, overshoot = self._clearance(dynamics, gains, count)
-        return dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
 
     def _clearance(self, dynamics: Dynamics, gains: Integers, count: int) -> tuple[Floats, Floats]:
         """Return the clearance of the first variants, (sets, count), and the overshoot of a csp step, (sets,)."""

@@ -6,7 +6,6 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.dynamics import OFF_NOMINAL
 from drive_env.loops.linear_model import controllers, velocity_filter_response, velocity_plant
@@ -17,11 +16,8 @@ from tuning.response.measured_loop import GOOD_MISFIT
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
+    from tuning.arrays import Complex, Floats, Integers
     from tuning.response.measured_loop import MeasuredLoop
-
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Integers = NDArray[np.int64]
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once
 LOOPS = "velocity", "position"  # that are judged

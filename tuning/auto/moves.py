@@ -6,22 +6,20 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
+from tuning.auto.bench import LOOK_BACK_TIME
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.loop_margins import measured_axis
 from tuning.auto.loop_model import loop_models
 from tuning.auto.proving import RESTLESS, without_noise
 
 if TYPE_CHECKING:
+    from tuning.arrays import Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STEP_TIME = 0.6  # s of drive time for a step of the set-point
 CALMING = 0.5  # s after a load step that did not end, with gains that hold
@@ -33,17 +31,14 @@ def show(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGain
     going = bench.target.together(where & bench.going)
     if not going.any():
         return recorded
-    assert bench.ground is not None, "trying makes it"
-    failed = list(recorded.failed)
+    failed = recorded.failed.copy()
     try:
         with bench.spending(going):
             shown = bench.ground.show(recorded.gains, going)
     except SafetyError as error:
-        with bench.spending(going):
-            bench.ground.recover(going)
-        for k in map(int, np.flatnonzero(going)):
-            failed[k] = f"the envelope stopped the move with the new gains: {error}"
-        return replace(recorded, failed=tuple(failed))
+        bench.recover(going)
+        failed[going] = f"the envelope stopped the move with the new gains: {error}"
+        return replace(recorded, failed=failed)
     swing = np.where(going, without_noise(shown.swing, shown.noise), recorded.swing)
     faults = bench.faults()
     for k in map(int, np.flatnonzero(going)):
@@ -52,29 +47,23 @@ def show(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGain
             failed[k] = f"the drive went into fault in the move with the new gains: {faults[k]}"
         elif not failed[k] and shown.restless[k]:
             failed[k] = f"it does not come to rest: {_shook(shown.swing[k], shown.noise[k], 'at rest')}"
-    recovering = np.isin(np.arange(len(failed)), list(faults))
-    if recovering.any():
-        with bench.spending(bench.target.together(recovering)):
-            bench.ground.recover(recovering)
-        bench.drop_faults("moving with the new gains, and the fault cannot be reset")
-    return replace(recorded.with_move(shown), failed=tuple(failed), swing=swing)
+    bench.recover_faults(faults, "moving with the new gains")
+    shown = shown if recorded.shown is None else recorded.shown.replaced(shown)
+    return replace(recorded, shown=shown, failed=failed, swing=swing)
 
 
 def step(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Make a small step of the set-point in csp with the gains of axes, and note by how much they overshoot it."""
-    going = bench.whole_machines(where & bench.going & np.array([not why for why in recorded.failed]))
-    going &= bench.affordable(STEP_TIME)
+    going = bench.whole_machines(where & bench.going & (recorded.failed == "")) & bench.affordable(STEP_TIME)
     if not going.any():
         return recorded
-    assert bench.ground is not None, "trying makes it"
     try:
         with bench.spending(going):
             overshoot = bench.ground.step(recorded.gains, going)
     except SafetyError as error:
         bench.note(going, f"the envelope stopped a step of the set-point in csp: {error}")
-        with bench.spending(going):
-            bench.ground.recover(going)
-        overshoot = np.where(going, np.nan, recorded.overshoot)
+        bench.recover(going)
+        overshoot = np.full(len(going), np.nan)
     return replace(recorded, overshoot=np.where(going, overshoot, recorded.overshoot))
 
 
@@ -97,61 +86,47 @@ def load(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target
         target: The drives, whose time is not counted, since a load step is not part of tuning.
         where: Axes that are looked at, (num_axes,).
     """
-    still = bench.whole_machines(where & bench.going & np.array([not why for why in recorded.failed]))
+    still = bench.whole_machines(where & bench.going & (recorded.failed == ""))
     if target.drives.machine is None or not still.any():
         return recorded
     write_gains(target.drives, recorded.gains, still)
-    recorded = replace(recorded, loaded={**recorded.loaded, **load_step(target, still)})
-    recorded, swings = _after_load_step(bench, recorded, still)
-    failed, most, shook = list(recorded.failed), recorded.swing.copy(), np.zeros_like(still)
-    for k, (swing, noise) in swings.items():
-        alone = float(without_noise(swing, noise))
-        if alone > RESTLESS:
-            told = _shook(swing, noise, "after a load step of 0.3 of the rated torque")
-            failed[k], most[k], shook[k] = f"it does not come to rest: {told}", alone, True
-    if shook.any():
-        # What the load step has set swinging says nothing of the next gains.
-        write_gains(target.drives, basis.calm, bench.target.together(shook))
-        target.drives.advance(CALMING)
-    return replace(recorded, failed=tuple(failed), swing=most)
-
-
-def _after_load_step(
-    bench: AutoBench, recorded: RecordedGains, where: Mask
-) -> tuple[RecordedGains, dict[int, tuple[float, float]]]:
-    """Return the axes whose current swings after it: by how much, and the noise in that, both over the rated one."""
-    swing = np.zeros(len(where))
-    swing[where] = [0.01 * recorded.loaded[k].figures[SWING] for k in map(int, np.flatnonzero(where))]
-    large = swing > RESTLESS
-    if not large.any():
-        return recorded, {}
-    assert bench.ground is not None, "proving makes it"
-    noise = bench.ground.noise(recorded.gains, large)
-    chosen, loaded = [int(k) for k in np.flatnonzero(large)], dict(recorded.loaded)
-    for k in chosen:
-        loaded[k] = replace(loaded[k], figures={**loaded[k].figures, NOISE: 100.0 * float(noise[k])})
-    return replace(recorded, loaded=loaded), {k: (float(swing[k]), float(noise[k])) for k in chosen}
+    loaded = {**recorded.loaded, **load_step(target, still)}
+    swing, failed, most = np.zeros(len(still)), recorded.failed.copy(), recorded.swing.copy()
+    swing[still] = [0.01 * loaded[int(k)].figures[SWING] for k in np.flatnonzero(still)]
+    if (large := swing > RESTLESS).any():
+        noise = bench.ground.noise(recorded.gains, large)
+        alone = without_noise(swing, noise)
+        shook = large & (alone > RESTLESS)
+        for k in map(int, np.flatnonzero(large)):
+            loaded[k] = replace(loaded[k], figures={**loaded[k].figures, NOISE: 100.0 * float(noise[k])})
+        for k in map(int, np.flatnonzero(shook)):
+            told = _shook(swing[k], noise[k], "after a load step of 0.3 of the rated torque")
+            failed[k], most[k] = f"it does not come to rest: {told}", alone[k]
+        if shook.any():
+            # What the load step has set swinging says nothing of the next gains.
+            write_gains(target.drives, basis.calm, bench.target.together(shook))
+            target.drives.advance(CALMING)
+    return replace(recorded, loaded=loaded, failed=failed, swing=most)
 
 
 def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
     """Record a move with the gains before, where they are safe by the model; keep them where they are better."""
     going = bench.going
-    late = going & ~bench.affordable(basis.look_back_time(bench))
-    reasons = [why or ("the drive time was used up" if late[k] else "") for k, why in enumerate(basis.unsafe)]
-    able = bench.whole_machines(going & np.array([not why for why in reasons]))
+    late = ~bench.affordable(LOOK_BACK_TIME)
+    why = np.where((basis.unsafe == "") & late, "the drive time was used up", basis.unsafe)
+    able = bench.whole_machines(going & (why == ""))
     for k in map(int, np.flatnonzero(going & ~able)):
-        why = reasons[k] or "another axis of its machine cannot make it"
-        bench.journals[k].note(f"no comparison move with the gains before: {why}")
+        told = why[k] or "another axis of its machine cannot make it"
+        bench.journals[k].note(f"no comparison move with the gains before: {told}")
     if not able.any():
         return recorded
-    assert bench.ground is not None, "proving makes it"
     try:
         with bench.spending(able):
             earlier = bench.ground.show(basis.before, able)
     except SafetyError as error:
         bench.note(able, f"the envelope stopped the move with the gains before: {error}")
         return recorded
-    failed = np.array([bool(reason) for reason in earlier.reason])
+    failed = able & (np.array(earlier.reason, object) != "")
     for k, causes in bench.faults().items():
         if able[k]:
             # That is those gains' doing, and speaks for the new ones.
@@ -159,12 +134,11 @@ def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Record
             bench.journals[k].note(f"the drive went into fault in the move with the gains before: {causes}")
         else:
             bench.journals[k].stop(f"the drive went into fault while holding its position: {causes}")
-    for k in map(int, np.flatnonzero(able & failed)):
+    for k in map(int, np.flatnonzero(failed)):
         if earlier.reason[k]:
             bench.journals[k].note(f"in the move with the gains before, {earlier.reason[k]}")
-    if (able & failed).any():
-        with bench.spending(able & failed):
-            bench.ground.recover(able & failed)
+    if failed.any():
+        bench.recover(failed)
     comparable = bench.whole_machines(able & ~failed) & bench.going
     return keep_what_is_better(bench, basis, replace(recorded, earlier=earlier), comparable)
 
@@ -202,7 +176,7 @@ def keep_what_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains,
         proof=np.where(kept, earlier.cost, recorded.proof),
         slack=np.where(kept, slack, recorded.slack),
         overshoot=np.where(kept, np.nan, recorded.overshoot),
-        verified=tuple(BY_COMPARISON if one else words for one, words in zip(kept, recorded.verified, strict=True)),
+        verified=np.where(kept, BY_COMPARISON, recorded.verified),
         shown=shown.replaced(earlier._replace(where=kept)),
         earlier=earlier._replace(where=earlier.where & ~kept),
         kept=kept,

@@ -2,7 +2,14 @@
 
 Everything acts through the Drives interface, on all axes of a target at the same time, inside a transaction
 (snapshot.py): the state before is in a file before anything is changed, and an axis that fails a check gets it back.
-Gains are designed on digital twins (twin.py), which costs no drive time, and corrected by what the drives show.
+Gains are designed on digital twins, which costs no drive time, and corrected by what the drives show. `auto` calls the
+stages in this order, and what they hand on is in stages.py:
+
+1. identify: identified.py, with the wiring and the motor's parameters (settings.py) and checks (checks.py);
+2. design: design.py, on twins (twin.py) and their linear models (loop_model.py);
+3. try: trying.py, in trials on the drives (proving.py);
+4. verify and correct: correction.py, by moves (moves.py) and measured loops (loop_margins.py, measured_margins.py);
+5. certify: certify.py, of the result (result.py).
 """
 
 from __future__ import annotations
@@ -19,13 +26,14 @@ from drive_env.gains import check_linear_model
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
-from tuning.auto.correction import correct, design_axes
+from tuning.auto.correction import correct
+from tuning.auto.design import design_axes
 from tuning.auto.identified import identify, prepare
 from tuning.auto.loop_margins import judge
 from tuning.auto.moves import look_back
 from tuning.auto.result import collect
 from tuning.auto.settings import begin, commission, write
-from tuning.auto.stages import Basis, TriedGains
+from tuning.auto.stages import Basis, RecordedGains
 from tuning.auto.trying import try_gains
 from tuning.identify.quick_identification import identify_briefly
 from tuning.lateness import told_lateness
@@ -40,9 +48,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
 Files = Callable[["Result"], AbstractContextManager[object]]
-Find = Callable[
-    [AutoBench, Basis, Progress], TriedGains
-]  # finds gains for the axes that go on, and tries them on the drives
+Find = Callable[[AutoBench, Basis, Progress], RecordedGains]  # for the axes that go on
 
 BUDGET = 18.0  # s of drive time
 
@@ -51,9 +57,10 @@ def auto(
     target: Target,
     file: str | Path,
     *,
+    find: Find | None = None,
     dynamics: str | Dynamics = DEFAULT,
     keep: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = lambda what, share: None,
     experiments: Identify = identify_briefly,
     budget: float = BUDGET,
     files: Files = nullcontext,
@@ -63,6 +70,8 @@ def auto(
     Args:
         target: The drives; they may have any gains, also none, and are off afterwards.
         file: File for the state before.
+        find: Finds gains, and tries them on the proving ground that it gives the bench; if it raises, everything is
+            rolled back. `on_twins` by default.
         dynamics: What the loops must keep.
         keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
         progress: Called with the present step, and the share done.
@@ -72,86 +81,48 @@ def auto(
             files must be removed if the block in it fails.
 
     Raises:
+        ValueError: For a drive without a linear model of its loops, before anything is done.
         BusError: If the drives cannot be reached any more; the message says what state they are in and how to undo.
         OSError: If a file cannot be written; the drives then have their state from before.
     """
-    return prove_found(
-        target, file, on_twins, dynamics=dynamics, keep=keep, progress=progress, experiments=experiments, budget=budget,
-        files=files,
-    )  # fmt: skip
-
-
-def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> TriedGains:
-    """Design gains on digital twins, and try them on the drives."""
-    designing = "designing gains on digital twins"
-    gains, cost, _ = design_axes(bench, basis, bench.going, lambda share: say(designing, 0.3 + 0.35 * share))
-    say("trying gains on the drives", 0.68)
-    return try_gains(bench, basis, gains, cost)
-
-
-def prove_found(
-    target: Target,
-    file: str | Path,
-    find: Find,
-    *,
-    dynamics: str | Dynamics = DEFAULT,
-    keep: bool = True,
-    progress: Progress | None = None,
-    experiments: Identify = identify_briefly,
-    budget: float = BUDGET,
-    files: Files = nullcontext,
-) -> Result:
-    """Check and identify axes, find gains, verify, write and store them; an axis that fails is rolled back.
-
-    Args:
-        target: The drives, as `auto` takes them.
-        file: File for the state before.
-        find: Finds gains, and tries them on the proving ground that it gives the bench. If it raises, the run ends and
-            everything is rolled back.
-        dynamics: What the loops must keep.
-        keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
-        progress: Called with the present step, and the share done.
-        experiments: The identification experiments.
-        budget: Longest drive time for each axis of a machine [s].
-        files: As `auto` takes it.
-
-    Raises:
-        ValueError: For a drive without a linear model of its loops, before anything is done.
-    """
     check_linear_model(target.device)
-    say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
         bench = AutoBench(watched, clock, budget, find_dynamics(dynamics))
-        say("checking the drives", 0.0)
+        progress("checking the drives", 0.0)
         begin(bench)
-        say("identifying", 0.05)
+        progress("identifying", 0.05)
         identified = identify(bench, experiments)
         fresh = commission(bench, identified)
-        if bench.dynamics.inertia_range != INERTIA_RANGE:
-            low, high = bench.dynamics.inertia_range
-            bench.note(
-                bench.going, f"gains were designed for a load inertia of {low:g} to {high:g} times that of the tuning"
-            )
+        if (loads := bench.dynamics.inertia_range) != INERTIA_RANGE:
+            bench.note(bench.going, "gains were designed for a load inertia of "
+                       f"{loads[0]:g} to {loads[1]:g} times that of the tuning")  # fmt: skip
         basis = prepare(bench, identified)
-        tried = find(bench, basis, say) if bench.going.any() else TriedGains.only(bench.before)
-        recorded = correct(bench, basis, tried, target, say)
-        say("comparing with the gains before", 0.94)
-        recorded = look_back(bench, basis, recorded)
-        verdict = judge(bench, basis, recorded)
+        tried = (find or on_twins)(bench, basis, progress) if bench.going.any() else RecordedGains.only(bench.before)
+        recorded = correct(bench, basis, tried, target, progress)
+        progress("comparing with the gains before", 0.94)
+        recorded = judge(bench, basis, look_back(bench, basis, recorded))
         tell_of_lateness(bench)
         if not is_recorded(target.drives):
             bench.note(np.ones(target.num_axes, bool), COMPUTED)
-        say("writing", 0.96)
+        progress("writing", 0.96)
         accepted = write(bench, fresh, recorded.gains, transaction)
         kept = keep and bool(accepted.any()) and can_store(target)
-        result = collect(bench, basis, recorded, verdict, transaction.path, kept)
+        result = collect(bench, identified, recorded, transaction.path, kept)
         # What cannot be written down is not left in the drives, and nothing is written of what they did not keep.
         with files(result):
             if kept:
                 transaction.store(accepted)
         transaction.commit(accepted)
-    say("done", 1.0)
+    progress("done", 1.0)
     return result
+
+
+def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> RecordedGains:
+    """Design gains on digital twins, and try them on the drives."""
+    designing = "designing gains on digital twins"
+    gains, cost, _ = design_axes(bench, basis, bench.going, lambda share: say(designing, 0.3 + 0.35 * share))
+    say("trying gains on the drives", 0.68)
+    return try_gains(bench, basis, gains, cost)
 
 
 def tell_of_lateness(bench: AutoBench) -> None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
@@ -23,7 +23,7 @@ from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.demand import computed, is_recorded
-from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trial, Trials, measured_cost, softness
+from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trials, measured_cost, softness
 from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import (
     CYCLE,
@@ -46,11 +46,8 @@ from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does not pass
 # Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.
@@ -75,22 +72,14 @@ STEP_ANGLE = STEP_SIZE / 4096 * 2.0 * math.pi  # rad, of the finer encoders
 QUIETENING, NOISE_CYCLES = 50, 100  # with slow outer loops: until an axis is quiet, and that show the noise
 
 
-class Proof(NamedTuple):
-    """The results of a trial, each of shape (num_axes,).
+OBJECTS = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]  # recorded in every motion
 
-    cost: J by measured terms. stopped: Whether it oscillated, went into fault, or left its envelope in any phase.
-    culprit: Whether it did so itself: the other axes of its machine are stopped with it.
-    reason: Why it does not pass, "" if it does. ripple: RMS increment of the current over the rated one, of the worst
-        phase. overshoot: Of the move, the largest of move and reversal. settling: t_s/t_0, mean of move and reversal.
-    """
+
+class Proof(NamedTuple):
+    """The results of a trial: J by measured terms, (num_axes,), and why each axis does not pass, "" if it does."""
 
     cost: Floats
-    stopped: Mask
-    culprit: Mask
     reason: tuple[str, ...]
-    ripple: Floats
-    overshoot: Floats
-    settling: Floats
 
     @property
     def passed(self) -> Mask:
@@ -124,13 +113,9 @@ class Shown(NamedTuple):
 
     def replaced(self, later: Shown) -> Shown:
         """Return this with the axes of a later recording in their place."""
-        demand, actual, current, cost, swing, noise = (
-            np.where(later.where, getattr(later, name), getattr(self, name))
-            for name in ("demand", "actual", "current", "cost", "swing", "noise")
-        )
-        both = zip(later.where, self.reason, later.reason, strict=True)
-        reason = tuple(new if made else old for made, old, new in both)
-        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost, swing, noise)
+        every: Any = zip(self[1:], later[1:], strict=True)  # all but the times
+        demand, actual, current, _, reason, *figures = (np.where(later.where, new, old) for old, new in every)
+        return Shown(self.t, demand, actual, current, self.where | later.where, tuple(map(str, reason)), *figures)
 
 
 def without_noise(swing: Floats | float, noise: Floats | float) -> Floats:
@@ -165,24 +150,23 @@ class ProvingGround:
         self.target = target = replace(target, drives=ObservedDrives(target.drives, self._fallback))
         self.safe = safe
         self._reference = reference
-        low, high = room
         motor, drives = target.motor, target.drives
         self._ampere = ampere_per_count(drives)
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
-        ends = (-1, target.axes_per_machine)
-        if target.linked:
-            # What pulls at one thing goes as far and as fast as its slowest end.
-            inertia = np.repeat(inertia.reshape(ends).max(axis=1), ends[1])
+        # What pulls at one thing goes as far and as fast as its slowest end.
+        ends = (-1, target.axes_per_machine if target.linked else 1)
+        inertia = np.repeat(inertia.reshape(ends).max(axis=1), ends[1])
         self._inertia, self._held = inertia, held
-        self.reach: Floats = trial_reach(target, inertia, held[0], longer_way(low, high))
-        if target.linked:
-            shortest = np.abs(self.reach).reshape(ends).argmin(axis=1)
-            self.reach = np.repeat(self.reach.reshape(ends)[np.arange(len(shortest)), shortest], ends[1])
+        reach = trial_reach(target, inertia, held[0], longer_way(*room)).reshape(ends)
+        shortest = np.abs(reach).argmin(axis=1)
+        reach = np.repeat(reach[np.arange(len(reach)), shortest], ends[1])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
         self.move: Move = plan_move(
-            motor, inertia, drives.read(Role.POSITION_SCALE), self.reach, highest_ramp(target.device)
+            motor, inertia, drives.read(Role.POSITION_SCALE), reach, highest_ramp(target.device)
         )
         self._count: Floats = self.move.increments / self.move.counts  # increments
+        self._size = np.maximum(np.abs(self.move.distance), 1)  # of the move, likewise
+        self._counts: Floats = np.abs(self.move.distance) / self._count  # of the encoder in a move
         top = RETURN_SPEED * target.speed * self.move.increments
         self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)
         self._t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
@@ -196,8 +180,7 @@ class ProvingGround:
 
     def too_short(self) -> Mask:
         """Return which axes have too short a travel for a useful trial."""
-        counts = np.abs(self.move.distance) / self.move.increments * self.move.counts
-        return np.asarray(counts < SHORTEST)
+        return np.asarray(self._counts < SHORTEST)
 
     def way_back(self) -> Floats:
         """Return how long it may take to bring axes back before their next move [s], (num_axes,)."""
@@ -220,32 +203,25 @@ class ProvingGround:
             self.target.drives.advance(RETURN_LOOK)
         self._shaken |= where
 
-    def run(self, gains: Integers, where: Mask, heavier: bool = False) -> Proof:
+    def run(self, gains: Integers, where: Mask) -> Proof:
         """Try gains, raw integers of shape (num_axes, count), on some axes; the others' figures are undefined.
 
-        Linked axes move together, all of them with these gains.
-
-        Args:
-            gains: What is tried.
-            where: Axes, (num_axes,).
-            heavier: Whether to look at what a heavier load would make of them, too.
+        Linked axes move together, all of them with these gains. Where the envelope stops all drives, machine by machine
+        tries them again, so that the one that caused it is known.
         """
-        where = self.target.together(where)
-        count, lanes = self.target.num_axes, self.target.axes_per_machine
+        where, lanes = self.target.together(where), self.target.axes_per_machine
         try:
-            return self._proof(gains, self._run(gains, where, heavier), where)
+            return self._run(gains, where)
         except SafetyError as error:
             if where.sum() <= lanes:
                 return self._refused(str(error), where)
-        proofs = []
-        for lane in range(count // lanes):
-            one = where & (np.arange(count) // lanes == lane)
-            if one.any():
-                try:
-                    proofs.append((one, self._proof(gains, self._run(gains, one, heavier), one)))
-                except SafetyError as error:
-                    proofs.append((one, self._refused(str(error), one)))
-        return _merged(proofs)
+        cost, reason = np.full(len(where), TRIP), np.full(len(where), "", object)
+        machines = np.arange(len(where)) // lanes
+        for machine in np.unique(machines[where]):
+            one = where & (machines == machine)
+            proof = self.run(gains, one)
+            cost, reason = np.where(one, proof.cost, cost), np.where(one, proof.reason, reason)
+        return Proof(cost, tuple(reason))
 
     def show(self, gains: Integers, where: Mask) -> Shown:
         """Record one move with gains; an axis that oscillates or goes into fault gets stable gains within 50 ms.
@@ -263,9 +239,7 @@ class ProvingGround:
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
         self.moves[where] += 1
-        objects = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
-        if has_demand := is_recorded(drives):
-            objects.append(cia402.POSITION_DEMAND)
+        objects = [*OBJECTS, *([cia402.POSITION_DEMAND] if is_recorded(drives) else [])]
         traces, stopped = [], np.zeros(self.target.num_axes, bool)
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
@@ -273,27 +247,24 @@ class ProvingGround:
         swing = self._swing(away, where & ~stopped)
         measured = self._noise(gains, where & ~stopped & (swing > RESTLESS) & (swing < OSCILLATION))
         seen = {name: np.concatenate([part[name] for part in traces]) for name in objects}
-        position, current = seen[cia402.POSITION_ACTUAL], seen[cia402.TORQUE_ACTUAL]
-        demanded = seen[cia402.POSITION_DEMAND] if has_demand else computed(self._origin, away, self.move, TRIAL)
+        position, current = seen[cia402.POSITION_ACTUAL], seen[cia402.TORQUE_ACTUAL] * self._ampere
+        demanded = seen.get(cia402.POSITION_DEMAND)
+        if demanded is None:
+            demanded = computed(self._origin, away, self.move, TRIAL)
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
-        error = wrapped(position - away) * way
-        size = np.maximum(np.abs(self.move.distance), 1)
-        overshoot, left = np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size
-        reason = self._reasons(stopped[None], overshoot, left, stop_causes(drives))
-        settling, noise, overshoot = move_terms(
-            position.astype(float), current * self._ampere, self.move, self._t_0, rated, away, way
-        )
+        error = wrapped(position - away) * way / self._size
+        reason = self._reasons(stopped[None], error.max(axis=0), np.abs(error[-1]), stop_causes(drives))
+        settling, noise, overshoot = move_terms(position.astype(float), current, self.move, self._t_0, rated, away, way)
         # Of axes that take no part the gains may be none.
         known = self.target.device.gains
         soft = softness(known, np.where(where[:, None], gains, self._reference)) / softness(known, self._reference)
         costs = cost(Terms(settling, soft, noise, overshoot, stopped))
         self.aborts[stopped] += 1
         self._shaken |= stopped
-        self._origin = np.where(where, away, self._origin)
-        self._direction = np.where(where, -self._direction, self._direction)
+        self._gone(where)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
-        return Shown(t, demand, actual, current * self._ampere, where, reason, costs, swing, measured)
+        return Shown(t, demand, actual, current, where, reason, costs, swing, measured)
 
     def step(self, gains: Integers, where: Mask) -> Floats:
         """Return how far axes go beyond a step of their set-point in csp, there and back, over the step, (num_axes,).
@@ -314,10 +285,7 @@ class ProvingGround:
             begin = drives.read(cia402.TARGET_POSITION)
             for end, way in ((here + size, 1), (here, -1)):
                 rows = np.tile(np.where(where, wrapped(end), begin), (STEPPING, 1)).astype(np.int64)
-                seen = drives.record(
-                    [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD], STEPPING * CYCLE,
-                    play={cia402.TARGET_POSITION: rows},
-                )  # fmt: skip
+                seen = drives.record(OBJECTS, STEPPING * CYCLE, play={cia402.TARGET_POSITION: rows})
                 beyond = (way * wrapped(seen[cia402.POSITION_ACTUAL] - end)).max(axis=0)
                 worst = np.maximum(worst, beyond / size)
         finally:
@@ -388,9 +356,7 @@ class ProvingGround:
         """
         windows = np.zeros(self.target.num_axes, np.int64)
         for _ in range(HOLDING // WATCH):
-            seen = self.target.drives.record(
-                [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD], WATCH * CYCLE
-            )
+            seen = self.target.drives.record(OBJECTS, WATCH * CYCLE)
             windows = np.where(self._shakes(seen), windows + 1, 0)
             self._stop(where & (windows == PATIENCE))
             if not np.any(where & ~self._stands(seen[cia402.POSITION_ACTUAL])):
@@ -413,18 +379,28 @@ class ProvingGround:
         """Return which axes were at rest in a recording of their positions, (cycles, num_axes)."""
         return np.asarray(np.abs(wrapped(positions - positions[-1])).max(axis=0) <= STEP_COUNTS * self._count)
 
-    def _run(self, gains: Integers, where: Mask, heavier: bool) -> Trial:
+    def _run(self, gains: Integers, where: Mask) -> Proof:
         self._fallback.begin()
         self._begin(where)
-        self.moves[where] += len(PHASES) + heavier
+        self.moves[where] += len(PHASES)
         stop_causes(self.target.drives)  # of before
-        tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where, heavier)
-        if heavier:  # it has come back
-            return tried
-        # A trial ends where its move did, and the next one goes the other way.
+        tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
+        self._gone(where)
+        known = self.target.device.gains
+        costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._reference)))
+        causes = stop_causes(self.target.drives)
+        stopped = where & tried.aborted.any(axis=0)
+        self.aborts[stopped] += 1
+        self._shaken |= stopped
+        # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
+        now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / self._size
+        left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
+        return Proof(costs, self._reasons(tried.aborted, tried.terms.overshoot[:2].max(axis=0), left, causes))
+
+    def _gone(self, where: Mask) -> None:
+        """Count on from where a move has ended: the next one goes the other way."""
         self._origin = np.where(where, self._origin + self._direction * self.move.distance, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
-        return tried
 
     def _begin(self, where: Mask) -> None:
         """Enable axes that are off, with stable gains, and bring those back that are not where they should be."""
@@ -503,35 +479,7 @@ class ProvingGround:
         self.violations[where] += 1
         self.aborts[where] += 1
         self._trials.recover(where)
-        count = self.target.num_axes
-        zero = np.zeros(count)
-        return Proof(zero + TRIP, zero == 0.0, zero == 0.0, (why,) * count, zero, zero, zero)
-
-    def _proof(self, gains: Integers, tried: Trial, where: Mask) -> Proof:
-        terms: Terms = tried.terms
-        known = self.target.device.gains
-        costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._reference)))
-        # What a heavier load makes of gains costs, and is no reason against them on this one.
-        aborted = tried.aborted[: len(PHASES)]
-        stopped: Mask = np.asarray(aborted.any(axis=0))
-        causes = stop_causes(self.target.drives)
-        self.aborts[where & tried.aborted.any(axis=0)] += 1
-        self._shaken |= where & tried.aborted.any(axis=0)
-        overshoot = terms.overshoot[:2].max(axis=0)
-        # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
-        now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / np.maximum(
-            np.abs(self.move.distance), 1
-        )
-        left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
-        return Proof(
-            costs,
-            stopped,
-            tried.culprit,
-            self._reasons(aborted, overshoot, left, causes),
-            terms.noise[: len(PHASES)].max(axis=0),
-            overshoot,
-            terms.settling[:2].mean(axis=0),
-        )
+        return Proof(np.full(len(where), TRIP), (why,) * len(where))
 
     def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]) -> tuple[str, ...]:
         """Return why axes do not pass, "" where they do.
@@ -542,38 +490,20 @@ class ProvingGround:
             left: Of the move, what was missing at its end, (num_axes,).
             causes: What the drives have told meanwhile.
         """
-        counts = np.maximum(np.abs(self.move.distance) / self.move.increments * self.move.counts, 1.0)
+        most_left = np.maximum(ASTRAY, 5.0 / np.maximum(self._counts, 1.0))
         reasons = []
-        for axis in range(self.target.num_axes):
-            if stopped[:, axis].any():
-                phase = PHASE_TITLES[int(stopped[:, axis].argmax())]
+        for axis, phases in enumerate(stopped.T):
+            reason = ""
+            if phases.any():
+                phase = PHASE_TITLES[int(phases.argmax())]
                 reason = f"stopped in the {phase}: it oscillated or went into fault (cut off within 50 ms)"
                 if causes[axis] != UNTOLD:
                     reason += f"; the drive reported {causes[axis]}"
             elif overshoot[axis] > OVERSHOOT:
-                reason = (
-                    f"its overshoot was {100.0 * overshoot[axis]:.0f} % of the move; {100.0 * OVERSHOOT:.0f} % is "
-                    "allowed"
-                )
-            elif left[axis] > max(ASTRAY, 5.0 / counts[axis]):
-                reason = (
-                    f"its error at the end was {100.0 * left[axis]:.0f} % of the move; {100.0 * ASTRAY:.0f} % is "
-                    "allowed"
-                )
-            else:
-                reason = ""
+                far, most = 100.0 * overshoot[axis], 100.0 * OVERSHOOT
+                reason = f"its overshoot was {far:.0f} % of the move; {most:.0f} % is allowed"
+            elif left[axis] > most_left[axis]:
+                far, most = 100.0 * left[axis], 100.0 * ASTRAY
+                reason = f"its error at the end was {far:.0f} % of the move; {most:.0f} % is allowed"
             reasons.append(reason)
         return tuple(reasons)
-
-
-def _merged(proofs: Sequence[tuple[Mask, Proof]]) -> Proof:
-    """Return one proof made of those of single machines; axes that took part in none have the first one's values."""
-    first = proofs[0][1]
-    reasons = list(first.reason)
-    columns: dict[str, Any] = {name: getattr(first, name).copy() for name in Proof._fields if name != "reason"}
-    for where, proof in proofs[1:]:
-        for name, column in columns.items():
-            column[where] = getattr(proof, name)[where]
-        for axis in map(int, np.flatnonzero(where)):
-            reasons[axis] = proof.reason[axis]
-    return Proof(reason=tuple(reasons), **columns)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuning.certificate.certificate import TAKEN, verdict
 from tuning.lateness import late_first
@@ -19,16 +18,13 @@ if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
-    from tuning.auto.stages import Basis, RecordedGains, Verdict
+    from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.certificate.certificate import Correction, StepResponse
     from tuning.identify.estimate import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -110,29 +106,28 @@ class Result(NamedTuple):
         return np.array([axis.accepted for axis in self.axes])
 
 
-def collect(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, verdict: Verdict, file: Path, kept: bool
-) -> Result:
+def collect(bench: AutoBench, identified: IdentifiedAxes, recorded: RecordedGains, file: Path, kept: bool) -> Result:
     """Return the result of a run: of the axes that were accepted with their gains."""
-    identified, axes = basis.identified, []
+    axes = []
     for k, journal in enumerate(bench.journals):
-        gains = bench.before[k] if journal.reason else recorded.gains[k]
-        reason = late_first(bench.target.drives, journal.reason)
+        before = bench.before[k]
+        after = before if journal.reason else recorded.gains[k]
         corrections = _outcomes(journal.corrections, recorded, k)
         axes.append(
             AxisResult(
-                tuple(map(int, bench.before[k])), tuple(map(int, gains)), reason, tuple(journal.reservations),
-                _with_outcomes(journal.notes, corrections), identified.found[k], identified.plants[k],
-                float(recorded.cost[k]), float(recorded.proof[k]), verdict.verified[k], verdict.margins[k],
-                verdict.at_least[k], float(recorded.slack[k]), float(recorded.overshoot[k]), corrections,
-                bool(recorded.kept[k]),
+                tuple(map(int, before)), tuple(map(int, after)), late_first(bench.target.drives, journal.reason),
+                tuple(journal.reservations), _with_outcomes(journal.notes, corrections),
+                identified.found[k], identified.plants[k],
+                float(recorded.cost[k]), float(recorded.proof[k]), recorded.verified[k], recorded.margins.get(k, {}),
+                recorded.at_least.get(k, {}), float(recorded.slack[k]), float(recorded.overshoot[k]),
+                corrections, bool(recorded.kept[k]),
             )
         )  # fmt: skip
-    ground, zero = bench.ground, np.zeros(bench.target.num_axes, np.int64)
-    counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
+    ground, none = getattr(bench, "ground", None), np.zeros(bench.target.num_axes, np.int64)
+    moves, aborts, violations = (none,) * 3 if ground is None else (ground.moves, ground.aborts, ground.violations)
     return Result(
-        tuple(axes), bench.spent, *counts, recorded.shown, recorded.earlier, recorded.response, recorded.loaded,
-        bench.dynamics, file, kept,
+        tuple(axes), bench.spent, moves, aborts, violations, recorded.shown, recorded.earlier, recorded.response,
+        recorded.loaded, bench.dynamics, file, kept,
     )  # fmt: skip
 
 

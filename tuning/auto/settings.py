@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
@@ -17,12 +15,10 @@ from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
+    from tuning.arrays import Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import IdentifiedAxes
     from tuning.target import Target
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
 
@@ -51,9 +47,9 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
     _wire(bench, identified, fresh)
     if not fresh.any():
         return fresh
-    for name, value in zip(_keys(target, names := _commissioning(target)), names.values(), strict=True):
-        if name not in findings(target.device):
-            target.drives.write(name, value, where=fresh)
+    for key, value in _commissioning(target).items():
+        if key not in findings(target.device):
+            target.drives.write(key, value, where=fresh)
     bench.note(fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
     if Role.LIMIT_SWITCHES not in target.device.roles:
         return fresh
@@ -70,12 +66,7 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
 def _wire(bench: AutoBench, identified: IdentifiedAxes, fresh: Mask) -> None:
     """Write the wiring settings: as identified, or else the known ones of a factory-fresh drive's motor."""
     target = bench.target
-    preset = _commissioning(target)
-    known = {
-        key: value
-        for key, value in zip(_keys(target, preset), preset.values(), strict=True)
-        if key in findings(target.device)
-    }
+    known = {key: value for key, value in _commissioning(target).items() if key in findings(target.device)}
     wanted: list[dict[Key, int]] = []
     for k, found in enumerate(identified.found):
         seen = {} if found is None else found.wiring
@@ -108,32 +99,24 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
     other = going & (bench.modes != 0) & (drives.read(cia402.MODE) != bench.modes)
     if other.any():
         drives.write(cia402.MODE, bench.modes, where=other)
-    kept = dict(zip(bench.target.device.gains.keys, gains.T, strict=True))
+    wiring, roles = list(findings(bench.target.device)), bench.target.device.roles
+    commissioned = [*wiring, *_commissioning(bench.target)]
+    if Role.LIMIT_SWITCHES in roles:
+        commissioned.append(roles[Role.LIMIT_SWITCHES])
     axes = []
     for k, values in enumerate(transaction.before.axes):
-        wanted = dict(values)
-        if fresh[k]:
-            commissioned = _keys(bench.target, _commissioning(bench.target))
-            if Role.LIMIT_SWITCHES in bench.target.device.roles:
-                commissioned.append(bench.target.device.roles[Role.LIMIT_SWITCHES])
-            wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
-        wanted |= {key: int(drives.read(key)[k]) for key in findings(bench.target.device) if key in values}
-        axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
+        stays = [key for key in (commissioned if fresh[k] else wiring) if key in values]
+        own = dict(zip(bench.target.device.gains.keys, map(int, gains[k]), strict=True))
+        axes.append({**values, **{key: int(drives.read(key)[k]) for key in stays}, **own})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
     return going
 
 
-def _commissioning(target: Target) -> dict[str, int]:
-    """Return the motor's parameters for a drive, without those of the encoder's initialisation.
+def _commissioning(target: Target) -> dict[Key, int]:
+    """Return the motor's parameters for a drive by their keys, without those of the encoder's initialisation.
 
     Presets take the encoder's offset as known, which it is not here.
     """
-    preset = target.device.preset(target.motor)
-    left = target.device.roles.get(Role.ENCODER_INITIALISATION)
-    return {name: preset[name] for name, key in zip(preset, _keys(target, preset), strict=True) if key != left}
-
-
-def _keys(target: Target, names: Iterable[Any]) -> list[tuple[int, int]]:
-    """Return the index and sub-index of objects by name."""
-    dictionary = target.device.new_dictionary()
-    return [(entry.index, entry.sub) for entry in map(dictionary.find, names)]
+    dictionary, left = target.device.new_dictionary(), target.device.roles.get(Role.ENCODER_INITIALISATION)
+    entries = [(dictionary.find(name), value) for name, value in target.device.preset(target.motor).items()]
+    return {(entry.index, entry.sub): value for entry, value in entries if (entry.index, entry.sub) != left}

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tuning.auto.bench import LOOK_BACK_TIME
+from drive_env.trials.positioning import longer_way
 from tuning.link_energy import trial_reach
 
 if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
+    from tuning.arrays import Floats, Integers, Mask, Texts
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.certificate.certificate import StepResponse
     from tuning.identify.estimate import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -54,14 +50,14 @@ class Basis:
         before: Raw gains of the drives before the run, (num_axes, count).
         reference: Those of the baseline rule, likewise.
         calm: Those that are slow enough for any load, with which what is stopped goes on, likewise.
-        unsafe: Why an axis must not be moved with the gains before, "" where it may.
+        unsafe: Why an axis must not be moved with the gains before, "" where it may, (num_axes,).
     """
 
     identified: IdentifiedAxes
     before: Integers
     reference: Integers
     calm: Integers
-    unsafe: tuple[str, ...]
+    unsafe: Texts
 
     def held(self) -> tuple[Floats, Floats]:
         """Return the currents that a weight takes, and dry friction at least [A], 0 where not known, (num_axes,)."""
@@ -74,86 +70,62 @@ class Basis:
         """Return for what reach moves are planned that do not overcharge the DC link [rad], (num_axes,)."""
         motor, plants = bench.target.motor, self.identified.plants
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
-        return trial_reach(bench.target, inertia, self.held()[0], bench.reach())
-
-    def look_back_time(self, bench: AutoBench) -> Floats:
-        """Return the time that a move with the gains before takes [s], 0 where none is made, (num_axes,)."""
-        safe = bench.whole_machines(np.array([not why for why in self.unsafe]))
-        return np.where(safe, LOOK_BACK_TIME, 0.0)
+        return trial_reach(bench.target, inertia, self.held()[0], longer_way(*bench.room()))
 
 
 @dataclass(frozen=True)
-class TriedGains:
-    """What trials on the drives left of the gains that were designed.
+class RecordedGains:
+    """Gains of all axes, and what is known of them: from trials, a move, a frequency response and a load step.
 
     Attributes:
         gains: Raw, (num_axes, count).
         proof: J by measured terms of their trial, (num_axes,); nan where there is none.
-        verified: How they were verified, in words; "" where they were not.
+        verified: How they were verified, in words, (num_axes,); "" where they were not.
         cost: Robust cost on the digital twins, (num_axes,); nan where it is not known.
+        failed: Of each axis, why its gains cannot stay: it failed the move, or does not come to rest; "" if they can.
+        swing: Of its current at rest without the noise of its measurement, over the rated one (RMS), (num_axes,).
+        unseen: Of each axis, why it has no usable frequency response; "" where it has one.
+        slack: How far the measured loops keep the dynamics, relative, (num_axes,); nan where they were not measured.
+        overshoot: Of a step of the set-point in csp, over the step, (num_axes,); nan where none was made.
+        kept: Axes that keep the gains before, (num_axes,).
+        shown: A recorded move, None if none was made.
+        earlier: A recorded move with the gains before, None if none was made.
+        response: The velocity loop's, None if none was measured.
+        loaded: Response to a load step, of emulated machines.
+        margins: Of the outer loops as measured, "velocity" and "position", by axis; nothing where nothing was.
+        at_least: Lower bounds of margins that were not measured, likewise.
     """
 
     gains: Integers
     proof: Floats
-    verified: tuple[str, ...]
+    verified: Texts
     cost: Floats
-
-    @staticmethod
-    def only(gains: Integers) -> TriedGains:
-        """Return gains of which nothing is known, (num_axes, count)."""
-        n = len(gains)
-        return TriedGains(gains, np.full(n, np.nan), ("",) * n, np.full(n, np.nan))
-
-
-@dataclass(frozen=True)
-class RecordedGains(TriedGains):
-    """What a move, a frequency response and a load step showed of the gains.
-
-    Attributes:
-        shown: A recorded move, None if none was made.
-        failed: Of each axis, why its gains cannot stay: it failed the move, or does not come to rest; "" if they can.
-        swing: Of its current at rest without the noise of its measurement, over the rated one (RMS), (num_axes,).
-        response: The velocity loop's, None if none was measured.
-        unseen: Of each axis, why it has no usable frequency response; "" where it has one.
-        slack: How far the measured loops keep the dynamics, relative, (num_axes,); nan where they were not measured.
-        overshoot: Of a step of the set-point in csp, over the step, (num_axes,); nan where none was made.
-        earlier: A recorded move with the gains before, None if none was made.
-        kept: Axes that keep the gains before, (num_axes,).
-        loaded: Response to a load step, of emulated machines.
-    """
-
-    shown: Shown | None
-    failed: tuple[str, ...]
+    failed: Texts
     swing: Floats
-    response: MeasuredLoop | None
-    unseen: tuple[str, ...]
+    unseen: Texts
     slack: Floats
     overshoot: Floats
     kept: Mask
+    shown: Shown | None = None
     earlier: Shown | None = None
+    response: MeasuredLoop | None = None
     loaded: Mapping[int, StepResponse] = field(default_factory=dict)
+    margins: Mapping[int, Mapping[str, Margins]] = field(default_factory=dict)
+    at_least: Mapping[int, Mapping[str, AtLeast]] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, tried: TriedGains) -> RecordedGains:
-        """Return gains that were tried, and nothing recorded yet."""
-        known = {one.name: getattr(tried, one.name) for one in fields(TriedGains)}
-        n = len(tried.gains)
-        return cls(
-            **known, shown=None, failed=("",) * n, swing=np.zeros(n), response=None, unseen=("",) * n,
-            slack=np.full(n, np.nan), overshoot=np.full(n, np.nan), kept=np.zeros(n, bool),
-        )  # fmt: skip
-
-    def with_move(self, shown: Shown) -> RecordedGains:
-        """Return this with a later move of some axes in place of theirs."""
-        return replace(self, shown=shown if self.shown is None else self.shown.replaced(shown))
+    @staticmethod
+    def only(gains: Integers) -> RecordedGains:
+        """Return gains of which nothing is known, (num_axes, count)."""
+        n = len(gains)
+        unknown, nothing = np.full(n, np.nan), np.full(n, "", object)
+        return RecordedGains(
+            gains, unknown, nothing, unknown, nothing, np.zeros(n), nothing, unknown, unknown, np.zeros(n, bool)
+        )
 
     def mixed(self, other: RecordedGains, where: Mask) -> RecordedGains:
         """Return this with all that another one has of some axes, (num_axes,)."""
-        numbers = ("proof", "cost", "swing", "slack", "overshoot", "kept")
-        values: dict[str, Any] = {name: np.where(where, getattr(other, name), getattr(self, name)) for name in numbers}
-        for name in ("verified", "failed", "unseen"):
-            both = zip(where, getattr(self, name), getattr(other, name), strict=True)
-            values[name] = tuple(new if chosen else old for chosen, old, new in both)
+        names = ("proof", "verified", "cost", "failed", "swing", "unseen", "slack", "overshoot", "kept")
+        values: dict[str, Any] = {name: np.where(where, getattr(other, name), getattr(self, name)) for name in names}
         shown, response = self.shown, self.response
         if other.shown is not None:
             moved = other.shown._replace(where=where & other.shown.where)
@@ -162,26 +134,5 @@ class RecordedGains(TriedGains):
             response = other.response if response is None else response.replaced(other.response, where)
         loaded = {k: one for k, one in self.loaded.items() if not where[k]}
         loaded |= {k: one for k, one in other.loaded.items() if where[k]}
-        return replace(
-            self,
-            **values,
-            gains=np.where(where[:, None], other.gains, self.gains),
-            shown=shown,
-            response=response,
-            loaded=loaded,
-        )
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What the final gains are worth, by axis.
-
-    Attributes:
-        margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
-        at_least: Lower bounds of margins that were not measured, likewise.
-        verified: How the gains were verified, in words; "" where they were not.
-    """
-
-    margins: tuple[Mapping[str, Margins], ...]
-    at_least: tuple[Mapping[str, AtLeast], ...]
-    verified: tuple[str, ...]
+        gains = np.where(where[:, None], other.gains, self.gains)
+        return replace(self, **values, gains=gains, shown=shown, response=response, loaded=loaded)

@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from tuning.auto.bench import TRIAL_TIME
 from tuning.auto.proving import ProvingGround
-from tuning.auto.stages import TriedGains
+from tuning.auto.stages import RecordedGains
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
+    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
 SLOWER = 0.6  # what gains that fail their trial are lowered to
 WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole of it
 
 
-def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> TriedGains:
+def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> RecordedGains:
     """Try designed gains on the drives; where they fail, lower ones, and at last those that any load bears.
 
     Args:
@@ -50,7 +47,7 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
         ("gains that are slow enough for any load", basis.calm),
     )
     for words, tried in attempts:
-        _recover_from_faults(bench, ground)
+        bench.recover_faults(bench.faults(), "gains were tried")
         open_ = bench.going & np.isnan(proof) & bench.affordable(TRIAL_TIME + ground.way_back())
         if not open_.any():
             break
@@ -60,18 +57,20 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
         passed = bench.whole_machines(found.passed | ~open_) & open_
         best = np.where(passed[:, None], tried, best)
         proof = np.where(passed, found.cost, proof)
-        for k in map(int, np.flatnonzero(passed)):
-            if tried is not gains:
-                bench.journals[k].correct(gains[k], tried[k], f"the designed gains failed their trial: {last[k]}")
-        for k in map(int, np.flatnonzero(open_ & ~passed)):
-            last[k] = found.reason[k] or "another axis of its machine did not pass"
-            if tried is not basis.calm:
-                bench.journals[k].note(f"{words} failed their trial: {last[k]}")
+        for k in map(int, np.flatnonzero(open_)):
+            journal = bench.journals[k]
+            if not passed[k]:
+                last[k] = found.reason[k] or "another axis of its machine did not pass"
+                if tried is not basis.calm:
+                    journal.note(f"{words} failed their trial: {last[k]}")
+            elif tried is not gains:
+                journal.correct(gains[k], tried[k], f"the designed gains failed their trial: {last[k]}")
     for k in map(int, np.flatnonzero(bench.going & np.isnan(proof))):
         why = last[k] or "there was no drive time left to try them"
         bench.journals[k].stop(f"no gains passed the trial; the last ones: {why}")
-    verified = tuple(BY_TRIAL if going else "" for going in bench.going)
-    return TriedGains(best, proof, verified, np.where((best == gains).all(axis=1), cost, np.nan))
+    verified = np.where(bench.going, BY_TRIAL, "").astype(object)
+    cost = np.where((best == gains).all(axis=1), cost, np.nan)
+    return replace(RecordedGains.only(best), proof=proof, verified=verified, cost=cost)
 
 
 def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
@@ -81,18 +80,8 @@ def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
     return bench.ground
 
 
-def _recover_from_faults(bench: AutoBench, ground: ProvingGround) -> None:
-    """Reset faults that have come since a trial; an axis that stays in one takes no further part."""
-    faulted = np.isin(np.arange(bench.target.num_axes), list(bench.faults()))
-    if faulted.any():
-        with bench.spending(bench.target.together(faulted)):
-            ground.recover(faulted)
-        bench.drop_faults("gains were tried, and the fault cannot be reset")
-
-
 def watch_following(bench: AutoBench, where: Mask) -> None:
     """Set a following error limit that no normal trial reaches."""
-    assert bench.ground is not None, "proving makes it"
     drives = bench.target.drives
     window = WINDOW * np.abs(bench.ground.move.distance) + drives.read(Role.POSITION_SCALE)
     drives.write(cia402.FOLLOWING_WINDOW, window, where=where)

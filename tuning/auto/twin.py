@@ -9,27 +9,26 @@ cost cannot be measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env.gains import integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
-from drive_env.trials.score import TRIPPED, RobustScore, robust_cost
+from drive_env.trials.score import TRIPPED, RobustScore
 from tuning.auto.loop_model import corner
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
+    from tuning.arrays import Floats, Integers
     from tuning.identify.estimate import Identification
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
 # quarter of a second that the robust cost looks at.
@@ -42,73 +41,50 @@ SLOWEST_FILTER = 50.0  # Hz
 UNKNOWN_FILTER = 0.5  # relative: how far a velocity filter may be off that was not identified
 
 
-class FrictionGuess(NamedTuple):
-    """Friction at the rotor: dry [A], viscous [A*s/rad], as identified."""
-
-    coulomb: float = 0.0
-    viscous: float = 0.0
-
-
-class Spread(NamedTuple):
-    """The uncertainty of the identification: half widths of the 95 % intervals, relative."""
-
-    inertia: float = 0.0
-    anti_resonance: float = 0.0
-    resonance: float = 0.0
-    filter: float = 0.0
-
-
 class Known(NamedTuple):
-    """The data of a twin: the axis, its friction, how far its rotor may turn, with the sign [rad], and the uncertainty.
+    """The data of a twin: the axis, and how far its rotor may turn, with the sign [rad].
 
-    offset: Current that gravity or another constant load takes [A].
+    coulomb, viscous: Its friction at the rotor, dry [A] and viscous [A*s/rad], as identified. offset: Current that
+    gravity or another constant load takes [A]. spread: Half widths of the 95 % intervals of what a variant of the
+    machine may deviate in, relative.
     """
 
     plant: Plant
-    friction: FrictionGuess
     reach: float
-    spread: Spread = Spread()
+    coulomb: float = 0.0
+    viscous: float = 0.0
     offset: float = 0.0
+    spread: Mapping[str, float] = MappingProxyType({})
 
 
 def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
-    """Return the data of a twin from an identification.
+    """Return the data of a twin from an identification; friction that was not identified counts as none.
 
     Args:
         plant: The axis model.
-        identified: What was identified; friction that was not identified counts as none.
+        identified: What was identified.
         reach: How far the rotor may turn, with the sign [rad].
     """
-    found = (identified.estimates.get(name) for name in ("coulomb", "viscous", "offset"))
-    dry, viscous, offset = (0.0 if one is None or not one.is_known else one.value for one in found)
-    widths = {"filter": UNKNOWN_FILTER}
-    for field, name in _INTERVALS.items():
-        estimate = identified.estimates.get(name)
-        if estimate is not None and estimate.is_known:
-            widths[field] = 0.5 * (estimate.high - estimate.low) / estimate.value
-    return Known(plant, FrictionGuess(max(dry, 0.0), max(viscous, 0.0)), reach, Spread(**widths), offset)
-
-
-_INTERVALS = {
-    "inertia": "inertia",
-    "anti_resonance": "anti_resonance",
-    "resonance": "resonance",
-    "filter": "velocity_filter",
-}
+    known = {name: one for name, one in identified.estimates.items() if one.is_known}
+    dry, viscous, offset = (known[name].value if name in known else 0.0 for name in ("coulomb", "viscous", "offset"))
+    widths = {"velocity_filter": UNKNOWN_FILTER}
+    for name in set(UNCERTAIN) & set(known):
+        widths[name] = 0.5 * (known[name].high - known[name].low) / known[name].value
+    return Known(plant, reach, max(dry, 0.0), max(viscous, 0.0), offset, widths)
 
 
 class MachineVariant(NamedTuple):
     """A variant of the machine within what identification leaves open; gains must be good on all of them.
 
-    inertia, anti_resonance, resonance, filter: Deviation from the identified value, relative; at least that of its
-        interval.
+    inertia, anti_resonance, resonance, velocity_filter: Deviation from the identified value, relative; at least that of
+        its interval.
     """
 
     name: str
     inertia: float = 0.0
     anti_resonance: float = 0.0
     resonance: float = 0.0
-    filter: float = 0.0
+    velocity_filter: float = 0.0
     damping: float = 1.0  # over what was identified or taken
     friction: float = 1.0  # dry, over what was identified
     adc_noise: float | None = None  # A
@@ -116,6 +92,7 @@ class MachineVariant(NamedTuple):
     supply_resistance: float | None = None  # ohm
 
 
+UNCERTAIN = ("inertia", "anti_resonance", "resonance", "velocity_filter")
 WORLDS = (
     MachineVariant("as identified"),
     # Dry friction holds a shaking axis still, and is what two short moves tell worst: drag and sticking pass for it.
@@ -138,21 +115,23 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
 
     The torque constant is the data sheet's: inertia and friction are identified relative to it, so it does not matter.
     """
-    plant, spread = known.plant, known.spread
-    total = plant.inertia * _factor(world.inertia, spread.inertia)
-    anti_resonance = plant.anti_resonance * _factor(world.anti_resonance, spread.anti_resonance)
-    resonance = max(plant.resonance * _factor(world.resonance, spread.resonance), LEAST_RATIO * anti_resonance)
-    filtered = corner(device, plant) * _factor(world.filter, spread.filter)
+    plant = known.plant
+    off = {name: _factor(getattr(world, name), known.spread.get(name, 0.0)) for name in UNCERTAIN}
+    total, anti_resonance = plant.inertia * off["inertia"], plant.anti_resonance * off["anti_resonance"]
+    resonance = max(plant.resonance * off["resonance"], LEAST_RATIO * anti_resonance)
+    filtered = corner(device, plant) * off["velocity_filter"]
+    noise, resistance = (
+        device.stage[name].default if value is None else value
+        for name, value in (("adc_noise", world.adc_noise), ("supply_resistance", world.supply_resistance))
+    )
     values = {
         "motor.R_s": plant.R,
         "motor.L_d": plant.L,
         "motor.L_q": plant.L,
         "stage.velocity_filter": float(np.clip(filtered, SLOWEST_FILTER, 0.4 * device.velocity_rate)),
         "motor.cogging_torque": motor.cogging_torque * world.cogging,
-        "stage.adc_noise": device.stage["adc_noise"].default if world.adc_noise is None else world.adc_noise,
-        "stage.supply_resistance": device.stage["supply_resistance"].default
-        if world.supply_resistance is None
-        else world.supply_resistance,
+        "stage.adc_noise": noise,
+        "stage.supply_resistance": resistance,
     }
     if is_elastic(plant):
         rotor = total * (anti_resonance / resonance) ** 2
@@ -164,8 +143,8 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
         load = max(total - motor.inertia, LEAST_LOAD * total)
         rotor = total - load
     values |= {"motor.inertia": rotor, "load.inertia": load}
-    dry = known.friction.coulomb * motor.torque_constant * world.friction
-    viscous = known.friction.viscous * motor.torque_constant
+    dry = known.coulomb * motor.torque_constant * world.friction
+    viscous = known.viscous * motor.torque_constant
     # The bearings of the data sheet are the motor's, what is more belongs to the load.
     values["motor.coulomb"] = min(dry, motor.coulomb)
     values["load.coulomb"] = dry - values["motor.coulomb"]
@@ -181,16 +160,16 @@ def _factor(way: float, spread: float) -> float:
 
 
 class Twins:
-    """Scores gains on twins, `sets` sets of gains for every axis at once.
+    """Judges gains on twins, `sets` sets of gains for every axis at once.
 
     Args:
         device: The drive.
         motor: The motor, as its data sheet has it.
         known: The data of each axis, n of them.
         scaler: 2058h of each axis, shape (n,).
-        sets: Sets of gains per axis that are scored at once.
+        sets: Sets of gains per axis that are judged at once.
         num_threads: Threads that run them; the number of cores by default.
-        worlds: Variants on which the gains are scored.
+        worlds: Variants on which the gains are judged.
         repeats: Runs of each variant, with a noise of their own, whose scores are averaged.
         dynamics: What the loops must keep.
     """
@@ -207,105 +186,71 @@ class Twins:
         repeats: int = 1,
         dynamics: str | Dynamics = DEFAULT,
     ) -> None:
-        self.sets, self.dynamics = sets, find_dynamics(dynamics)
-        self.device = device
-        self.num_axes = len(known)
+        self.device, self.sets, self.dynamics = device, sets, find_dynamics(dynamics)
+        self.num_axes, self._worlds = len(known), len(worlds)
+        self._parts: list[tuple[Integers, RobustScore]] = []  # those of a load: which axes they are, and their score
         elastic = np.array([is_elastic(one.plant) for one in known])
-        self._parts = []
         for load, mask in (("inertia", ~elastic), ("two_mass", elastic)):
-            if mask.any():
-                axes = np.flatnonzero(mask)
-                chosen = [known[int(k)] for k in axes]
-                machines = len(chosen) * sets * len(worlds)
-                robust = RobustScore(
-                    device.name, load, motor, machines, num_threads=num_threads, repeats=repeats, dynamics=dynamics
-                )
-                self._parts.append(_Part(robust, device, motor, axes, chosen, scaler[mask], sets, worlds))
+            if not mask.any():
+                continue
+            axes = np.flatnonzero(mask)
+            robust = RobustScore(
+                device.name, load, motor, len(axes) * sets * len(worlds), num_threads=num_threads, repeats=repeats,
+                dynamics=dynamics,
+            )  # fmt: skip
+            self._parts.append((axes, robust))
+            chosen = [known[int(k)] for k in axes]
+            rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in chosen]
+            columns = {name: np.array([[row[name] for row in axis] for axis in rows]) for name in rows[0][0]}
+            robust.set_machines(
+                {name: np.repeat(values, sets, axis=0).reshape(-1) for name, values in columns.items()},
+                self._each([one.plant.supply for one in chosen]),
+            )
+            # What the motor must push for is what the load pulls.
+            robust.set_constant_load(self._each([-one.offset * motor.torque_constant for one in chosen]))
+            inertia, reach = [one.plant.inertia for one in chosen], [one.reach for one in chosen]
+            move = plan_move(motor, inertia, scaler[mask], reach, highest_ramp(device))
+            distance, velocity, acceleration, increments = map(self._each, move[:4])
+            robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
 
-    def score(self, gains: Integers) -> Floats:
-        """Return the robust cost of gains, raw integers of shape (n, any sets, count), over the worlds, (n, any sets).
+    def _each(self, values: ArrayLike) -> NDArray[Any]:
+        """Return values of axes, (axes,), for all their machines: sets of gains, and of each the worlds."""
+        return np.repeat(np.asarray(values), self.sets * self._worlds)
+
+    def judge(self, gains: Integers) -> tuple[Floats, Floats]:
+        """Return the robust performance of gains over the worlds, and how far they keep the constraints.
 
         The mean performance of all worlds counts, and the margins of the first; gains that a trial would stop as
         oscillating keep no constraints.
-        """
-        return robust_cost(*self.judge(gains))
 
-    def judge(self, gains: Integers) -> tuple[Floats, Floats]:
-        """Return the robust performance of gains over the worlds and how far they keep the constraints, as `score`."""
+        Args:
+            gains: Raw, (n, any sets, count).
+
+        Returns:
+            Of shape (n, any sets) each.
+        """
         found = np.empty((2, *gains.shape[:2]))
         for first in range(0, gains.shape[1], self.sets):
             rows = gains[:, first : first + self.sets]
             count = rows.shape[1]
             whole = np.concatenate([rows, np.repeat(rows[:, -1:], self.sets - count, axis=1)], axis=1)
-            for part in self._parts:
-                found[:, part.axes, first : first + count] = np.array(part.judge(whole[part.axes]))[:, :, :count]
+            for axes, robust in self._parts:
+                found[:, axes, first : first + count] = self._judged(robust, whole[axes])[:, :, :count]
         return found[0], found[1]
+
+    def _judged(self, robust: RobustScore, gains: Integers) -> Floats:
+        shape = (*gains.shape[:2], self._worlds)
+        scores = robust.score(np.repeat(gains.reshape(-1, gains.shape[-1]), self._worlds, axis=0))
+        worth = np.exp(np.log(scores.performance).reshape(shape).mean(axis=2))
+        # A drive on which that swings would be stopped: a trial sees the move and the probe.
+        swing = scores.swing.max(axis=1).reshape(shape).max(axis=2)
+        calm = 1.0 - np.minimum(swing / MOST_SWING, 1.0 - TRIPPED)
+        return np.array([worth, np.minimum(scores.slack.reshape(shape)[:, :, 0], calm)])
 
     def close(self) -> None:
         """Close the emulated machines."""
-        for part in self._parts:
-            part.close()
-
-    def __enter__(self) -> Twins:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class _Part:
-    """Twins of one load."""
-
-    def __init__(
-        self,
-        robust: RobustScore,
-        device: Device,
-        motor: Motor,
-        axes: NDArray[np.int64],
-        known: Sequence[Known],
-        scaler: Floats,
-        sets: int,
-        worlds: Sequence[MachineVariant],
-    ) -> None:
-        self.axes = axes
-        self._shape = (len(axes), sets, len(worlds))
-        self._robust = robust
-        rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
-        parameters = {
-            name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
-        }
-        supply = np.array([one.plant.supply for one in known])
-        self._robust.set_machines(parameters, self._spread(supply))
-        # What the motor must push for is what the load pulls.
-        pull = np.array([-one.offset * motor.torque_constant for one in known])
-        self._robust.set_constant_load(self._spread(pull))
-        inertia = np.array([one.plant.inertia for one in known])
-        move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]), highest_ramp(device))
-        distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:4])
-        self._robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
-
-    def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values per axis, (axes, ...), for all machines, (machines, ...)."""
-        trailing = values.shape[1:]
-        return np.broadcast_to(values[:, None, None], (*self._shape, *trailing)).reshape(-1, *trailing)
-
-    def _spread_worlds(self, values: Floats) -> Floats:
-        """Return values per axis and world, (axes, worlds), for all machines, (machines,)."""
-        return np.broadcast_to(values[:, None], self._shape).reshape(-1)
-
-    def judge(self, gains: Integers) -> tuple[Floats, Floats]:
-        """Return performance and slack over the worlds, (axes, sets) each."""
-        every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
-        found = self._robust.score(every)
-        worth = np.exp(np.log(found.performance).reshape(self._shape).mean(axis=2))
-        slack = found.slack.reshape(self._shape)[:, :, 0]
-        # A drive on which that swings would be stopped: a trial sees the move and the probe.
-        swing = found.swing.max(axis=1).reshape(self._shape).max(axis=2)
-        slack = np.minimum(slack, 1.0 - np.minimum(swing / MOST_SWING, 1.0 - TRIPPED))
-        return np.asarray(worth), slack
-
-    def close(self) -> None:
-        self._robust.close()
+        for _, robust in self._parts:
+            robust.close()
 
 
 def least_gains(device: Device) -> Integers:

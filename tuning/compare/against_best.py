@@ -14,8 +14,6 @@ import numpy as np
 from tuning.bootstrap import bootstrap_interval
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from tuning.compare.comparison import Comparison
 
 
@@ -37,25 +35,15 @@ class RivalRow:
     better: int
 
 
-def against_the_best(comparison: Comparison, tuner: str, rivals: Sequence[str]) -> RivalRow:
-    """Return a tuner against the best of others on each machine.
-
-    Raises:
-        ValueError: If there is no rival, or the tuner is one of them.
-    """
-    if not rivals or tuner in rivals:
-        raise ValueError(f"rivals of {tuner} must be other tuners, at least one, not {', '.join(rivals) or 'none'}")
-    own = np.array([row.robust_cost for row in comparison.of(tuner)])
-    best = np.min([[row.robust_cost for row in comparison.of(name)] for name in rivals], axis=0)
-    ratio = own / best
-    low, high = bootstrap_interval(lambda drawn: np.median(drawn, axis=1), ratio)
-    return RivalRow(tuner, ", ".join(rivals), len(ratio), float(np.median(ratio)), low, high, int(np.sum(ratio < 1.0)))
-
-
 def all_rivals(comparison: Comparison) -> tuple[RivalRow, ...]:
-    """Return every tuner against all others, the best first; nothing if there is but one."""
-    names = [row.tuner for row in comparison.tuners]
-    if len(names) < 2:
-        return ()
-    rows = [against_the_best(comparison, name, [other for other in names if other != name]) for name in names]
+    """Return every tuner against the best of all others on each machine, the best first; nothing of one alone."""
+    costs = {one.tuner: np.array([row.robust_cost for row in comparison.of(one.tuner)]) for one in comparison.tuners}
+    rows = []
+    for name, own in costs.items():
+        others = [other for other in costs if other != name]
+        if others:
+            ratio = own / np.min([costs[other] for other in others], axis=0)
+            low, high = bootstrap_interval(lambda drawn: np.median(drawn, axis=1), ratio)
+            figures = float(np.median(ratio)), low, high, int(np.sum(ratio < 1.0))
+            rows.append(RivalRow(name, ", ".join(others), len(ratio), *figures))
     return tuple(sorted(rows, key=lambda row: row.median))

@@ -16,9 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
 from drive_env.loops.dynamics import DEFAULT
 from mechanics.untrusted import parse_json
@@ -34,11 +32,10 @@ from tuning.search.trial_bench import read_gains
 from tuning.target import Target
 
 if TYPE_CHECKING:
+    from tuning.arrays import Integers
     from tuning.identify.estimate import Identification
     from tuning.runs.pools import Pool
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
 NEAR_PHASE, NEAR_GAIN = 5.0, 1.0  # degrees and dB by which margins may be missed and still be near
@@ -157,18 +154,18 @@ def compare(
         dynamics: What the loops must keep, by which gains are judged.
     """
     best = find_oracles(machines, num_threads, dynamics=dynamics) if oracles is None else oracles
-    tasks = [(indices, name) for indices in groups(machines) for name in tuners]
-    done = {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
+    kinds = [[machines[index] for index in indices] for indices in groups(machines)]
+    tasks = [
+        _Task(group, [best[machine.name] for machine in group], seed, dynamics, name, trials)
+        for group in kinds for name in tuners
+    ]  # fmt: skip
+    done = _rows_in(log)
     left = [k for k in range(len(tasks)) if k not in done]
 
-    def say(k: int) -> None:
-        machine = machines[tasks[k][0][0]]
-        progress(f"{tasks[k][1]} on {machine.load}, {machine.motor}", len(done) / len(tasks))
+    def say(task: _Task) -> None:
+        progress(f"{task.tuner} on {task.group[0].load}, {task.group[0].motor}", len(done) / len(tasks))
 
-    if pool is None:
-        fresh = _here(machines, tuners, tasks, left, best, seed, num_threads, dynamics, say)
-    else:
-        fresh = _elsewhere(machines, tasks, left, best, seed, trials, dynamics, pool, say)
+    fresh = _here(tasks, left, tuners, num_threads, say) if pool is None else _elsewhere(tasks, left, pool, say)
     for k, rows in fresh:
         done[k] = rows
         if log is not None:
@@ -181,95 +178,72 @@ def compare(
 
 def so_far(machines: Sequence[SuiteMachine], tuners: Sequence[str], log: ShardLog) -> Comparison | None:
     """Return the comparison on those machines that a run which was stopped has had all tuners tune; None if none."""
-    return _compared(machines, tuners, {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()})
+    return _compared(machines, tuners, _rows_in(log))
 
 
 def _compared(
     machines: Sequence[SuiteMachine], tuners: Sequence[str], done: Mapping[int, Sequence[MachineRow]]
 ) -> Comparison | None:
     """Return the comparison by the rows of tasks; on the machines that all tuners have tuned."""
-    tasks = [(indices, name) for indices in groups(machines) for name in tuners]
-    found = {(tasks[k][1], i): row for k, own in done.items() for i, row in zip(tasks[k][0], own, strict=True)}
-    common = [i for i in range(len(machines)) if all((name, i) in found for name in tuners)]
+    found = {(row.tuner, row.machine): row for rows in done.values() for row in rows}
+    common = [machine.name for machine in machines if all((name, machine.name) in found for name in tuners)]
     if not common:
         return None
-    ordered = tuple(found[name, i] for name in tuners for i in common)
+    ordered = tuple(found[name, machine] for name in tuners for machine in common)
     summaries = [_summary(name, [row for row in ordered if row.tuner == name]) for name in tuners]
     return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (-row.kept, row.median, row.tuner))))
 
 
-class _GroupTask(NamedTuple):
-    """A tuner on the machines of a group, for another process."""
+class _Task(NamedTuple):
+    """A tuner on the machines of a group."""
 
     group: list[SuiteMachine]
-    tuner: str
     oracles: list[Oracle]
-    trials: int | None
     seed: int
     dynamics: str
+    tuner: str
+    trials: int | None
 
 
-def _run(task: _GroupTask) -> str:
-    """Return what a tuner makes of the machines of a group, as text."""
-    with closing(Yardstick(task.group, 1, dynamics=task.dynamics)) as yardstick:
-        tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics))
-        return _text_of(_rows(task.tuner, task.group, tuned, yardstick, task.oracles))
+Fresh = Iterator[tuple[int, list[MachineRow]]]  # the number of a task, and its rows
+Say = Callable[[_Task], None]  # called with a task that begins, or has come back
 
 
 def _here(
-    machines: Sequence[SuiteMachine],
-    tuners: Mapping[str, Tuner],
-    tasks: Sequence[tuple[Sequence[int], str]],
-    left: Sequence[int],
-    oracles: Mapping[str, Oracle],
-    seed: int,
-    num_threads: int | None,
-    dynamics: str,
-    say: Callable[[int], None],
-) -> Iterator[tuple[int, list[MachineRow]]]:
-    """Give the number and the rows of each task as it is done, group by group: what a group needs is made once."""
+    tasks: Sequence[_Task], left: Sequence[int], tuners: Mapping[str, Tuner], num_threads: int | None, say: Say
+) -> Fresh:
+    """Do tasks one after the other; what a group needs is made once."""
     with ExitStack() as open_now:
-        indices: Sequence[int] = ()
+        bench: _Bench | None = None
         for k in left:
-            if tasks[k][0] is not indices:
+            if bench is None or bench.task.group is not tasks[k].group:
                 open_now.close()
-                indices = tasks[k][0]
-                group = [machines[index] for index in indices]
-                yardstick = Yardstick(group, num_threads, dynamics=dynamics)
-                bench = _Bench(group, seed, num_threads)
-                open_now.callback(yardstick.close)
-            name = tasks[k][1]
-            say(k)
-            best = [oracles[machine.name] for machine in group]
-            yield k, _rows(name, group, bench.tune(name, tuners[name]), yardstick, best)
+                bench = open_now.enter_context(closing(_Bench(tasks[k], num_threads)))
+            say(tasks[k])
+            yield k, bench.rows(tasks[k].tuner, tuners[tasks[k].tuner])
 
 
-def _elsewhere(
-    machines: Sequence[SuiteMachine],
-    tasks: Sequence[tuple[Sequence[int], str]],
-    left: Sequence[int],
-    oracles: Mapping[str, Oracle],
-    seed: int,
-    trials: int | None,
-    dynamics: str,
-    pool: Pool,
-    say: Callable[[int], None],
-) -> Iterator[tuple[int, list[MachineRow]]]:
-    """Give the number and the rows of each task as it comes back."""
-    found = [oracles[machine.name] for machine in machines]
-    machines = [
-        replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor})) for one in machines
-    ]
+def _elsewhere(tasks: Sequence[_Task], left: Sequence[int], pool: Pool, say: Say) -> Fresh:
+    """Have tasks done by others, with the content of their files, in whatever order they come back."""
     items = [
-        _GroupTask([machines[i] for i in where], name, [found[i] for i in where], trials, seed, dynamics)
-        for where, name in (tasks[k] for k in left)
-    ]
+        tasks[k]._replace(group=[
+            replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor}))
+            for one in tasks[k].group
+        ])
+        for k in left
+    ]  # fmt: skip
     for place, text in pool.unordered(_run, items, fits=_is_of):
-        say(left[place])
+        say(tasks[left[place]])
         yield left[place], _rows_of(text)
 
 
-def _is_of(task: _GroupTask, text: Any) -> bool:
+def _run(task: _Task) -> str:
+    """Return what a tuner makes of the machines of a group, as text."""
+    with closing(_Bench(task, 1)) as bench:
+        return _text_of(bench.rows(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics)))
+
+
+def _is_of(task: _Task, text: Any) -> bool:
     """Return whether a text has the rows of a tuner on a group."""
     rows = [(row.tuner, row.machine) for row in _rows_of(text)]
     return rows == [(task.tuner, machine.name) for machine in task.group]
@@ -283,29 +257,29 @@ def _rows_of(text: str) -> list[MachineRow]:
     return [MachineRow(**row) for row in parse_json(text)]
 
 
-class _Tuned(NamedTuple):
-    """What came of a tuner on the machines of a group: its outcome, or why there is none and the gains it left."""
-
-    outcome: Outcome | None
-    gains: Integers
-    failure: str
-    audit: DriveAudit
+def _rows_in(log: ShardLog | None) -> dict[int, list[MachineRow]]:
+    return {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
 
 
 class _Bench:
-    """Has tuners tune the machines of a group, each time fresh from the box."""
+    """The machines of a task's group, which tuners tune one after the other, each time fresh from the box."""
 
-    def __init__(self, group: Sequence[SuiteMachine], seed: int, num_threads: int | None) -> None:
-        self._group, self._seed, self._num_threads = group, seed, num_threads
+    def __init__(self, task: _Task, num_threads: int | None) -> None:
+        self.task, self._num_threads = task, num_threads
+        self._yardstick = Yardstick(task.group, num_threads, dynamics=task.dynamics)
         self._identified: tuple[list[Identification], float, Integers, DriveAudit] | None = None
 
-    def tune(self, name: str, tuner: Tuner) -> _Tuned:
-        """Return what comes of a tuner."""
-        with open_group(self._group, self._num_threads) as target:
+    def close(self) -> None:
+        """Give the yardstick's machines back."""
+        self._yardstick.close()
+
+    def _tune(self, name: str, tuner: Tuner) -> tuple[Outcome | None, Integers, str, DriveAudit]:
+        """Return a tuner's outcome, or None and why; the gains it left, and what was counted meanwhile."""
+        with open_group(self.task.group, self._num_threads) as target:
             audit = DriveAudit(target)
             watched = replace(target, drives=ObservedDrives(target.drives, audit))
-            machines = (zlib.crc32(machine.name.encode()) for machine in self._group)
-            rng = np.random.default_rng((self._seed, zlib.crc32(name.encode()), *machines))
+            machines = (zlib.crc32(machine.name.encode()) for machine in self.task.group)
+            rng = np.random.default_rng((self.task.seed, zlib.crc32(name.encode()), *machines))
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
                 try:
@@ -313,9 +287,9 @@ class _Bench:
                         outcome, audit = self._propose(tuner, watched, audit)
                     else:
                         outcome = tuner(watched, rng)
-                    return _Tuned(outcome, _checked_gains(outcome, target), "", audit)
+                    return outcome, _checked_gains(outcome, target), "", audit
                 except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
-                    return _Tuned(None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit)
+                    return None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit
 
     def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
         """Return what a rule proposes, and the audit of the identification, which is the same for all rules."""
@@ -326,49 +300,47 @@ class _Bench:
         found, seconds, before, audit = self._identified
         return tuner.propose(target, found, before, seconds), audit
 
-
-def _rows(
-    name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Yardstick, oracles: Sequence[Oracle]
-) -> list[MachineRow]:
-    """Return what a tuner made of every machine of a group."""
-    scores, worst = yardstick.score(tuned.gains), yardstick.margins(tuned.gains)
-    outcome, audit, asked = tuned.outcome, tuned.audit, yardstick.dynamics
-    per_machine = len(tuned.gains) // len(group)
-    names = find_device(group[0].device).gains.names
-    vouched = None if outcome is None else outcome.accepted
-    accepted = np.full(len(tuned.gains), outcome is not None) if vouched is None else vouched
-    rows = []
-    for k, machine in enumerate(group):
-        axes = slice(k * per_machine, (k + 1) * per_machine)
-        counts = audit.violations[:, axes].sum(axis=1)
-        notes = [tuned.failure] if outcome is None else [note for note in outcome.notes[axes] if note]
-        phase, gain, ms = (float(value[k]) if np.isfinite(value[k]) else None for value in worst)
-        rows.append(
-            MachineRow(
-                tuner=name,
-                machine=machine.name,
-                robust_cost=float(scores.robust_cost[k]),
-                performance=float(scores.performance[k]),
-                oracle=oracles[k].performance,
-                relative=float(scores.performance[k]) / oracles[k].performance,
-                slack=float(scores.slack[k]) if np.isfinite(scores.slack[k]) else None,
-                phase_deg=phase,
-                gain_db=gain,
-                ms=ms,
-                near=(phase is None or phase >= asked.phase_deg - NEAR_PHASE)
-                and (gain is None or gain >= asked.gain_db - NEAR_GAIN),
-                accepted=bool(accepted[axes].all()),
-                drive_seconds=round(float(audit.seconds[axes].max()), 3),
-                moves=int(audit.moves[axes].sum()),
-                aborts=0 if outcome is None else int(outcome.aborts[axes].sum()),
-                violations=int(counts.sum()),
-                kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),
-                failed=outcome is None,
-                gains=dict(zip(names, map(int, tuned.gains[axes.start]), strict=True)),
-                note=" | ".join(notes).replace("\n", " "),
+    def rows(self, name: str, tuner: Tuner) -> list[MachineRow]:
+        """Return what a tuner makes of every machine."""
+        outcome, gains, failure, audit = self._tune(name, tuner)
+        scores, worst = self._yardstick.score(gains), self._yardstick.margins(gains)
+        asked, per_machine = self._yardstick.dynamics, self._yardstick.axes
+        vouched = None if outcome is None else outcome.accepted
+        accepted = np.full(len(gains), outcome is not None) if vouched is None else vouched
+        rows = []
+        for k, (machine, oracle) in enumerate(zip(self.task.group, self.task.oracles, strict=True)):
+            axes = slice(k * per_machine, (k + 1) * per_machine)
+            counts = audit.violations[:, axes].sum(axis=1)
+            notes = [failure] if outcome is None else [note for note in outcome.notes[axes] if note]
+            phase, gain, ms, slack = (
+                float(value[k]) if np.isfinite(value[k]) else None for value in (*worst, scores.slack)
             )
-        )
-    return rows
+            rows.append(
+                MachineRow(
+                    tuner=name,
+                    machine=machine.name,
+                    robust_cost=float(scores.robust_cost[k]),
+                    performance=float(scores.performance[k]),
+                    oracle=oracle.performance,
+                    relative=float(scores.performance[k]) / oracle.performance,
+                    slack=slack,
+                    phase_deg=phase,
+                    gain_db=gain,
+                    ms=ms,
+                    near=(phase is None or phase >= asked.phase_deg - NEAR_PHASE)
+                    and (gain is None or gain >= asked.gain_db - NEAR_GAIN),
+                    accepted=bool(accepted[axes].all()),
+                    drive_seconds=round(float(audit.seconds[axes].max()), 3),
+                    moves=int(audit.moves[axes].sum()),
+                    aborts=0 if outcome is None else int(outcome.aborts[axes].sum()),
+                    violations=int(counts.sum()),
+                    kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),
+                    failed=outcome is None,
+                    gains=dict(zip(self._yardstick.device.gains.names, map(int, gains[axes.start]), strict=True)),
+                    note=" | ".join(notes).replace("\n", " "),
+                )
+            )
+        return rows
 
 
 def _checked_gains(outcome: Any, target: Target) -> Integers:

@@ -21,18 +21,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import has_linear_model, integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.whole_file import write_table
 from mechanics.untrusted import read_rows
+from tuning.arrays import Floats, Integers, Mask
 from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG, LEAST_TORQUE
 from tuning.compare.suite import SuiteMachine, groups
 from tuning.compare.yardstick import Yardstick
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 KEPT = Path(__file__).with_name("oracles.csv")
 HEAD = ("device", "machine", "digest", "gains", "performance", "slack")
@@ -118,7 +115,7 @@ class _Box(NamedTuple):
     rule: Floats
     least: Floats
     most: Floats
-    outer: NDArray[np.bool_]
+    outer: Mask
 
     @classmethod
     def of(cls, yardstick: Yardstick) -> _Box:

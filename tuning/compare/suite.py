@@ -11,13 +11,13 @@ import math
 import tomllib
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -31,9 +31,6 @@ from tuning.identify.linked_axes import are_linked
 from tuning.runs.inputs import files_of, is_path, is_shipped, taken
 from tuning.target import Target
 from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 SHIPPED = Path(__file__).parent / "suites"
 FRICTION = "stribeck"
@@ -121,7 +118,12 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
         machines += _generated(f"{where}: generated", device, table.get("generated", []), seed, path.parent)
     if not machines:
         raise ExperimentError(f"{where}: it has no machine; add a [[group]], or [[generated]] and a seed")
-    _check_names(where, machines)
+    names = [machine.name for machine in machines]
+    for name in names:
+        if names.count(name) > 1:
+            raise ExperimentError(
+                f"{where}: two machines are named {name!r}; put machines of one load and motor into one group"
+            )
     return tuple(machines) if count is None else _spread(machines, count)
 
 
@@ -131,18 +133,6 @@ def groups(machines: Sequence[SuiteMachine]) -> list[list[int]]:
     for k, machine in enumerate(machines):
         found.setdefault(machine.kind, []).append(k)
     return list(found.values())
-
-
-def open_machines(
-    machines: Sequence[SuiteMachine], num_threads: int | None = None
-) -> Iterator[tuple[Target, list[int]]]:
-    """Yield machines ready to be tuned, those of one load and motor as one target, and their indices.
-
-    The drives come up commissioned for their motor and at rest; they are closed when the next ones are asked for.
-    """
-    for indices in groups(machines):
-        with open_group([machines[k] for k in indices], num_threads) as target:
-            yield target, indices
 
 
 def open_group(machines: Sequence[SuiteMachine], num_threads: int | None = None) -> Target:
@@ -191,15 +181,15 @@ def _path(name_or_path: str | Path) -> Path:
     if isinstance(name_or_path, Path) or str(name_or_path).endswith(".toml"):
         path = Path(name_or_path)
         if not path.is_file():
-            raise ExperimentError(f"there is no file {path} of machines; the suites that ship are {_names()}")
+            raise ExperimentError(
+                f"there is no file {path} of machines; the suites that ship are {', '.join(suite_names())}"
+            )
         return path
     if name_or_path not in suite_names():
-        raise ExperimentError(f"no suite is named {name_or_path!r}; there are {_names()}, or give a .toml")
+        raise ExperimentError(
+            f"no suite is named {name_or_path!r}; there are {', '.join(suite_names())}, or give a .toml"
+        )
     return SHIPPED / f"{name_or_path}.toml"
-
-
-def _names() -> str:
-    return ", ".join(suite_names())
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -269,16 +259,6 @@ def _numbers(where: str, value: Any, count: int | None = None) -> list[float]:
     return [item if item == math.inf else as_value(where, item, "float") for item in value]
 
 
-def _check_names(where: str, machines: Sequence[SuiteMachine]) -> None:
-    seen: set[str] = set()
-    for machine in machines:
-        if machine.name in seen:
-            raise ExperimentError(
-                f"{where}: two machines are named {machine.name!r}; put machines of one load and motor into one group"
-            )
-        seen.add(machine.name)
-
-
 def _checked_defaults(where: str, device: str, load: str, motor: str) -> dict[str, float]:
     try:
         return _defaults(device, load, motor)
@@ -286,19 +266,14 @@ def _checked_defaults(where: str, device: str, load: str, motor: str) -> dict[st
         raise ExperimentError(f"{where}: {error}") from error
 
 
+@cache
 def _defaults(device: str, load: str, motor: str) -> dict[str, float]:
-    """Return the default of every parameter of a machine."""
-    key = (device, load, motor)
-    if key not in _DEFAULTS:
-        find_motor(motor), find_load(load)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MisfitWarning)  # of the default machine, which may not be one of ours
-            with EmulatedDrives(device, load, motor, num_threads=1) as drives:
-                _DEFAULTS[key] = {name: float(value[0]) for name, value in drives.machine.parameters.items()}
-    return _DEFAULTS[key]
-
-
-_DEFAULTS: dict[tuple[str, str, str], dict[str, float]] = {}  # they never change, and take a load's compilation
+    """Return the default of every parameter of a machine; they never change, and take a load's compilation."""
+    find_motor(motor), find_load(load)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MisfitWarning)  # of the default machine, which may not be one of ours
+        with EmulatedDrives(device, load, motor, num_threads=1) as drives:
+            return {name: float(value[0]) for name, value in drives.machine.parameters.items()}
 
 
 def _spread(machines: Sequence[SuiteMachine], count: int) -> tuple[SuiteMachine, ...]:

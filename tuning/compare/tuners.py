@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
 from drive_env.loops.dynamics import DEFAULT
@@ -25,10 +24,9 @@ from tuning.target import Target, timed
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.arrays import Integers
     from tuning.identify.estimate import Identification
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+    from tuning.rules.proposal import Proposal
 
 ENTRY_POINTS = "drive_env.tuners"
 
@@ -54,7 +52,7 @@ class MissingTunerError(ValueError):
 def tuner_rows() -> dict[str, TunerKind]:
     """Return all tuners by name: those of this package, the rules, and those that others have registered."""
     rows = {row.name: row for row in _OWN}
-    rows |= {name: TunerKind(name, f"rule {name}", partial(RuleTuner, name)) for name in _rule_names()}
+    rows |= {name: TunerKind(name, f"rule {name}", partial(RuleTuner, name)) for name in _rules()}
     rows |= {row.name: row for row in _AFTER}
     for entry in sorted(importlib.metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         distribution = entry.dist.name if entry.dist else "an unknown package"
@@ -110,7 +108,7 @@ class RuleTuner:
     """
 
     def __init__(self, name: str) -> None:
-        self._rule = importlib.import_module("tuning.rules.rules_by_name").RULES[name]
+        self._rule = _rules()[name]
 
     def __call__(self, target: Target, rng: np.random.Generator) -> Outcome:
         """Tune a target."""
@@ -148,8 +146,10 @@ def identify_all(target: Target) -> tuple[list[Identification], float]:
     return found, clock.seconds
 
 
-def _rule_names() -> tuple[str, ...]:
-    return tuple(importlib.import_module("tuning.rules.rules_by_name").RULES)
+def _rules() -> Mapping[str, Callable[..., Proposal]]:
+    from tuning.rules.rules_by_name import RULES
+
+    return RULES
 
 
 def _auto(dynamics: str | Dynamics) -> Tuner:

@@ -17,11 +17,9 @@ from drive_env.loops.true_plant import true_machines
 from drive_env.loops.worst_margins import WorstMargins, worst_margins
 from drive_env.trials.positioning import highest_ramp, longer_way, plan_move
 from drive_env.trials.score import RobustScore, Scores
+from tuning.arrays import Floats, Integers
 from tuning.compare.suite import SuiteMachine, open_group
 from tuning.identify.moved_inertia import true_inertia
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Runs of every machine and variant, each with a noise of its own, whose scores are averaged: with one run, the same
 # gains get a score that differs by 10 % on some machines.

@@ -14,7 +14,7 @@ from drive_env.gains import read_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import wrapped
-from tuning.auto.checks import wrong_wiring
+from tuning.auto.checks import identified_plant
 from tuning.auto.loop_model import loop_models
 from tuning.auto.stages import IdentifiedAxes
 from tuning.identify.quick_identification import identify_briefly
@@ -51,11 +51,7 @@ class ModelMargins:
             found = identify_briefly(target, where)
         plants: list[Plant | None] = [None] * target.num_axes
         for k in map(int, np.flatnonzero(where)):
-            wrong = wrong_wiring(target, found[k])
-            try:
-                plants[k] = Plant.from_identification(target.device, target.motor, float(target.supply[k]), found[k])
-            except ValueError as error:
-                wrong = wrong or str(error)
+            plants[k], wrong = identified_plant(target, k, found[k])
             if wrong:
                 number = axis_number(target.drives, k)
                 raise RuntimeError(f"axis {number}: no margins can be kept without a model of its loops: {wrong}")

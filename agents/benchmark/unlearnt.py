@@ -1,0 +1,56 @@
+"""Policies that have learnt nothing: a task of the suite that one of them wins would be none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.envs import make_vector
+from drive_env.envs.suite import TASKS
+
+Floats = NDArray[np.float64]
+
+AXIS_ENTRIES = 8  # of an axis in Tracking's observation; the first is the following error
+CONSTANTS = (-1.0, -0.5, -0.2, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)
+
+
+def _constant(value: float) -> Callable[[Floats, np.random.Generator], Floats]:
+    return lambda error, rng: np.full_like(error, value)
+
+
+# Name -> action of every entry from the following errors, shape (machines, entries), and a generator.
+POLICIES: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
+    "zero": lambda error, rng: np.zeros_like(error),
+    "random": lambda error, rng: rng.uniform(-1.0, 1.0, error.shape),
+    "bang-bang": lambda error, rng: np.sign(error),
+    **{f"constant {value:g}": _constant(value) for value in CONSTANTS},
+}
+
+
+def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
+    """Return each policy's mean score, 0...1, on the machines of the seeds 0, 1, ... of a task.
+
+    Raises:
+        ValueError: If a reward is not in 0...1.
+    """
+    lanes = make_vector(len(POLICIES) * machines, name=name, autoreset_mode="NextStep")
+    try:
+        entries = lanes.single_action_space.shape[0]  # type: ignore[index]
+        seen, _ = lanes.reset(seed=list(range(machines)) * len(POLICIES))  # every policy meets the same ones
+        rng = np.random.default_rng(0)
+        total, going = np.zeros(lanes.num_envs), np.ones(lanes.num_envs, bool)
+        for _ in range(TASKS[name].steps):
+            rows = np.asarray(seen, float)[:, : AXIS_ENTRIES * entries]
+            errors = rows.reshape(len(POLICIES), machines, entries, AXIS_ENTRIES)[..., 0]
+            action = np.stack([act(error, rng) for act, error in zip(POLICIES.values(), errors, strict=True)])
+            seen, reward, terminated, _, _ = lanes.step(action.reshape(-1, entries).astype(np.float32))
+            if np.any((reward < 0.0) | (reward > 1.0)):
+                raise ValueError(f"a reward of {name} is {reward.min():g} to {reward.max():g}; it must lie in 0...1")
+            total += np.where(going, reward, 0.0)
+            going &= ~terminated
+    finally:
+        lanes.close()
+    means = total.reshape(len(POLICIES), machines).mean(axis=1) / TASKS[name].steps
+    return dict(zip(POLICIES, means.tolist(), strict=True))

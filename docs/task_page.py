@@ -1,0 +1,133 @@
+"""docs/tasks.md from the suite's table and docs/task_scores.json: `python docs/task_page.py` writes it anew.
+
+`python docs/task_page.py FOLDER` takes the scores from the folder of a `drive-agent benchmark` first, and plays the
+policies that have learnt nothing.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from agents.policies.baselines import SUITE_TASKS
+from agents.training.tasks import short_name
+from drive_env.envs.suite import TASKS, SuiteTask
+from drive_env.envs.tracking import Tracking
+
+HERE = Path(__file__).parent
+SCORES = HERE / "task_scores.json"
+MACHINES = 24
+INTRODUCTION = """# Learning tasks
+
+Tasks to train on and to compare agents by. Each is an id that never changes: device, load, mode, action, distributions,
+horizon and reward belong to it, and it takes no options. `gymnasium.make("ServoDrive/Crane-v1")` makes one,
+`drive_env.envs.make_vec_env("ServoDrive/Crane-v1", num_envs=64)` many for Stable-Baselines3, `drive-agent train
+--environment Crane-v1` trains, and `drive-agent benchmark --task Crane-v1` trains with several seeds and judges in
+held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0`, whose configurations these are.
+
+The reward of a step lies in 0...1, nothing is earned after a fall or a trip, and the score of an episode is the sum of
+rewards over the horizon. Every episode has a machine of its own, drawn from the load's distributions: inertia,
+friction, stiffness, motor, power stage, and the delays of the bus.
+
+What is in the table: the best of twelve policies that have learnt nothing (zero, random, bang-bang on the following
+error, nine constants); the *cascade* that a drive or a master has anyway; the *expert*, which is what a motion engineer
+would program who knows the parameters of each machine; and agents that were trained as the benchmark trains them, with the
+interquartile mean and its 95 % interval. Agents see only what the drives tell.
+
+"""
+
+
+def page() -> str:
+    """Return the page."""
+    scores = json.loads(SCORES.read_text(encoding="utf-8"))
+    rows = [_row(name, task, scores.get(name, {})) for name, task in TASKS.items()]
+    table = "\n".join(
+        [
+            "| task | what has learnt nothing | cascade | expert | trained agents |",
+            "| --- | --- | --- | --- | --- |",
+            *rows,
+        ]
+    )
+    return INTRODUCTION + table + "\n\n" + "\n".join(_section(*item) for item in TASKS.items()) + _spaces()
+
+
+def _row(name: str, task: SuiteTask, scores: dict[str, Any]) -> str:
+    unlearnt = scores.get("unlearnt", {})
+    best = max(unlearnt, key=lambda policy: unlearnt[policy], default="")
+    agents = "; ".join(
+        f"{policy} {one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f}), {one['steps']:,} steps x {one['seeds']}"
+        for policy, one in scores.get("trained", {}).items()
+    )
+    baselines = scores.get("baselines", {})
+    shown = [f"{baselines[row]:.3f}" if row in baselines else "-" for row in ("cascade", "expert")]
+    plain = f"{unlearnt[best]:.3f} ({best})" if best else "-"
+    return f"| [{name.partition('/')[2]}](#{_anchor(name)}) | {plain} | {shown[0]} | {shown[1]} | {agents or '-'} |"
+
+
+def _section(name: str, task: SuiteTask) -> str:
+    options = "\n".join(f"{key} = {_toml(value)}" for key, value in task.options.items() if not isinstance(value, dict))
+    tables = "\n".join(
+        f"{key} = {{ {', '.join(f'{one} = {number:g}' for one, number in value.items() if number)} }}"
+        for key, value in task.options.items()
+        if isinstance(value, dict)
+    )
+    first = str(inspect.getdoc(SUITE_TASKS[name]["expert"])).partition("\n")[0].rstrip(".")
+    expert = first.removeprefix("Return the ")
+    return "\n".join(
+        [
+            f"## {name.partition('/')[2]}\n",
+            f"{task.about[0].upper()}{task.about[1:]}. An episode has {task.steps} steps. The expert:",
+            f"{expert[0].lower()}{expert[1:]}.\n",
+            f"![The machine and its expert at work](assets/tasks/{short_name(name)}.webp)\n",
+            f"```toml\n{options}\n{tables}\n```\n",
+        ]
+    )
+
+
+def _spaces() -> str:
+    text = inspect.cleandoc(Tracking.__doc__ or "").partition("\nArgs:\n")[0]
+    return (
+        "\n## Actions, observations, terms\n\nOf all of them, as of `ServoDrive/Tracking-v0`:\n\n"
+        + text.partition("\n\n")[2].rstrip()
+        + "\n"
+    )
+
+
+def _anchor(name: str) -> str:
+    return name.partition("/")[2].lower()
+
+
+def _toml(value: Any) -> str:
+    return (
+        f"[{', '.join(map(_toml, value))}]"
+        if isinstance(value, tuple)
+        else json.dumps(value).replace("Infinity", "inf")
+    )
+
+
+def measure(folder: Path) -> None:
+    """Take a benchmark's results into SCORES, with what policies reach that have learnt nothing."""
+    from agents.benchmark.unlearnt import unlearnt_scores
+
+    found: dict[str, dict[str, Any]] = {}
+    for row in json.loads((folder / "results.json").read_text(encoding="utf-8")):
+        if row["task"] not in TASKS:
+            continue
+        own = found.setdefault(row["task"], {"unlearnt": {}, "baselines": {}, "trained": {}})
+        if row["kind"] == "baseline":
+            own["baselines"][row["policy"]] = round(row["score"]["value"], 4)
+        else:
+            figures = {key: round(row["score"][key], 4) for key in ("value", "low", "high")}
+            own["trained"][row["policy"]] = figures | {"steps": row["steps"], "seeds": row["seeds"]}
+    for name, own in found.items():
+        own["unlearnt"] = {policy: round(score, 4) for policy, score in unlearnt_scores(name, MACHINES).items()}
+    SCORES.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        measure(Path(sys.argv[1]))
+    (HERE / "tasks.md").write_text(page(), encoding="utf-8")

@@ -1,0 +1,51 @@
+"""The suite of learning tasks: what is frozen, and that no task is won by a policy that has learnt nothing."""
+
+from __future__ import annotations
+
+import contextlib
+
+import gymnasium
+import numpy as np
+import pytest
+
+from agents.benchmark.unlearnt import unlearnt_scores
+from agents.evaluation.evaluation import evaluate
+from agents.policies.baselines import SUITE_TASKS, baseline
+from agents.training.tasks import environment_name, make_environments
+from drive_env.envs.suite import TASKS
+
+MACHINES = 6
+UNLEARNT, LEAST, MOST = 0.6, 0.7, 0.95  # score of what has learnt nothing at most; of the expert
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_has_its_horizon_and_its_threshold_in_the_spec_and_takes_no_options(name):
+    task = TASKS[name]
+    with gymnasium.make(name) as env:
+        assert env.spec.max_episode_steps == task.steps == env.unwrapped.vector.config.steps
+        assert env.spec.reward_threshold == pytest.approx(task.solved * task.steps)
+        assert np.all(env.action_space.low == -1.0) and np.all(env.action_space.high == 1.0)
+    with contextlib.closing(gymnasium.make_vec(name, 2)) as envs:
+        assert envs.spec.max_episode_steps == task.steps
+    with pytest.raises(ValueError, match="is frozen and takes no 'speed'"):
+        gymnasium.make(name, speed=1.0)
+    assert environment_name(name.partition("/")[2].partition("-")[0]) == name
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_what_has_learnt_nothing_scores_less_than_0_6(name):
+    scores = unlearnt_scores(name, MACHINES)
+    assert max(scores.values()) < UNLEARNT, scores
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
+    scores = {}
+    for row in SUITE_TASKS[name]:
+        lanes = make_environments(name, 1)
+        policy = baseline(row, name, lanes.config, lanes.single_action_space.shape[0])
+        lanes.close()
+        found = evaluate(policy, name, episodes=24, seed=3_000_000)
+        scores[row] = float(np.mean([episode.rewards.sum() for episode in found.episodes])) / TASKS[name].steps
+    assert LEAST <= scores.pop("expert") <= MOST
+    assert max(scores.values()) < UNLEARNT + 0.02, scores
