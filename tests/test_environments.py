@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import warnings
 from contextlib import contextmanager
@@ -461,6 +462,17 @@ def test_an_amplifier_on_mains_is_a_drive_like_any_other(kind, load):
 def test_a_wrong_value_names_the_valid_ones(kind, options, says):
     with pytest.raises(ValueError, match=says):
         KINDS[kind][0](1, **options)
+
+
+@EVERY_KIND
+def test_a_configuration_comes_back_from_json(kind):
+    """As agents and datasets keep it: JSON has no infinity, which Tracking's `fall` is where nothing falls."""
+    from agents.training.tasks import configuration_of
+
+    with lanes_of(kind) as lanes:
+        kept = json.loads(json.dumps(configuration_of(lanes), allow_nan=False))
+        with lanes_of(kind, config=kept) as again:
+            assert again.config == lanes.config
 
 
 @EVERY_KIND
