@@ -55,7 +55,7 @@ class BenchmarkRun:
     seed: int = 0
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     written: Written | None = None
-    episodes: int = EPISODES
+    episodes: int = field(default_factory=lambda: EPISODES)
 
     @property
     def folder(self) -> str:
@@ -94,7 +94,7 @@ def suite_task(text: str) -> str:
 def baseline_runs(task: str) -> list[BenchmarkRun]:
     """Return the runs of a task's baselines."""
     return [
-        BenchmarkRun(task, name, BASELINE, written=Written.of(name, trust=False), episodes=EPISODES)
+        BenchmarkRun(task, name, BASELINE, written=Written.of(name, trust=False))
         for name in baselines_of(task)
     ]
 
@@ -115,7 +115,7 @@ def submitted_run(task: str, text: str, trust: bool) -> BenchmarkRun:
     name = Path(text).stem if names_a_file(text) else text.replace(":", ".")
     if is_baseline(text) or name in (*ALGORITHMS, *baselines_of(task)):
         raise ValueError(f"{text} has the name of a baseline or an algorithm of the table; give it one of its own")
-    return BenchmarkRun(task, name, SUBMITTED, written=Written.of(text, trust), episodes=EPISODES)
+    return BenchmarkRun(task, name, SUBMITTED, written=Written.of(text, trust))
 
 
 def make(
