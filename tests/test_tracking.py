@@ -15,6 +15,7 @@ from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.envs import tracking_cycle as cycle
+from drive_env.envs.suite import TERMS
 from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, WEIGHTS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
 from drive_env.gains import Gains, bandwidths_from_gains
@@ -49,16 +50,18 @@ def run(lanes, given, seed=0):
 
 # --- what the page says -----------------------------------------------------------------------------------------------
 def test_the_page_has_the_terms_of_the_reward_with_their_margins_and_weights():
+    margins = cycle.MARGINS
     rows = {
-        "tracking": f"g(position error, {cycle.TRACKING_MARGIN:g} amplitude)",
-        "speed": f"g(velocity error, {cycle.SPEED_MARGIN:g} speed)",
-        "load": f"g(angle of the pendulum, {cycle.LOAD_MARGIN:g} rad); 0 of a load without sensor",
+        "tracking": f"g(position error, {margins['tracking']:g} amplitude), or the configuration's margin, as below",
+        "speed": f"g(velocity error, {margins['speed']:g} speed)",
+        "load": f"g(angle of the pendulum, {margins['load']:g} rad); 0 of a load without sensor",
+        "carried": f"g(error of where the bob is, {margins['tracking']:g} amplitude); 0 of a load without sensor",
         "effort": "g(torque actual value, current limit)",
-        "smoothness": f"g(change of the action, {cycle.SMOOTHNESS_MARGIN:g})",
+        "smoothness": f"g(change of the action, {margins['smoothness']:g})",
         "trip": "1 in the step in which a drive tripped or the pole fell",
     }
-    assert tuple(rows) == cycle.TERMS
-    assert cycle.EFFORT_MARGIN == 1.0
+    assert tuple(rows) == TERMS
+    assert margins["effort"] == 1.0
     for name, value in rows.items():
         assert f"| {name} | {value} | {WEIGHTS[name]:g}" in Tracking.__doc__
     assert cycle.tolerance(0.3, 0.3) == pytest.approx(0.1)
@@ -83,9 +86,9 @@ def test_the_page_has_what_each_load_follows_by_default():
     ("options", "message"),
     [
         ({"mode": "pp"}, r"mode is one of 'csp', 'csv', 'cst', not 'pp'"),
-        ({"action": "gain"}, r"action is one of 'direct', 'offset', not 'gain'"),
+        ({"action": "gain"}, r"action is one of 'direct', 'offset', 'ramp', not 'gain'"),
         ({"rate": 250}, r"rate is one of 500, 1000, not 250"),
-        ({"trajectory": "circle"}, r"'hold', 'moves', 'sines', not 'circle'"),
+        ({"trajectory": "circle"}, r"'hold', 'moves', 'sines', 'run', not 'circle'"),
         ({"weights": {"speeed": 1.0}}, r"a weight's name is one of 'tracking', .*not 'speeed'"),
         ({"delay": 0}, r"delay is 1\.\.\.10 communication cycles, not 0"),
         ({"stage": 2.0}, r"must lie in 0\.\.\.1, not 2"),
@@ -337,8 +340,73 @@ def test_bus_imperfections_are_drawn_and_late():
         assert set(ages) >= {2.0, 3.0} and 0.05 < np.mean(ages > 2.0) < 0.5
 
 
+# --- ramps, tilts, bobs -----------------------------------------------------------------------------------------------
+def test_ramped_actions_add_up_to_the_target_within_the_full_scale():
+    with tracking(load="inertia", mode="csv", action="ramp", ramp=10.0, speed=8.0) as lanes:
+        lanes.reset(seed=0)
+        full = 1.25 * lanes._episodes.scales[0, 1]
+        for step, (given, sum_of_ramps) in enumerate(((0.5, 0.005), (1.0, 0.015), (-1.0, 0.005), (0.0, 0.005))):
+            lanes.step(np.array([[given]], np.float32))
+            sent = lanes._episodes.actions.held[0, 0]
+            assert sent == pytest.approx(sum_of_ramps * full, abs=0.51), step
+        for _ in range(150):
+            lanes.step(np.array([[1.0]], np.float32))
+        assert lanes._episodes.target[0] == full
+
+
+def test_a_pole_begins_at_the_angle_that_is_drawn_and_falls_as_a_free_one_does():
+    with tracking(16, load="inverted_pendulum", mode="cst", tilt=(-0.2, 0.2), duration=0.3) as lanes:
+        first, _ = lanes.reset(seed=4)
+        angles = first[:, 8].astype(float)
+        assert np.abs(angles).max() <= 0.2 and np.ptp(angles) > 0.2 and not first[:, 9].any()
+        for _ in range(50):
+            seen, *_ = lanes.step(np.zeros((16, 1), np.float32))
+        # The cart is held by its rotor: theta grows as cosh(sqrt(m g l / (m l^2 + I)) t).
+        rate = np.sqrt(0.08 * 9.81 * 0.3 / (0.08 * 0.3**2 + 5e-5))
+        wide = np.abs(angles) > 0.05
+        assert np.allclose(seen[wide, 8] / angles[wide], np.cosh(rate * 0.050), rtol=0.05)
+
+
+def test_the_carried_term_is_the_error_of_where_the_bob_is():
+    with tracking(1, load="cart_pendulum", distributions="cart_pendulum", weights={"carried": 1.0}) as lanes:
+        lanes.reset(seed=2)
+        for _ in range(300):
+            *_, info = lanes.step(np.array([[0.2]], np.float32))
+        machine = lanes.drives.machine
+        reference = lanes._episodes.reference[0, 0, 299]
+        cart = lanes.drives.read((0x6064, 0))[0] - lanes._episodes.origin[0]
+        lead = 0.04 / lanes._per_turn[0]  # m per increment
+        bob = cart * lead + machine.parameters["load.length"][0] * np.sin(lanes._episodes.angles[0])
+        error = (reference * lead - bob) / (lanes.config.amplitude * 0.04)
+        assert info["reward_terms"]["carried"][0] == pytest.approx(1 / (1 + 9 * (error / 0.25) ** 2), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"load": "inertia", "tilt": (0.1, 0.2)}, "tilt is of a pendulum, and load 'inertia' has none"),
+        ({"load": "inverted_pendulum", "tilt": (0.2, 0.1)}, r"tilt is \[low, high\] within a turn, in order"),
+        (
+            {"load": "inverted_pendulum", "tilt": (0.0, 0.7)},
+            "must be beyond the greatest tilt, 0.7 rad",
+        ),
+        ({"margins": {"traking": 1.0}}, "a margin's name is one of 'tracking', .* not 'traking'"),
+        ({"margins": {"tracking": 0.0}}, "the margin of tracking must be above 0 and finite, not 0"),
+        ({"action": "ramp", "ramp": 0.0}, "ramp must be above 0 and finite, not 0"),
+    ],
+)
+def test_wrong_tilts_margins_and_ramps_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrackingConfig(**options)
+
+
 # --- trajectories -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", TRAJECTORIES)
+def test_a_run_goes_on_at_its_speed_from_the_first_moment():
+    position, velocity, acceleration = draw("run", np.random.default_rng(0), 1500, 1e-3, 2.0, 10.0)
+    assert np.allclose(position, 0.01 * np.arange(1500)) and np.all(velocity == 10.0) and not acceleration.any()
+
+
+@pytest.mark.parametrize("kind", [kind for kind in TRAJECTORIES if kind != "run"])
 def test_trajectories_keep_to_their_limits_and_are_smooth(kind):
     for seed in range(30):
         position, velocity, acceleration = draw(kind, np.random.default_rng(seed), 1500, 1e-3, 2.0, 10.0)

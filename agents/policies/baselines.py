@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.experts import CarriageServo, ComputedTorque, Pendulum, SpeedCurve, TorqueCascade
+from agents.policies.experts import CarriageServo, ComputedTorque, Pendulum, SpeedCurve, SwingUp, TorqueCascade
 from agents.training.tasks import environment_name
 
 Array = NDArray[np.float32]
@@ -139,7 +139,7 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": feed_forward},
     "ServoDrive/Crane-v1": {"rest": nothing, "cascade": CarriageServo, "expert": Pendulum},
     "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
-    "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": Pendulum},
+    "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
     "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": feed_forward},
     "ServoDrive/StepperRun-v1": {"rest": nothing, "expert": SpeedCurve},
 }

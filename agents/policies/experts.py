@@ -21,7 +21,6 @@ AXIS_ENTRIES = 8
 ERROR, SPEED_ERROR, POSITION, SPEED, TORQUE, WANTED_SPEED, WANTED_SPEED_LATER = range(7)  # of an axis in Tracking
 PREVIEW = 0.01  # s, how much later
 GRAVITY = 9.81  # m/s^2
-STEP = 0.001  # s
 
 
 class Expert:
@@ -91,13 +90,11 @@ class ComputedTorque(Expert):
 class Pendulum(Expert):
     """A linear-quadratic regulator of cart and pendulum about the flat feed-forward, through the cart's acceleration.
 
-    Flat output is where the bob is (Fliess et al. 1995); the swing-up pumps energy (Astrom and Furuta 2000).
+    Flat output is where the bob is (Fliess et al. 1995).
     """
 
-    WEIGHTS = np.diag([1000.0, 100.0, 0.0, 0.0])  # bob's position and speed, angle and its rate
+    WEIGHTS = np.diag([1000.0, 30.0, 0.0, 0.0])  # bob's position and speed, angle and its rate
     EFFORT = 0.05
-    CATCH = 0.5  # rad from upright, within which the regulator acts
-    PUMP, CENTRE, BRAKE = 10.0, 6.0, 3.0  # 1/m, 1/s^2, 1/s
 
     def __init__(self, configuration: Any) -> None:
         super().__init__(configuration)
@@ -120,12 +117,6 @@ class Pendulum(Expert):
         )
         gains = np.stack([self._gain(round(float(one), 4), sign) for one in length])
         acceleration = wanted - np.sum(gains * state, axis=1)
-        if configuration.fall == np.inf and self._stands:
-            energy = 0.5 * (length * rate) ** 2 + GRAVITY * length * (np.cos(angle) - 1.0)  # J/kg, 0 upright
-            pumped = self.PUMP * energy * np.sign(rate * np.cos(angle))
-            pumped = np.clip(pumped, -0.8 * greatest, 0.8 * greatest)
-            pumped -= self.CENTRE * amplitude * rows[:, POSITION] + self.BRAKE * speed * rows[:, SPEED]
-            acceleration = np.where(np.abs(angle) < self.CATCH, acceleration, pumped)
         return np.asarray(acceleration / greatest)[:, None]
 
     def _gain(self, length: float, sign: float) -> Floats:
@@ -136,13 +127,34 @@ class Pendulum(Expert):
             model = np.zeros((5, 5))
             model[0, 1] = model[2, 3] = model[1, 4] = 1.0
             model[3, 2], model[3, 4] = sign * GRAVITY / length, -1.0 / length
-            discrete = expm(STEP * model)
+            discrete = expm(model / self.configuration.rate)
             a, b = discrete[:4, :4], discrete[:4, 4:]
             bob = np.eye(4)
             bob[0, 2] = bob[1, 3] = length
             cost = solve_discrete_are(a, b, bob.T @ self.WEIGHTS @ bob, np.array([[self.EFFORT]]))
             self._gains[length] = np.linalg.solve(self.EFFORT + b.T @ cost @ b, b.T @ cost @ a)[0]
         return self._gains[length]
+
+
+class SwingUp(Pendulum):
+    """Pumps energy into a hanging pole (Astrom and Furuta 2000) and has the regulator catch it."""
+
+    WEIGHTS = np.diag([100.0, 10.0, 10.0, 1.0])
+    CATCH = 0.5  # rad from upright, within which the regulator acts
+    PUMP, CENTRE, BRAKE, MOST = 10.0, 10.0, 4.0, 0.8  # 1/m, 1/s^2, 1/s, of the greatest acceleration
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the cart's speed, of the greatest."""
+        configuration, lead = self.configuration, self._lead
+        greatest = 1.25 * configuration.ramp * lead * configuration.speed
+        length = self.parameter("load.length", configuration.task.length)
+        angle, rate = rows[:, AXIS_ENTRIES], rows[:, AXIS_ENTRIES + 1]
+        energy = 0.5 * (length * rate) ** 2 + GRAVITY * length * (np.cos(angle) - 1.0)  # J/kg, 0 upright
+        pumped = self.PUMP * energy * np.sign(rate * np.cos(angle))
+        pumped = np.clip(pumped, -self.MOST * greatest, self.MOST * greatest)
+        pumped -= self.CENTRE * lead * configuration.amplitude * rows[:, POSITION]
+        pumped -= self.BRAKE * lead * configuration.speed * rows[:, SPEED]
+        return np.where((np.abs(angle) < self.CATCH)[:, None], super().actions(rows), (pumped / greatest)[:, None])
 
 
 class SpeedCurve(Expert):
@@ -167,7 +179,7 @@ class SpeedCurve(Expert):
         """Return the change of the step rate, of the greatest."""
         inertia = self.parameter("motor.inertia", 6.8e-6) + self.parameter("load.inertia", 1e-5)
         acceleration = self.ACCELERATION * self.NOMINAL_INERTIA / inertia * (1.0 - self._speed / self.SPEED)
-        self._speed = self._speed + STEP * acceleration
+        self._speed = self._speed + acceleration / self.configuration.rate
         greatest = 1.25 * self.configuration.ramp * self.configuration.speed
         return np.broadcast_to(acceleration / greatest, len(rows))[:, None]
 

@@ -34,16 +34,17 @@ class SuiteTask:
 
 
 def _tracking(about: str, solved: float, reward: str, load: str, duration: float, **options: Any) -> SuiteTask:
-    """Return a task of Tracking, at 1 kHz, on machines of the load's set, with one term as the reward."""
+    """Return a task of Tracking, on machines of the load's set, with one term as the reward."""
     weights = dict.fromkeys(TERMS, 0.0) | {reward: 1.0}
     own = {"load": load, "distributions": load, "duration": duration, "weights": weights}
-    return SuiteTask("ServoDrive/Tracking-v0", about, round(1000 * duration), solved, own | options)
+    steps = round(options.get("rate", 1000) * duration)
+    return SuiteTask("ServoDrive/Tracking-v0", about, steps, solved, own | options)
 
 
 TASKS: dict[str, SuiteTask] = {
     "ServoDrive/TorqueTracking-v1": _tracking(
         "moves of a disc on an elastic shaft by torque alone: inertia, stiffness, friction and the bus' delays differ",
-        0.80, "tracking", "two_mass", 1.0, mode="cst", margins={"tracking": 0.08},
+        0.80, "tracking", "two_mass", 1.0, mode="cst", margins={"tracking": 0.06},
     ),
     "ServoDrive/GantryBeam-v1": _tracking(
         "two drives pull one beam along a trajectory: the agent leads both set-points, the drives close the loops",
@@ -51,18 +52,18 @@ TASKS: dict[str, SuiteTask] = {
     ),
     "ServoDrive/Crane-v1": _tracking(
         "a load on a rope follows a trajectory: the agent accelerates the carriage; rope and mass differ",
-        0.80, "carried", "cart_pendulum", 4.0, mode="csv", action="ramp", ramp=12.0, trajectory="moves",
+        0.80, "carried", "cart_pendulum", 4.0, rate=500, mode="csv", action="ramp", ramp=12.0, trajectory="moves",
         amplitude=5.0, speed=5.0, margins={"tracking": 0.05},
     ),
     "ServoDrive/PoleBalance-v1": _tracking(
         "a pole that begins up to 0.2 rad beside its balance stands over the middle of the rail; a fall ends it",
-        0.85, "carried", "inverted_pendulum", 3.0, mode="csv", action="ramp", ramp=8.0, tilt=(-0.2, 0.2),
+        0.85, "carried", "inverted_pendulum", 3.0, rate=500, mode="csv", action="ramp", ramp=8.0, tilt=(-0.2, 0.2),
         trajectory="hold", amplitude=3.0, speed=25.0, margins={"tracking": 0.1},
     ),
     "ServoDrive/PoleSwingUp-v1": _tracking(
         "a hanging pole is swung up and held, on a rail that ends",
-        0.80, "load", "inverted_pendulum", 6.0, mode="csv", action="ramp", ramp=8.0, tilt=(pi - 0.25, pi + 0.25),
-        fall=inf, trajectory="hold", amplitude=5.0, speed=25.0, margins={"load": 1.0},
+        0.80, "load", "inverted_pendulum", 8.0, rate=500, mode="csv", action="ramp", ramp=8.0,
+        tilt=(pi - 0.25, pi + 0.25), fall=inf, trajectory="hold", amplitude=5.0, speed=25.0, margins={"load": 1.0},
     ),
     "ServoDrive/ArmPath-v1": _tracking(
         "six joints of an arm follow a path under gravity with an unknown tool: the agent leads their set-points",

@@ -268,10 +268,10 @@ class Tracking(VectorEnvironment):
 
     | term | value | weight |
     | --- | --- | --- |
-    | tracking | g(position error, 0.25 amplitude), the configuration's margins in place of these | 1 |
+    | tracking | g(position error, 0.25 amplitude), or the configuration's margin, as below | 1 |
     | speed | g(velocity error, 0.5 speed) | 0.2 |
     | load | g(angle of the pendulum, 0.2 rad); 0 of a load without sensor | 1 |
-    | carried | g(error of where the pendulum's bob is, 0.25 amplitude); 0 of a load without sensor | 0 |
+    | carried | g(error of where the bob is, 0.25 amplitude); 0 of a load without sensor | 0 |
     | effort | g(torque actual value, current limit) | 0.05 |
     | smoothness | g(change of the action, 1) | 0.05 |
     | trip | 1 in the step in which a drive tripped or the pole fell | 10, subtracted |
