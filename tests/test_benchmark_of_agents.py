@@ -37,7 +37,8 @@ def test_the_interquartile_mean_is_of_the_middle_half():
     found = interquartile_mean([np.array([[0.0, 3.0, 5.0, 100.0]])])
     assert found.value == 4.0
     # Agarwal's rule, scipy.stats.trim_mean(scores, 0.25): of 10 scores 2 go at each end.
-    assert interquartile_mean([np.arange(10.0).reshape(2, 5) ** 2]).value == np.mean(np.arange(2.0, 8.0) ** 2)
+    squares = np.arange(10.0) ** 2
+    assert interquartile_mean([squares.reshape(2, 5)]).value == squares[2:8].mean()
 
 
 def test_the_tasks_scores_are_pooled_each_with_its_own_number_of_seeds():
@@ -55,7 +56,7 @@ def test_the_interval_is_that_of_all_draws():
 
 
 def test_the_interval_of_a_mean_is_the_textbooks():
-    """Of 400 normal values: 1.96 standard errors, which are 1.09 as long for the middle half as for the mean (Tukey)."""
+    """Of 400 normal values: 1.96 standard errors, 1.09 times as long for the middle half as for the mean (Tukey)."""
     scores = np.random.default_rng(1).standard_normal((1, 400))
     found = interquartile_mean([scores])
     assert found.high - found.low == pytest.approx(2 * 1.96 * 1.09 / 20.0, rel=0.1)

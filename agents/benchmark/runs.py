@@ -93,10 +93,7 @@ def suite_task(text: str) -> str:
 
 def baseline_runs(task: str) -> list[BenchmarkRun]:
     """Return the runs of a task's baselines."""
-    return [
-        BenchmarkRun(task, name, BASELINE, written=Written.of(name, trust=False))
-        for name in baselines_of(task)
-    ]
+    return [BenchmarkRun(task, name, BASELINE, written=Written.of(name, trust=False)) for name in baselines_of(task)]
 
 
 def submitted_run(task: str, text: str, trust: bool) -> BenchmarkRun:

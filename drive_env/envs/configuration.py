@@ -73,6 +73,8 @@ def configured(
             raise ValueError(f"there is no option {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}")
     for field in fields(kind):  # type: ignore[arg-type]
         if field.name in table:
+            if str(field.type).startswith("float") and table[field.name] in ("inf", "-inf"):
+                table[field.name] = float(table[field.name])  # JSON has no infinity: a file of an agent says it so
             _check_type(field.name, str(field.type), table[field.name])
     return kind(**table)
 
