@@ -190,9 +190,10 @@ def _draw(folder: Path, task: str, policies: Mapping[str, Sequence[Row]]) -> Non
         label = f"{policy}, held out: {value:.3f}"
         axes.axhline(value, color=colors[policy], linestyle=style, linewidth=1.0, label=label)
     axes.set_ylim(0.0, 1.0)
+    axes.set_xlim(left=0.0)
     axes.set_xlabel("steps of all environments together, millions")
     axes.set_ylabel("return of an episode, of the horizon")
-    axes.set_title(f"{task}: interquartile mean and 95 % interval over seeds, with exploration", fontsize=10)
+    figure.suptitle(f"{task}\ntraining, with exploration: interquartile mean over seeds, 95 % interval", fontsize=10)
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
