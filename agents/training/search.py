@@ -65,6 +65,7 @@ SPACES: dict[str, tuple[SearchRow, ...]] = {
         SearchRow("policy_kwargs.net_arch", choices=("64,64", "128,128", "256,256")),
     ),
 }
+SPACES["tqc"] = SPACES["sac"]
 
 
 class SearchTrial(NamedTuple):
