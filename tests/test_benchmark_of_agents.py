@@ -19,8 +19,10 @@ from agents.commands.cli import app
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
 from agents.training import hyperparameters, seeds
+from agents.training.imitation import imitate
 from agents.training.tasks import make_environments
-from agents.training.training_run import segment_seed
+from agents.training.train import make_env, make_model, train
+from agents.training.training_run import TrainingRun, segment_seed
 from drive_env.envs.suite import TASKS
 
 TASK = "ServoDrive/TorqueTracking-v1"
@@ -207,6 +209,51 @@ def test_worker_processes_change_no_score(benchmark, tmp_path):
     one, other = rows_of(benchmark), rows_of(tmp_path / "other")
     # Workers read the shipped hyper-parameters never: they are given with the run.
     assert {name: row.scores for name, row in one.items()} == {name: row.scores for name, row in other.items()}
+
+
+# --- what trains there ------------------------------------------------------------------------------------------------
+SHIPPED = hyperparameters.FOLDER
+
+
+@pytest.mark.every(3)
+@pytest.mark.parametrize("task", TASKS)
+def test_the_hyperparameters_that_ship_train_on_every_task(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(hyperparameters, "FOLDER", SHIPPED)
+    given = hyperparameters.load(task, "ppo")
+    hyperparameters.merge(given, {"n_envs": 2, "n_timesteps": 16, "n_steps": 8, "batch_size": 16, "n_epochs": 1})
+    if given.get("imitate"):
+        given["imitate"] = {"expert": {"steps": 8, "updates": 1}}
+    assert train(TrainingRun(task, "ppo", given), tmp_path).environment == task
+
+
+class Recorder:
+    """A teacher that is told its machines."""
+
+    def __init__(self):
+        self.begun = np.zeros(2, int)
+        self.inertia = set()
+
+    def told(self, parameters, mask):
+        self.begun += mask
+        self.inertia |= set(parameters["load.inertia"][mask])
+
+    def reset(self, mask):
+        pass
+
+    def act(self, rows):
+        return np.zeros((len(rows), 1))
+
+
+def test_a_teacher_is_told_the_machine_of_each_episode():
+    given = {**hyperparameters.load(TASK, "ppo"), "n_envs": 2}
+    _, env = make_env(TrainingRun(TASK, "ppo", given))
+    try:
+        model, _ = make_model(TrainingRun(TASK, "ppo", given), env)
+        teacher = Recorder()
+        imitate(model, teacher, seed=1, steps=2 * (2 * TASKS[TASK].steps + 5), updates=1)
+    finally:
+        env.close()
+    assert teacher.begun.tolist() == [3, 3] and len(teacher.inertia) == 6
 
 
 # --- submitted policies -----------------------------------------------------------------------------------------------
