@@ -65,11 +65,10 @@ class BenchmarkRun:
     def check_same(self, path: Path, row: Row) -> None:
         """Raise ValueError unless a row that is there already is this run's."""
         check_begun(path, row.versions.get("sources"), "give another --out")
-        content = b"" if self.written is None else self.written.content or b""
         what = {
             "hyper-parameters": (row.hyperparameters, dict(self.hyperparameters)),
             "episodes": (len(row.scores), self.episodes),
-            "a policy": (row.policy_sha256 if content else "", hashlib.sha256(content).hexdigest() if content else ""),
+            "a policy": (row.policy_sha256, row.policy_sha256 if self.written is None else self.written.sha256),
         }
         for name, (there, here) in what.items():
             if there != here:
@@ -178,9 +177,9 @@ def _made(run: BenchmarkRun, tell: Callable[[float], None] = lambda share: None)
         opened, sha256 = AGENT, hashlib.sha256(files[AGENT]).hexdigest()
     else:
         policy = run.written.open(run.task, ONE_THREAD)
-        opened, sha256 = run.written.text, run.written.source
+        opened, sha256 = run.written.text, run.written.sha256
         if run.written.content is not None:
-            opened, sha256 = Path(opened).name, hashlib.sha256(run.written.content).hexdigest()
+            opened = Path(opened).name
             files = {opened: run.written.content}
     trained = time.process_time()
     scores, ended = judge(policy, run.task, run.episodes)
@@ -236,9 +235,10 @@ def check(path: Path, *, trust: bool = False) -> Checked:
     if names_a_file(text) and not Path(text).is_file():
         raise RowError(f"the row's policy, {row.opened}, is not beside it: put it into {path.parent}")
     written = Written.of(text, trust)
-    sha256 = written.source if written.content is None else hashlib.sha256(written.content).hexdigest()
-    if sha256 != row.policy_sha256:
-        return Checked(False, f"{row.opened} is not the row's policy: its SHA-256 is {sha256}, not {row.policy_sha256}")
+    if written.sha256 != row.policy_sha256:
+        return Checked(
+            False, f"{row.opened} is not the row's policy: its SHA-256 is {written.sha256}, not {row.policy_sha256}"
+        )
     scores, _ = judge(written.open(row.task, ONE_THREAD), row.task, len(row.scores))
     if scores == row.scores:
         return Checked(True, f"all {len(scores)} scores are the row's, to the last digit")
