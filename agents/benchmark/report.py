@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from agents.benchmark.results import RESULT, TRAINED, Row
-from agents.benchmark.statistics import Estimate, Floats, interquartile_mean, probability_of_improvement
+from agents.benchmark.statistics import Floats, ScoreEstimate, interquartile_mean, probability_of_improvement
 from agents.training.learning_curve import COLORS
 from agents.training.training_run import TABLE
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import write_picture, write_whole
-from mechanics.untrusted import MOST_RECORDING, read_text
+from mechanics.untrusted import read_rows as read_rows_of
 
 TEXT, NUMBERS, CURVES = "results.md", "results.json", "learning_curves.png"
 EXPERT, ALL = "expert", "all tasks"
@@ -45,8 +43,8 @@ class Standing:
     policy: str
     kind: str
     seeds: int
-    score: Estimate
-    improvement: Estimate | None
+    score: ScoreEstimate
+    improvement: ScoreEstimate | None
     ended_early: float
     steps: int
     cpu_minutes: float
@@ -103,15 +101,16 @@ def _scores(rows: Sequence[Row]) -> Floats:
     return np.array([row.scores for row in rows])
 
 
-def write_report(folder: Path) -> list[Standing]:
-    """Write results.json, results.md and the curves of what the folder holds, and return the table."""
+def write_report(folder: Path) -> str:
+    """Write results.json, results.md and the curves of what the folder holds, and return the text."""
     rows = read_rows(folder)
     table = standings(rows)
     for task, policies in rows.items():
         _draw(folder, task, policies)
     write_whole(folder / NUMBERS, json.dumps([_plain(row) for row in table], indent=1))
-    write_whole(folder / TEXT, _text(rows, table))
-    return table
+    text = _text(rows, table)
+    write_whole(folder / TEXT, text)
+    return text
 
 
 def _plain(row: Standing) -> dict[str, Any]:
@@ -147,7 +146,7 @@ def _text(rows: Mapping[str, Mapping[str, Sequence[Row]]], table: Sequence[Stand
     return "\n".join([*lines, "", f"Made with {'; '.join(made)}.", *(f"\n{one}" for one in pictures), ""])
 
 
-def _interval(found: Estimate) -> str:
+def _interval(found: ScoreEstimate) -> str:
     return f"{found.value:.3f} ({found.low:.3f} to {found.high:.3f})"
 
 
@@ -202,7 +201,8 @@ def _draw(folder: Path, task: str, policies: Mapping[str, Sequence[Row]]) -> Non
 
 def _curve(table: Path, task: str) -> Floats:
     """Return steps and return over the horizon of a training, shape (rows, 2), from the first episode's end on."""
-    rows = list(csv.DictReader(io.StringIO(read_text(table, MOST_RECORDING))))
-    points = [(float(row["timesteps"]), float(row["return"] or "nan") / TASKS[task].steps) for row in rows]
+    names, *rows = read_rows_of(table)
+    step, total = names.index("timesteps"), names.index("return")
+    points = [(float(row[step]), float(row[total] or "nan") / TASKS[task].steps) for row in rows]
     found = np.array([point for point in points if np.isfinite(point[1])])
     return found.reshape(-1, 2)

@@ -26,6 +26,7 @@ from agents.training.tasks import environment_name
 from agents.training.training_run import AGENT, TABLE, TrainingRun
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import write_whole
+from mechanics.untrusted import MOST_ARRAYS, read_bytes
 from tuning.runs.provenance import check_begun, versions
 
 if TYPE_CHECKING:
@@ -201,7 +202,7 @@ def _trained(run: BenchmarkRun, tell: Callable[[float], None]) -> tuple[Any, dic
         folder = Path(elsewhere)
         training = TrainingRun(run.task, run.policy, given, seed=run.seed, preset="benchmark")
         bundle = train(training, folder, report=lambda state: tell(state.timesteps / max(state.total, 1)))
-        return bundle, {name: (folder / name).read_bytes() for name in (AGENT, TABLE)}
+        return bundle, {name: read_bytes(folder / name, MOST_ARRAYS) for name in (AGENT, TABLE)}
 
 
 def judge(policy: Any, task: str, episodes: int) -> tuple[list[float], int]:
@@ -215,14 +216,14 @@ def _is_of(run: BenchmarkRun, found: Any) -> bool:
     return isinstance(found, _Done) and found.row.task == run.task and len(found.row.scores) == run.episodes
 
 
-class Checked(NamedTuple):
+class RowCheck(NamedTuple):
     """What came of a row's episodes when they were run again."""
 
     holds: bool
     says: str
 
 
-def check(path: Path, *, trust: bool = False) -> Checked:
+def check(path: Path, *, trust: bool = False) -> RowCheck:
     """Run a row's episodes again with the policy beside it, and return whether it holds.
 
     Raises:
@@ -236,18 +237,18 @@ def check(path: Path, *, trust: bool = False) -> Checked:
         raise RowError(f"the row's policy, {row.opened}, is not beside it: put it into {path.parent}")
     written = Written.of(text, trust)
     if written.sha256 != row.policy_sha256:
-        return Checked(
+        return RowCheck(
             False, f"{row.opened} is not the row's policy: its SHA-256 is {written.sha256}, not {row.policy_sha256}"
         )
     scores, _ = judge(written.open(row.task, ONE_THREAD), row.task, len(row.scores))
     if scores == row.scores:
-        return Checked(True, f"all {len(scores)} scores are the row's, to the last digit")
+        return RowCheck(True, f"all {len(scores)} scores are the row's, to the last digit")
     import numpy as np
 
     stated, now = (interquartile_mean([np.array([values])]) for values in (row.scores, scores))
     most = float(np.abs(np.subtract(scores, row.scores)).max())
     inside = stated.low <= now.value <= stated.high
-    return Checked(
+    return RowCheck(
         inside,
         f"the interquartile mean is {now.value:.4f}, {'inside' if inside else 'outside'} the row's interval "
         f"({stated.low:.4f} to {stated.high:.4f}); scores differ by up to {most:.2g}, and the row was made with "

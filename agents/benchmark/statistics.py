@@ -19,7 +19,7 @@ from tuning.bootstrap import ENDS, RESAMPLES
 Floats = NDArray[np.float64]
 
 
-class Estimate(NamedTuple):
+class ScoreEstimate(NamedTuple):
     """A figure with the ends of its 95 % interval."""
 
     value: float
@@ -27,7 +27,7 @@ class Estimate(NamedTuple):
     high: float
 
 
-def interquartile_mean(tables: Sequence[Floats]) -> Estimate:
+def interquartile_mean(tables: Sequence[Floats]) -> ScoreEstimate:
     """Return the mean of the middle half of the scores: a quarter, rounded down, is cut off at each end.
 
     Args:
@@ -42,7 +42,7 @@ def interquartile_mean(tables: Sequence[Floats]) -> Estimate:
     return _estimate(middle, tables)
 
 
-def probability_of_improvement(tables: Sequence[Floats], rivals: Sequence[Floats]) -> Estimate:
+def probability_of_improvement(tables: Sequence[Floats], rivals: Sequence[Floats]) -> ScoreEstimate:
     """Return how probable it is that a score is above the rival's in the same episode; an equal one counts half.
 
     Args:
@@ -53,7 +53,7 @@ def probability_of_improvement(tables: Sequence[Floats], rivals: Sequence[Floats
     return _estimate(lambda rows: rows.mean(axis=1), wins)
 
 
-def _estimate(statistic: Callable[[Floats], Floats], tables: Sequence[Floats]) -> Estimate:
+def _estimate(statistic: Callable[[Floats], Floats], tables: Sequence[Floats]) -> ScoreEstimate:
     """Return a statistic of all values with its interval; it takes rows of values and returns one value for each."""
     rng = np.random.default_rng(0)
     drawn = []
@@ -62,4 +62,4 @@ def _estimate(statistic: Callable[[Floats], Floats], tables: Sequence[Floats]) -
         drawn.append(table[seeds[:, :, None], episodes[:, None, :]].reshape(RESAMPLES, -1))
     value = statistic(np.concatenate([table.reshape(1, -1) for table in tables], axis=1))[0]
     low, high = np.quantile(statistic(np.concatenate(drawn, axis=1)), ENDS)
-    return Estimate(float(value), float(low), float(high))
+    return ScoreEstimate(float(value), float(low), float(high))

@@ -65,7 +65,7 @@ def benchmark(
     a row of the table, which --check proves.
     """
     with errors_as_exit_codes():
-        from agents.benchmark.report import TEXT, write_report
+        from agents.benchmark.report import write_report
         from agents.benchmark.runs import make
 
         if check is not None:
@@ -88,8 +88,7 @@ def benchmark(
                 make(runs, folder, pool=pool, told=tell, share=share)
         except KeyboardInterrupt:
             fail(f"interrupted; the runs that are complete are in {folder}: {AGAIN}", INTERRUPTED)
-        write_report(folder)
-        print((folder / TEXT).read_text(encoding="utf-8"), end="")
+        print(write_report(folder), end="")
         print(f"written to {folder}")
 
 
