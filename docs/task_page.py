@@ -34,8 +34,8 @@ friction, stiffness, motor, power stage, and the delays of the bus.
 
 What is in the table: the best of twelve policies that have learnt nothing (zero, random, bang-bang on the following
 error, nine constants); the *cascade* that a drive or a master has anyway; the *expert*, which is what a motion engineer
-would program who knows the parameters of each machine; and agents that were trained as the benchmark trains them, with the
-interquartile mean and its 95 % interval. Agents see only what the drives tell.
+would program who knows the parameters of each machine; and agents, trained as the benchmark trains
+them, with the interquartile mean and its 95 % interval. Agents see only what the drives tell.
 
 """
 

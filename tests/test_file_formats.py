@@ -15,6 +15,7 @@ import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
 
+from agents.benchmark.results import Row
 from agents.evaluation import episode_log
 from agents.evaluation.evaluation import Evaluation
 from agents.evaluation.scores import Episode
@@ -246,11 +247,13 @@ def test_agent():
     assert AgentFile.load(find_agent("tracking_two_mass")).kind in PAGE
 
 
-def test_report_and_episodes(tmp_path):
+def test_report_row_and_episodes(tmp_path):
     episode = Episode(0, np.zeros((3, 2)), np.zeros((2, 1)), np.zeros(2), {}, False, "", {}, {})
     report = Evaluation("p", "e", {}, "emulator", [0], {"return": [1.0]}, {"return": False}, {})
     report.save(tmp_path / "report.json")
     assert set(fields("evaluation report")) == set(json.loads((tmp_path / "report.json").read_text(encoding="utf-8")))
+    row = Row("ServoDrive/Crane-v1", "ppo", "trained", 0, "agent.npz", "", [2**33, 2**33], [0.5], 0)
+    assert set(fields("benchmark row")) == set(json.loads(row.text()))
     episode_log.save(tmp_path / "episodes.npz", "e", {}, [episode])
     with np.load(tmp_path / "episodes.npz") as stored:
         assert fields("episodes") == list(stored)

@@ -19,7 +19,7 @@ app = typer.Typer(
 
 PANELS = {
     "Use an agent": ("tune", "evaluate", "export"),
-    "Make one": ("train", "search"),
+    "Make one": ("train", "search", "benchmark"),
 }
 for panel, names in PANELS.items():
     for name in names:

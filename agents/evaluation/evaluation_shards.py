@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -39,6 +40,11 @@ class Written(NamedTuple):
         """Return what a text names."""
         content = read_bytes(text, MOST_ARRAYS) if names_a_file(text) else None
         return cls(text, content, trust, source_of(text) if content is None else "")
+
+    @property
+    def sha256(self) -> str:
+        """Hash of its file, or of the file of its function; "" of what the package has."""
+        return self.source if self.content is None else hashlib.sha256(self.content).hexdigest()
 
     def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:
         """Return the policy, or the baseline, in an environment with these options."""

@@ -10,7 +10,10 @@ ALGORITHMS = {
     "ppo": "stable_baselines3:PPO",
     "sac": "stable_baselines3:SAC",
     "recurrent_ppo": "sb3_contrib:RecurrentPPO",
+    "tqc": "sb3_contrib:TQC",
 }
+# Algorithm -> the one whose hyper-parameters it takes: TQC is SAC with critics of quantiles (arXiv:2005.04269).
+SAME_HYPERPARAMETERS = {"tqc": "sac"}
 
 
 class MissingPackageError(ImportError):

@@ -86,6 +86,11 @@ class CountedEnvironments:
         self._terms, self._term_steps = {}, 0
         return found
 
+    def forget(self) -> None:
+        """Begin the means of episodes and terms anew."""
+        self._ended.clear()
+        self.take_terms()
+
     def episode_means(self) -> dict[str, float]:
         """Return mean return and length, and the share that terminated, of the last episodes; NaN before any."""
         if not self._ended:

@@ -101,6 +101,7 @@ def _play(
     """Return observations, the teacher's actions, rewards and ends, each of shape (steps, environments, ...)."""
     seen = env.reset()
     teacher.reset(None)
+    _tell(teacher, env, np.ones(env.num_envs, bool))
     observations: list[Any] = []
     found: tuple[list[Any], ...] = ([], [], [])
     for step in range(steps):
@@ -112,6 +113,7 @@ def _play(
         reward = env.get_original_reward() if hasattr(env, "get_original_reward") else reward
         if ended.any():
             teacher.reset(ended)
+            _tell(teacher, env, ended)
         observations.append(rows)
         for column, value in zip(found, (wanted, reward, ended), strict=True):
             column.append(np.array(value))
@@ -121,6 +123,15 @@ def _play(
         stacked = np.stack(observations)
     actions, rewards, ends = (np.stack(column) for column in found)
     return stacked, actions, rewards, ends
+
+
+def _tell(teacher: Any, env: Any, mask: Any) -> None:
+    """Tell a teacher that wants it the machines whose episodes begin where the mask is true.
+
+    The network, which is told nothing, learns what such a teacher does on average over the machines.
+    """
+    if hasattr(teacher, "told"):
+        teacher.told(env.get_attr("told")[0]["parameters"], mask)
 
 
 def _discounted(rewards: NDArray[Any], ends: NDArray[Any], discount: float) -> NDArray[Any]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +19,7 @@ import yaml
 
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
+from agents.training.seeds import VALIDATION
 from agents.training.train import DivergedError, train, with_inputs
 from agents.training.training_run import TrainingRun
 from drive_env.whole_file import write_whole
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 JOURNAL, BEST = "study.log", "best.yaml"
 ROUND = 5  # trials that are drawn from the same knowledge, and may run at a time
-# Torch's and NumPy's random numbers are a process's: of two trainings at once in it, none would be what it is alone.
-_ALONE = threading.Lock()
 
 
 class SearchRow(NamedTuple):
@@ -67,6 +65,7 @@ SPACES: dict[str, tuple[SearchRow, ...]] = {
         SearchRow("policy_kwargs.net_arch", choices=("64,64", "128,128", "256,256")),
     ),
 }
+SPACES["tqc"] = SPACES["sac"]
 
 
 class SearchTrial(NamedTuple):
@@ -255,10 +254,10 @@ def _sampler(known: Any, seed: int) -> Any:
 
 def _trained(task: _TrainingTask) -> _Scored:
     """Do a task."""
-    from agents.evaluation.evaluation import FIRST_SEED, evaluate
+    from agents.evaluation.evaluation import evaluate
     from agents.policies.policy import policy_of
 
-    with _ALONE, tempfile.TemporaryDirectory() as elsewhere:
+    with tempfile.TemporaryDirectory() as elsewhere:
         folder = Path(elsewhere) if task.folder is None else task.folder
         score: float | None = None
         try:
@@ -268,7 +267,7 @@ def _trained(task: _TrainingTask) -> _Scored:
         else:
             found = evaluate(
                 policy_of(bundle), bundle.environment, bundle.configuration, episodes=task.episodes,
-                seed=FIRST_SEED // 2,
+                seed=VALIDATION[0],
             )  # fmt: skip
             mean = found.interval(found.score).mean
             score = mean if found.lower_is_better[found.score] else -mean

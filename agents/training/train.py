@@ -35,6 +35,8 @@ from tuning.runs.provenance import check_begun
 
 logger = logging.getLogger(__name__)
 
+# Torch's and NumPy's random numbers are a process's: of two trainings at once in it, none would be what it is alone.
+_ALONE = threading.Lock()
 IMITATION = 1_000_000  # a segment's number that no run has, for seeds
 # "constant" is SB3's word for SAC's automatic entropy and others.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
@@ -68,11 +70,6 @@ def train(
         HyperparameterError: For hyper-parameters that the algorithm does not take.
         DivergedError: If the networks come to hold what nothing can act with; the last checkpoint is from before.
     """
-    import torch
-    from stable_baselines3.common.logger import configure
-
-    from agents.training.segments import Segments
-
     folder = Path(folder)
     path = folder / CHECKPOINT
     if resume:
@@ -81,6 +78,17 @@ def train(
         check_begun(path, checkpoint.read_run(path).get("sources"), "begin a new run")
     else:
         run = with_inputs(run)
+    with _ALONE:
+        return _train(run, folder, report, resume, trust)
+
+
+def _train(run: TrainingRun, folder: Path, report: Report | None, resume: bool, trust: bool) -> AgentFile:
+    import torch
+    from stable_baselines3.common.logger import configure
+
+    from agents.training.segments import Segments
+
+    path = folder / CHECKPOINT
     threads = torch.get_num_threads()
     torch.set_num_threads(run.torch_threads)
     lanes, env = make_env(run)
@@ -288,6 +296,7 @@ def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: R
     with _settings_of(f"imitate {name}"):
         wanted = inspect.signature(imitate).bind(model, teacher, seed=seed, told=told, **settings)
     left = imitate(*wanted.args, **wanted.kwargs)
+    lanes.forget()  # the teacher's episodes are none of the training's
     logger.info("the policy begins as %s, its actions within %.3g", name, left)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -24,8 +23,6 @@ def _is_number(value: Any) -> bool:
 def _is_whole(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, Integral)
 
-
-_INFINITE = {"inf": math.inf, "-inf": -math.inf}  # JSON has no such numbers: agents and datasets keep the text
 
 # Type of a field -> what it takes, in words, and whether a value is one; fields of other types check themselves.
 _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
@@ -76,8 +73,8 @@ def configured(
             raise ValueError(f"there is no option {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}")
     for field in fields(kind):  # type: ignore[arg-type]
         if field.name in table:
-            if str(field.type).startswith("float") and isinstance(table[field.name], str):
-                table[field.name] = _INFINITE.get(table[field.name], table[field.name])
+            if str(field.type).startswith("float") and table[field.name] in ("inf", "-inf"):
+                table[field.name] = float(table[field.name])  # JSON has no infinity: a file of an agent says it so
             _check_type(field.name, str(field.type), table[field.name])
     return kind(**table)
 

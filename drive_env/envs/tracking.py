@@ -392,15 +392,8 @@ class Tracking(VectorEnvironment):
                 )
             joint = config.task.joint
             self._sensor = lambda: machine.joint_positions[:, joint]
-        per_turn = drives.read(Role.POSITION_SCALE).astype(float)
-        scales = np.empty((self.drives.num_axes, 4))
-        scales[:, 0] = config.amplitude * per_turn
-        counts = per_turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
-        scales[:, 1] = config.speed * counts
-        scales[:, 2] = per_turn / drives.read(Role.FULL_STEPS) if self._is_stepper else drives.read(Role.CURRENT_LIMIT)
-        full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": scales[:, 2]}
-        scales[:, 3] = full[str(config.mode)] * (config.offset if config.action == "offset" else 1.0)
-        self._per_turn, self._speed_counts = per_turn, counts
+        self._per_turn = drives.read(Role.POSITION_SCALE).astype(float)
+        self._speed_counts = self._per_turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
         target, offset = OBJECTS[str(config.mode)]
         play = (target, offset) if config.action == "offset" else (target,)
         self._acts_on_position = play[-1] == cia402.TARGET_POSITION
@@ -409,7 +402,7 @@ class Tracking(VectorEnvironment):
         self._episodes = own = cycle.Episodes(
             lanes=np.zeros(n, cycle.LANE),
             action=np.zeros(drives.num_axes),
-            scales=scales,
+            scales=self._scales(),
             origin=np.zeros(drives.num_axes),
             actions=self._bus.actions,
             observations=self._bus.observations,
@@ -440,6 +433,18 @@ class Tracking(VectorEnvironment):
         self._amplitudes = np.minimum(float(config.amplitude or 0.0), room).tolist()
         period = config.cycles * CYCLE
         self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
+
+    def _scales(self) -> Floats:
+        """Return amplitude, speed, torque and full scale of the action of each axis, raw, shape (num_axes, 4)."""
+        config, drives = self.config, self.drives
+        scales = np.empty((drives.num_axes, 4))
+        scales[:, 0] = config.amplitude * self._per_turn
+        scales[:, 1] = config.speed * self._speed_counts
+        torque = self._per_turn / drives.read(Role.FULL_STEPS) if self._is_stepper else drives.read(Role.CURRENT_LIMIT)
+        scales[:, 2] = torque
+        full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": torque}
+        scales[:, 3] = full[str(config.mode)] * (config.offset if config.action == "offset" else 1.0)
+        return scales
 
     def _profile_scales(self) -> Floats:
         """Return raw units of the target per unit of the reference's row: 1, in cst counts of torque per inc/s^2."""

@@ -16,13 +16,13 @@ from typing import Any
 
 import yaml
 
+from agents.training.algorithms import ALGORITHMS, SAME_HYPERPARAMETERS
 from agents.training.tasks import environment_name, row_of
 from drive_env.envs import environment_of
 from drive_env.envs.suite import TASKS
 from mechanics.untrusted import check_table, read_text
 
 FOLDER = Path(__file__).parent
-ALGORITHMS = ("ppo", "sac", "recurrent_ppo")
 PRESETS = ("quick", "full")
 
 # Keys that are the run's, as RL-Zoo has them; all others go to the algorithm's constructor.
@@ -165,7 +165,9 @@ def _whole(file: Path, key: str, value: Any) -> int:
 def _file(environment: str, algorithm: str, path: str | Path | None) -> Path:
     if algorithm not in ALGORITHMS:
         raise HyperparameterError(f"there is no algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
-    return FOLDER / f"{row_of(environment).short}_{algorithm}.yaml" if path is None else Path(path)
+    if path is not None:
+        return Path(path)
+    return FOLDER / f"{row_of(environment).short}_{SAME_HYPERPARAMETERS.get(algorithm, algorithm)}.yaml"
 
 
 def _read(file: Path) -> dict[str, Any]:
