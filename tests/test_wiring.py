@@ -19,6 +19,7 @@ from drive_env.emulator.parameters import WIRING
 from drive_env.motors import MOTORS
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.one_button import auto
+from tuning.compare.suite import load_suite, open_group
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.wiring import (
@@ -315,3 +316,11 @@ def test_auto_finds_a_reversed_encoder_on_a_bus_inside_the_envelope(tmp_path, mo
         result = auto(target, tmp_path / "before.toml", budget=12.0)
         assert result.accepted.all(), result.axes[0].reason
         assert drives.read(ENCODER_DIRECTION)[0] == 1
+
+
+def test_the_fields_of_a_gantry_turn_the_same_way_so_that_its_ends_do_not_block_each_other():
+    # Drawn once: its ends stood so that one had more room forwards and the other backwards, and neither followed.
+    (machine,) = (row for row in load_suite("public", 822) if row.name == "seed822-24-gantry-qbl4208")
+    with open_group([machine], 1) as target:
+        found = identify(target)
+    assert [one.value("pole_pairs") for one in found] == [MOTOR.n_p] * 2

@@ -178,9 +178,14 @@ def _way(working: Working) -> tuple[Floats, Mask]:
     """Return how far the fields turn from where the rotors stand now [electrical rad], and which of them can."""
     n_p = working.target.motor.n_p
     down, up = working.room()
-    sign = np.where(up >= -down, 1.0, -1.0)
+    least = LEAST_TURN * 2.0 * np.pi / n_p
+    # All axes of a machine turn the same way where they can: the ends of a beam that turn apart block each other.
+    free = np.stack([up, -down]).reshape(2, -1, working.target.axes_per_machine).min(axis=2)
+    common = np.repeat(np.where(free[0] >= free[1], 1.0, -1.0), working.target.axes_per_machine)
+    together = np.repeat(free.max(axis=0) - MARGIN >= least, working.target.axes_per_machine)
+    sign = np.where(together, common, np.where(up >= -down, 1.0, -1.0))
     way = np.minimum(np.where(sign > 0.0, up, -down) - MARGIN, MOST_TURN * 2.0 * np.pi / n_p)
-    return sign * way * n_p, np.asarray(way >= LEAST_TURN * 2.0 * np.pi / n_p)
+    return sign * way * n_p, np.asarray(way >= least)
 
 
 def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[Halls], list[str]]:
