@@ -303,7 +303,9 @@ def test_a_python_function_is_submitted_and_checked(tmp_path):
     found = run("--submit", "own_policy_of_test:act", "--task", TASK, "--out", tmp_path / "own")
     assert found.exit_code == 0, found.output
     path = tmp_path / "own/TorqueTracking-v1/own_policy_of_test.act/0" / RESULT
-    assert run("--check", path).exit_code == 0
+    refused = run("--check", path)  # a row of somebody else says what is run
+    assert refused.exit_code == 2 and "if you trust it, give --trust" in refused.output
+    assert run("--check", path, "--trust").exit_code == 0
 
 
 def test_a_file_with_pickles_needs_trust(tmp_path):
@@ -354,6 +356,13 @@ def test_a_file_that_is_no_row_is_told(tmp_path):
         (tmp_path / RESULT).write_text(text)
         with pytest.raises(RowError, match="is not a row of the benchmark"):
             Row.load(tmp_path / RESULT)
+
+
+def test_a_row_names_no_file_elsewhere(tmp_path):
+    row = Row(TASK, "mine", "submitted", 0, "../agent.npz", "", [seeds.TEST[0]] * 2, [0.5], 0)
+    (tmp_path / RESULT).write_text(row.text())
+    with pytest.raises(RowError, match="is not a row of the benchmark"):
+        Row.load(tmp_path / RESULT)
 
 
 def test_rows_of_other_episodes_are_not_compared(benchmark):
