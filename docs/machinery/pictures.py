@@ -1,6 +1,6 @@
 """Draw the site's pictures of loads and environments, and film a machine while it is tuned, into docs/assets.
 
-python docs/machinery/pictures.py             # all; or the names of some: loads environments film
+python docs/machinery/pictures.py             # all; or the names of some: loads environments tasks film
 
 Pictures are committed: they need OpenGL (as `drive-env render` does), which not every computer that builds the site
 has. Run it again after a load or an environment has changed.
@@ -18,11 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from agents.policies.baselines import baseline
 from agents.policies.open_policy import open_policy
 from agents.shipped import TUNER
+from agents.training.tasks import short_name
 from agents.tuner.tune_target import TrialShown, tune_target
 from drive_env import EmulatedDrives, motion
 from drive_env.envs import ENVIRONMENTS
+from drive_env.envs.suite import TASKS
 from drive_env.gains import write_gains
 from drive_env.pictures.demonstration import PictureFormat
 from drive_env.pictures.recording import CYCLE, Recorder
@@ -77,6 +80,21 @@ def draw_environments() -> None:
             save(np.asarray(env.render()), ASSETS / "environments" / f"{module}.webp")
 
 
+def draw_tasks() -> None:
+    """Draw every task of the suite with its expert at work, after a third of the episode."""
+    for name, task in TASKS.items():
+        with gymnasium.make(name, render_mode="rgb_array") as env:
+            lanes = env.unwrapped.vector  # type: ignore[attr-defined]
+            expert = baseline("expert", name, lanes.config, lanes.single_action_space.shape[0])
+            observation, info = env.reset(seed=1)
+            if hasattr(expert, "told"):
+                known = {key: np.atleast_1d(value) for key, value in info["parameters"].items()}
+                expert.told(known, np.ones(1, bool))
+            for _ in range(task.steps // 3):
+                observation, *_ = env.step(expert.act(observation))
+            save(np.asarray(env.render()), ASSETS / "tasks" / f"{short_name(name)}.webp")
+
+
 def film_tuning() -> None:
     """Film the trials with which the tuner that ships tunes a belt axis: each trial's gains, on the same machine."""
     trials: list[TrialShown] = []
@@ -123,7 +141,12 @@ def save(image: NDArray[np.uint8], path: Path) -> None:
     print(f"{path.relative_to(ASSETS.parent)}: {path.stat().st_size} bytes")
 
 
-JOBS: dict[str, Callable[[], None]] = {"loads": draw_loads, "environments": draw_environments, "film": film_tuning}
+JOBS: dict[str, Callable[[], None]] = {
+    "loads": draw_loads,
+    "environments": draw_environments,
+    "tasks": draw_tasks,
+    "film": film_tuning,
+}
 
 if __name__ == "__main__":
     for wanted in sys.argv[1:] or JOBS:

@@ -67,8 +67,8 @@ TASKS: dict[str, SuiteTask] = {
     ),
     "ServoDrive/ArmPath-v1": _tracking(
         "six joints of an arm follow a path under gravity with an unknown tool: the agent leads their set-points",
-        0.82, "tracking", "robot", 2.0, mode="csp", action="offset", offset=0.1, amplitude=6.0, speed=20.0,
-        margins={"tracking": 0.02},
+        0.82, "tracking", "robot", 2.0, mode="csp", action="offset", offset=0.05, amplitude=12.0, speed=20.0,
+        margins={"tracking": 0.007},
     ),
     "ServoDrive/StepperRun-v1": _tracking(
         "a stepper runs as fast as it can: the agent changes the step rate; steps lost end the episode",

@@ -39,6 +39,7 @@ from drive_env.envs.vector_environment import (
 )
 from drive_env.motors import Motor, find_motor
 from mechanics.loads import find_load
+from mechanics.shaft import one, way
 
 CYCLE = 0.001  # s, one communication cycle
 
@@ -54,6 +55,7 @@ SAMPLED_OF_STEPPERS = (*SAMPLED[:3], cia402.POSITION_DEMAND)
 ENCODER, ENCODER_OFF = 0, -1  # of 606Ah
 WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "carried": 0.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
 RATES = (500, 1000)
+WITHIN_TRAVEL = 0.8  # of an axis' travel to its end stops: what a trajectory uses at most
 ACTIONS = ("direct", "offset", "ramp")
 RETURN_SPEED = 0.25  # of the trajectory's, back to the start on a bus
 RESTARTS = 3  # tries to go back to the start on a bus: what brakes in haste may trip once more
@@ -117,7 +119,8 @@ class TrackingConfig:
     duration: Of an episode [s].
     delay: From the drive's sample to the action's effect [communication cycles], 1 or more: an agent on a real bus
         has one cycle to answer.
-    trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode. "hold": the start;
+    trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode, within 80 % of an axis'
+        travel. "hold": the start;
         "moves": to random places within the amplitude, with rests of up to 0.1 s; "sines": three sines of 0.5 to 5 Hz;
         "run": on at `speed` from the first moment. Each axis has its own, the ends of a gantry the same.
         None: hold, 5 rev and 25 rev/s for inverted_pendulum, else moves: two_mass 2 and 20, gantry 3 and 15,
@@ -421,6 +424,9 @@ class Tracking(VectorEnvironment):
         )
         self._control.hooks = Hooks(cycle.act, cycle.observe, own)
         self._start = np.zeros(drives.num_axes, np.int64)
+        turning = way(one(find_load(config.load)))
+        room = WITHIN_TRAVEL * np.minimum(-turning.low, turning.high) / (2.0 * np.pi)
+        self._amplitudes = np.minimum(float(config.amplitude or 0.0), room).tolist()
         period = config.cycles * CYCLE
         self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
 
@@ -534,7 +540,7 @@ class Tracking(VectorEnvironment):
             for axis in range(lane * self._axes, (lane + 1) * self._axes):
                 if axis == lane * self._axes or not config.task.together:
                     turns = draw(str(config.trajectory), self.rngs[lane], own.reference.shape[2], CYCLE,
-                                 float(config.amplitude or 0.0), float(config.speed or 0.0))  # fmt: skip
+                                 self._amplitudes[axis % self._axes], float(config.speed or 0.0))  # fmt: skip
                 own.reference[axis] = turns * self._per_turn[axis]
                 own.reference[axis, 1] = turns[1] * self._speed_counts[axis]
         own.lanes["step"][mask] = 0
