@@ -148,6 +148,7 @@ def test_every_run_has_its_row_and_the_table_has_them_all(benchmark):
     assert AgentFile.load(benchmark / "TorqueTracking-v1/ppo/1/agent.npz").card["seeds"]["training"] == 1
     table = {row["policy"]: row for row in json.loads((benchmark / "results.json").read_text())}
     assert table["ppo"]["seeds"] == 2 and table["expert"]["improvement"] is None
+    assert table["ppo"]["mean"] == np.mean([rows[f"TorqueTracking-v1/ppo/{seed}"].scores for seed in (0, 1)])
     assert table["rest"]["improvement"]["value"] < 0.5 < table["expert"]["score"]["value"]
     assert (benchmark / "TorqueTracking-v1/learning_curves.png").read_bytes().startswith(b"\x89PNG")
     text = (benchmark / "results.md").read_text()
