@@ -148,6 +148,7 @@ def test_every_run_has_its_row_and_the_table_has_them_all(benchmark):
     assert AgentFile.load(benchmark / "TorqueTracking-v1/ppo/1/agent.npz").card["seeds"]["training"] == 1
     table = {row["policy"]: row for row in json.loads((benchmark / "results.json").read_text())}
     assert table["ppo"]["seeds"] == 2 and table["expert"]["improvement"] is None
+    assert table["ppo"]["mean"] == np.mean([rows[f"TorqueTracking-v1/ppo/{seed}"].scores for seed in (0, 1)])
     assert table["rest"]["improvement"]["value"] < 0.5 < table["expert"]["score"]["value"]
     assert (benchmark / "TorqueTracking-v1/learning_curves.png").read_bytes().startswith(b"\x89PNG")
     text = (benchmark / "results.md").read_text()
@@ -303,7 +304,9 @@ def test_a_python_function_is_submitted_and_checked(tmp_path):
     found = run("--submit", "own_policy_of_test:act", "--task", TASK, "--out", tmp_path / "own")
     assert found.exit_code == 0, found.output
     path = tmp_path / "own/TorqueTracking-v1/own_policy_of_test.act/0" / RESULT
-    assert run("--check", path).exit_code == 0
+    refused = run("--check", path)  # a row of somebody else says what is run
+    assert refused.exit_code == 2 and "if you trust it, give --trust" in refused.output
+    assert run("--check", path, "--trust").exit_code == 0
 
 
 def test_a_file_with_pickles_needs_trust(tmp_path):
@@ -354,6 +357,13 @@ def test_a_file_that_is_no_row_is_told(tmp_path):
         (tmp_path / RESULT).write_text(text)
         with pytest.raises(RowError, match="is not a row of the benchmark"):
             Row.load(tmp_path / RESULT)
+
+
+def test_a_row_names_no_file_elsewhere(tmp_path):
+    row = Row(TASK, "mine", "submitted", 0, "../agent.npz", "", [seeds.TEST[0]] * 2, [0.5], 0)
+    (tmp_path / RESULT).write_text(row.text())
+    with pytest.raises(RowError, match="is not a row of the benchmark"):
+        Row.load(tmp_path / RESULT)
 
 
 def test_rows_of_other_episodes_are_not_compared(benchmark):

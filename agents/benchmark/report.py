@@ -33,6 +33,7 @@ class Standing:
         kind: As the rows have it.
         seeds: Of trainings.
         score: Interquartile mean over seeds and episodes.
+        mean: Of all scores: what the middle half hides, rare failures, is in it.
         improvement: Probability that it is better than the expert in an episode; None of the expert.
         ended_early: Share of the episodes that a fall or a trip ended.
         steps: Of a training.
@@ -44,6 +45,7 @@ class Standing:
     kind: str
     seeds: int
     score: ScoreEstimate
+    mean: float
     improvement: ScoreEstimate | None
     ended_early: float
     steps: int
@@ -90,7 +92,8 @@ def _standing(name: str, rows: Mapping[str, Mapping[str, Sequence[Row]]], policy
     if policy != EXPERT and all(EXPERT in policies for policies in rows.values()):
         improvement = probability_of_improvement(tables, [_scores(policies[EXPERT])[0] for policies in rows.values()])
     return Standing(
-        name, policy, own[0].kind, min(len(table) for table in tables), interquartile_mean(tables), improvement,
+        name, policy, own[0].kind, min(len(table) for table in tables), interquartile_mean(tables),
+        float(np.mean([row.scores for row in own])), improvement,
         sum(row.ended_early for row in own) / sum(len(row.scores) for row in own), max(row.steps for row in own),
         float(np.mean([row.cpu_seconds["training"] for row in own])) / 60.0,
     )  # fmt: skip
@@ -128,15 +131,16 @@ def _text(rows: Mapping[str, Mapping[str, Sequence[Row]]], table: Sequence[Stand
         f"{first.seeds[0]} to {first.seeds[1]}). Interquartile mean over seeds and episodes, and the probability of "
         "being better than the expert in an episode, each with a 95 % bootstrap interval (Agarwal et al., 2021).",
         "",
-        "| task | policy | seeds | score | better than the expert | ended early | steps | CPU minutes |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| task | policy | seeds | score | mean | better than the expert | ended early | steps | CPU minutes |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in table:
         better = "" if row.improvement is None else _interval(row.improvement)
         trained = (f"{row.steps:,}", f"{row.cpu_minutes:.1f}") if row.kind == TRAINED else ("", "")
         lines.append(
             f"| {_short(row.task)} | {row.policy} | {row.seeds if row.kind == TRAINED else ''} "
-            f"| {_interval(row.score)} | {better} | {row.ended_early:.0%} | {trained[0]} | {trained[1]} |"
+            f"| {_interval(row.score)} | {row.mean:.3f} | {better} "
+            f"| {row.ended_early:.0%} | {trained[0]} | {trained[1]} |"
         )
     made = sorted({f"drive-env {row.versions.get('drive-env')}, sources {row.versions.get('sources')}"
                    for policies in rows.values() for each in policies.values() for row in each})  # fmt: skip

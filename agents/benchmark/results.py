@@ -77,6 +77,8 @@ class Row:
             row = cls(**table)
             sound = len(row.scores) == row.seeds[1] - row.seeds[0] + 1 > 0
             sound = sound and row.task in TASKS and row.seeds[0] in TEST and row.seeds[1] in TEST
+            # Names of files beside it, never a path that leads elsewhere.
+            sound = sound and all(name == Path(name).name for name in (row.opened, row.policy))
             sound = sound and all(isinstance(score, float) for score in row.scores)
         except OSError as error:
             raise RowError(f"{path} cannot be read: {error.strerror}") from None

@@ -227,12 +227,18 @@ def check(path: Path, *, trust: bool = False) -> RowCheck:
     """Run a row's episodes again with the policy beside it, and return whether it holds.
 
     Raises:
-        RowError: If the file is no row, or was changed; UntrustedError for a checkpoint without `trust`.
+        RowError: If the file is no row, or was changed, or names a Python function without `trust`.
+        UntrustedError: For a checkpoint without `trust`.
     """
     from agents.benchmark.statistics import interquartile_mean
 
     row = Row.load(path)
     text = str(path.parent / row.opened) if names_a_file(row.opened) else row.opened
+    if ":" in row.opened and not names_a_file(text) and not trust:
+        raise RowError(
+            f"the row's policy is the Python function {row.opened}, whose module would be run with your rights: if you "
+            "trust it, give --trust"
+        )
     if names_a_file(text) and not Path(text).is_file():
         raise RowError(f"the row's policy, {row.opened}, is not beside it: put it into {path.parent}")
     written = Written.of(text, trust)
