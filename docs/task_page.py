@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from agents.policies.baselines import SUITE_TASKS
 from agents.training.tasks import short_name
 from drive_env.envs.suite import TASKS, SuiteTask
@@ -19,6 +21,7 @@ from drive_env.envs.tracking import Tracking
 
 HERE = Path(__file__).parent
 SCORES = HERE / "task_scores.json"
+CURVES = "assets/tasks/{}_curves.webp"
 MACHINES = 24
 INTRODUCTION = """# Learning tasks
 
@@ -34,8 +37,9 @@ friction, stiffness, motor, power stage, and the delays of the bus.
 
 What is in the table: the best of twelve policies that have learnt nothing (zero, random, bang-bang on the following
 error, nine constants); the *cascade* that a drive or a master has anyway; the *expert*, which is what a motion engineer
-would program who knows the parameters of each machine; and agents, trained as the benchmark trains
-them, with the interquartile mean and its 95 % interval. Agents see only what the drives tell.
+would program who knows the parameters of each machine; and agents, trained as `drive-agent benchmark --seeds 3` trains
+them. Baselines and agents have the same 64 held-out episodes; the figure is the interquartile mean, of agents with its
+95 % interval and with the mean, which sees rare failures. Agents see only what the drives tell.
 
 """
 
@@ -58,7 +62,9 @@ def _row(name: str, task: SuiteTask, scores: dict[str, Any]) -> str:
     unlearnt = scores.get("unlearnt", {})
     best = max(unlearnt, key=lambda policy: unlearnt[policy], default="")
     agents = "; ".join(
-        f"{policy} {one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f}), {one['steps']:,} steps x {one['seeds']}"
+        f"{policy} {one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f}), mean {one['mean']:.3f}, "
+        f"{one['ended_early']:.0%} ended early, {one['steps']:,} steps in {one['cpu_minutes']:.1f} CPU minutes, "
+        f"{one['seeds']} seeds"
         for policy, one in scores.get("trained", {}).items()
     )
     baselines = scores.get("baselines", {})
@@ -75,7 +81,7 @@ def _section(name: str, task: SuiteTask) -> str:
         if isinstance(value, dict)
     )
     first = str(inspect.getdoc(SUITE_TASKS[name]["expert"])).partition("\n")[0].rstrip(".")
-    expert = first.removeprefix("Return the ")
+    expert, curves = first.removeprefix("Return the "), CURVES.format(short_name(name))
     return "\n".join(
         [
             f"## {name.partition('/')[2]}\n",
@@ -83,6 +89,7 @@ def _section(name: str, task: SuiteTask) -> str:
             f"{expert[0].lower()}{expert[1:]}.\n",
             f"![The machine and its expert at work](assets/tasks/{short_name(name)}.webp)\n",
             f"```toml\n{options}\n{tables}\n```\n",
+            *([f"![Learning curves]({curves})\n"] if (HERE / curves).is_file() else []),
         ]
     )
 
@@ -119,11 +126,16 @@ def measure(folder: Path) -> None:
         own = found.setdefault(row["task"], {"unlearnt": {}, "baselines": {}, "trained": {}})
         if row["kind"] == "baseline":
             own["baselines"][row["policy"]] = round(row["score"]["value"], 4)
-        else:
+        elif row["kind"] == "trained":
             figures = {key: round(row["score"][key], 4) for key in ("value", "low", "high")}
-            own["trained"][row["policy"]] = figures | {"steps": row["steps"], "seeds": row["seeds"]}
+            kept = ("mean", "ended_early", "steps", "cpu_minutes", "seeds")
+            own["trained"][row["policy"]] = figures | {key: round(row[key], 4) for key in kept}
     for name, own in found.items():
         own["unlearnt"] = {policy: round(score, 4) for policy, score in unlearnt_scores(name, MACHINES).items()}
+        curves = folder / name.partition("/")[2] / "learning_curves.png"
+        if curves.is_file():
+            with Image.open(curves) as picture:
+                picture.save(HERE / CURVES.format(short_name(name)), quality=82, method=6)
     SCORES.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
