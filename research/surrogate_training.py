@@ -33,7 +33,7 @@ from drive_env.envs.gain_tuning import GainTuning, GainTuningConfig
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.trials.score import TRIP
 from mechanics.untrusted import read_arrays
-from research.tuner_recipes import RECIPES, Recipe, Row, laws
+from research.tuner_recipes import RECIPES, Recipe, TrainingMachines, laws
 from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
@@ -97,7 +97,7 @@ class Answers(NamedTuple):
 
 
 @contextmanager
-def machines_of(recipe: Recipe, row: Row, count: int, **options: Any) -> Iterator[Any]:
+def machines_of(recipe: Recipe, row: TrainingMachines, count: int, **options: Any) -> Iterator[Any]:
     """Make the environment with random machines of a row, options in place of the configuration's."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of machines that their motors can hardly move: they are tuned, too
@@ -117,7 +117,9 @@ def configuration(recipe: Recipe) -> dict[str, Any]:
     return {**own, "gains": list(recipe.gains), "trials": TRIALS, "step": STEP}
 
 
-def collect(recipe: Recipe, row: Row, machines: int, trials: int, seed: int, agent: AgentFile | None = None) -> Any:
+def collect(
+    recipe: Recipe, row: TrainingMachines, machines: int, trials: int, seed: int, agent: AgentFile | None = None
+) -> Any:
     """Return `TrialData` on random machines: of random gains, or of what an agent proposes, shaken a little."""
     from research.surrogate_fit import TrialData
 

@@ -13,7 +13,7 @@ from mechanics.loads import find_load
 FORCES = ("kg", "N")  # what the units of masses and inertias, of forces and of all that is counted by them begin with
 
 
-class Row(NamedTuple):
+class TrainingMachines(NamedTuple):
     """Machines: load and motor, drawn from the load's shipped distributions.
 
     times: Of the load's inertia, stiffness, damping and friction, for a motor that is larger than the load's own; the
@@ -56,7 +56,7 @@ class Recipe(NamedTuple):
     about: tuple[float, ...]
     together: tuple[float, ...]
     spread: tuple[float, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TrainingMachines, ...]
     dynamics: tuple[str, ...]
     rule: str
     limits: tuple[str, ...]
@@ -75,14 +75,14 @@ _TMCM1636 = Recipe(
     together=(0.9, 0.3, 1.2),
     spread=(0.3, 0.7, 0.3),
     rows=(
-        Row("two_mass", "qbl4208"),
-        Row("belt", "qbl4208"),
-        Row("inertia", "ec_i_40"),
-        Row("ball_screw", "teknic_m2310p"),
-        Row("three_mass", "qbl4208"),
-        Row("geared_joint", "ec_45_flat"),
-        Row("vertical_screw", "re_40"),
-        Row("fan", "re_35"),
+        TrainingMachines("two_mass", "qbl4208"),
+        TrainingMachines("belt", "qbl4208"),
+        TrainingMachines("inertia", "ec_i_40"),
+        TrainingMachines("ball_screw", "teknic_m2310p"),
+        TrainingMachines("three_mass", "qbl4208"),
+        TrainingMachines("geared_joint", "ec_45_flat"),
+        TrainingMachines("vertical_screw", "re_40"),
+        TrainingMachines("fan", "re_35"),
     ),
     dynamics=tuple(known_dynamics()),
     rule="the baseline rule",
@@ -101,14 +101,14 @@ _NOT_COMPARED = "trained for a comparison: drive-tune auto tunes this drive"
 _TGZ = _TMCM1636._replace(
     device="tgz_d",
     rows=(
-        Row("two_mass", "am3041_e", 16.0),
-        Row("belt", "am3041_e", 16.0),
-        Row("inertia", "am3033_e", 16.0),
-        Row("ball_screw", "am3041_e", 16.0),
-        Row("three_mass", "am3041_e", 16.0),
-        Row("geared_joint", "am3033_e", 16.0),
-        Row("vertical_screw", "am3041_e", 8.0),
-        Row("fan", "am3033_e", 16.0),
+        TrainingMachines("two_mass", "am3041_e", 16.0),
+        TrainingMachines("belt", "am3041_e", 16.0),
+        TrainingMachines("inertia", "am3033_e", 16.0),
+        TrainingMachines("ball_screw", "am3041_e", 16.0),
+        TrainingMachines("three_mass", "am3041_e", 16.0),
+        TrainingMachines("geared_joint", "am3033_e", 16.0),
+        TrainingMachines("vertical_screw", "am3041_e", 8.0),
+        TrainingMachines("fan", "am3033_e", 16.0),
     ),
     limits=("velocity P and I and position P only", _NOT_COMPARED),
 )
@@ -128,11 +128,11 @@ _TMCM3313 = Recipe(
     together=(0.0, 0.0, 0.0, 0.0),
     spread=(0.8, 0.8, 1.0, 0.7),
     rows=(
-        Row("inertia", "qsh4218_51"),
-        Row("two_mass", "qsh4218_51"),
-        Row("belt", "qsh5718_76", 4.0),
-        Row("fan", "qsh4218_47"),
-        Row("ball_screw", "qsh6018_86", 8.0),
+        TrainingMachines("inertia", "qsh4218_51"),
+        TrainingMachines("two_mass", "qsh4218_51"),
+        TrainingMachines("belt", "qsh5718_76", 4.0),
+        TrainingMachines("fan", "qsh4218_47"),
+        TrainingMachines("ball_screw", "qsh6018_86", 8.0),
     ),
     dynamics=(DEFAULT,),
     rule="the values it is commissioned with",
@@ -142,7 +142,7 @@ _TMCM3313 = Recipe(
 RECIPES = {recipe.device: recipe for recipe in (_TMCM1636, _TGZ, _TGZ._replace(device="tgz_s"), _TMCM3313)}
 
 
-def laws(recipe: Recipe, row: Row) -> Distributions | None:
+def laws(recipe: Recipe, row: TrainingMachines) -> Distributions | None:
     """Return how machines of a row are distributed; None is as the load's shipped set has it."""
     if row.times == 1.0:
         return None

@@ -13,7 +13,7 @@ from agents.shipped import find_agent, shipped, shipped_names
 from agents.tuner.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
 from drive_env.envs.gain_tuning import GainTuningConfig
 from research import surrogate_training as training
-from research.tuner_recipes import RECIPES, Row, laws
+from research.tuner_recipes import RECIPES, TrainingMachines, laws
 
 RECIPE = RECIPES["tmcm1636"]
 G = len(RECIPE.gains)
@@ -286,7 +286,7 @@ def test_a_tuner_that_answers_the_rules_gains_has_the_rules_hidden_j_and_one_tha
     monkeypatch,
 ):
     monkeypatch.setattr(training, "TRIALS", 1)
-    one = RECIPE._replace(rows=(Row("inertia", "ec_i_40"),))
+    one = RECIPE._replace(rows=(TrainingMachines("inertia", "ec_i_40"),))
     found = training.judge(one, Constant(0.0, 0.0), 2, 5)
     assert found.ratio == pytest.approx(1.0) and found.best == pytest.approx(1.0)
     with pytest.raises(RuntimeError, match="answered gains that it had not tried"):
@@ -296,7 +296,7 @@ def test_a_tuner_that_answers_the_rules_gains_has_the_rules_hidden_j_and_one_tha
 @pytest.mark.slow
 def test_training_from_nothing_makes_a_tuner_repeats_and_goes_on_from_kept_trials(tmp_path):
     rounds = (training.Round(sets=1, trials=8), training.Round(sets=1, trials=10))
-    one = RECIPE._replace(rows=(Row("inertia", "ec_i_40"),))
+    one = RECIPE._replace(rows=(TrainingMachines("inertia", "ec_i_40"),))
     few = training.Budget(rounds, machines=2, networks=3, judged=2)
     first = training.train(one, 3, budget=few, kept=tmp_path)
     (tmp_path / "trials_3_1_0_0.npz").unlink()  # stopped in its second round
@@ -329,7 +329,7 @@ def test_a_recipe_makes_a_tuner_of_its_device_with_figures(device, tmp_path, mon
 
 
 def test_a_load_of_more_times_has_that_inertia_stiffness_and_friction_and_the_same_frequencies():
-    row = Row("two_mass", "am3041_e", 16.0)
+    row = TrainingMachines("two_mass", "am3041_e", 16.0)
     small, large = (dict(laws(RECIPES["tgz_d"], row._replace(times=times)).laws) for times in (1.0 + 1e-12, 16.0))
     scaled = {f"load.{name}" for name in ("inertia", "stiffness", "damping", "coulomb", "breakaway", "viscous")}
     for name, law in small.items():

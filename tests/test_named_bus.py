@@ -99,7 +99,7 @@ VALUES: dict[str, str] = {
     "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc", "apply": "simc",
     "sampler": "tpe", "objectives": "cost", "gains": "velocity_p", "axes": "apart", "travel": "-1:1",
     "cluster": "tcp://127.0.0.1:1", "against": "emulator", "sensor": "module:function", "listen": "127.0.0.1",
-    "token": "12345678", "fault": "encoder_stuck at=2",
+    "token": "12345678", "minari": "drives/tracking-v0", "fault": "encoder_stuck at=2",
 }  # fmt: skip
 BY_TYPE = {int: "1", float: "0.5"}
 INSTEAD = {"by": "duration"}  # an option that stands in another's place

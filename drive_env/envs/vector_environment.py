@@ -11,6 +11,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium
@@ -205,11 +206,9 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
     def _description(self) -> State:
         """Return what environments must have in common to have the same states."""
-        from drive_env import __version__
-
         table = {one.name: _text(getattr(self.config, one.name)) for one in fields(self.config)}
         table.pop("num_threads", None)
-        return {"environment": type(self).__name__, "version": __version__, "num_envs": self.num_envs, **table}
+        return {"environment": type(self).__name__, "version": version("drive-env"), "num_envs": self.num_envs, **table}
 
     def __reduce__(self) -> tuple[Any, ...]:
         if not self._owned:
