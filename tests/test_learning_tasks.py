@@ -11,7 +11,7 @@ import pytest
 from agents.benchmark.unlearnt import unlearnt_scores
 from agents.evaluation.evaluation import evaluate
 from agents.policies.baselines import SUITE_TASKS, baseline
-from agents.training.tasks import environment_name, make_environments
+from agents.training.tasks import configuration_of, environment_name, make_environments
 from drive_env.envs.suite import TASKS
 
 MACHINES = 6
@@ -49,3 +49,21 @@ def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
         scores[row] = float(np.mean([episode.rewards.sum() for episode in found.episodes])) / TASKS[name].steps
     assert LEAST <= scores.pop("expert") <= MOST
     assert max(scores.values()) < UNLEARNT + 0.02, scores
+
+
+def test_an_agents_file_has_the_whole_configuration_of_its_task_and_another_is_refused():
+    lanes = make_environments("Crane", 1)
+    whole = configuration_of(lanes)
+    lanes.close()
+    make_environments("Crane", 1, whole).close()
+    with pytest.raises(ValueError, match="is frozen and takes no 'speed'"):
+        make_environments("Crane", 1, {**whole, "speed": 6.0})
+
+
+def test_the_score_of_a_task_is_the_share_of_the_horizons_rewards():
+    lanes = make_environments("PoleBalance", 1)
+    rest = baseline("rest", "PoleBalance", lanes.config, 1)
+    lanes.close()
+    found = evaluate(rest, "PoleBalance", episodes=4, seed=3_000_000)
+    sums = [episode.rewards.sum() / TASKS["ServoDrive/PoleBalance-v1"].steps for episode in found.episodes]
+    assert found.score == "score [0...1]" and found.values[found.score] == pytest.approx(sums)

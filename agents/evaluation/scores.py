@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.envs import environment_of
+from drive_env.envs.suite import TASKS
 from drive_env.trials.score import TRIP
 from tuning.bootstrap import bootstrap_interval
 
@@ -144,6 +145,10 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 def figures(environment: str, config: Any) -> tuple[Figure, ...]:
     """Return the figures of an environment, the score first: where a pole can fall, the time that it stood."""
     found = FIGURES[environment_of(environment)]
+    if environment in TASKS:
+        steps = TASKS[environment].steps
+        score = Figure("score [0...1]", lambda episode, config: total(episode, config) / steps, lower_is_better=False)
+        return (score, *found)
     if np.isfinite(getattr(getattr(config, "task", None), "fall", np.inf)):
         found = tuple(sorted(found, key=lambda figure: figure.compute is not upright))
     return found

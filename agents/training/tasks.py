@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from agents.policies.agent_file import plain
 from drive_env.envs import environment_of, make_vector
 from drive_env.envs.suite import TASKS as SUITE
 
@@ -76,18 +79,22 @@ def make_environments(
     """
     name, own = environment_name(environment), dict(configuration or {})
     if name in SUITE:
-        plain_own = SUITE[name].options
-        own = {key: value for key, value in own.items() if key not in plain_own or value != plain_own[key]}
+        whole = _whole_configuration(name)  # an agent's file has all of it
+        own = {key: value for key, value in own.items() if key not in whole or plain({key: value})[key] != whole[key]}
         return make_vector(num_envs, name=name, **own, **options)
     return make_vector(num_envs, name=name, config=own, **options)
 
 
+def _whole_configuration(task: str) -> dict[str, Any]:
+    """Return all options of a task of the suite for JSON, defaults too."""
+    row = row_of(task)
+    kind = getattr(importlib.import_module(f"drive_env.envs.{row.short}"), f"{row.kind}Config")
+    table: dict[str, Any] = plain(asdict(kind(**SUITE[task].options)))
+    return table
+
+
 def configuration_of(lanes: Any) -> dict[str, Any]:
     """Return all options of an environment for JSON, defaults too."""
-    from dataclasses import asdict
-
-    from agents.policies.agent_file import plain
-
     table: dict[str, Any] = plain(asdict(lanes.config))
     return table
 
