@@ -29,6 +29,8 @@ for _ in range(100):
     observations, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
 ```
 
+The [learning tasks](../../tasks.md), `ServoDrive/...-v1`, are frozen configurations of these.
+
 `gym.make("ServoDrive/Tracking-v0")` makes a single one; `gym.make("drive_env:ServoDrive/Tracking-v0")` needs no import
 before, as in the configuration of a training script. The steps of an episode are in `env.spec.max_episode_steps`,
 whatever the configuration makes them, so that wrappers like `TimeAwareObservation` work; the environment itself
