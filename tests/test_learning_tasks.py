@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import runpy
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -14,6 +17,7 @@ from agents.policies.baselines import SUITE_TASKS, baseline
 from agents.training.tasks import configuration_of, environment_name, make_environments
 from drive_env.envs.suite import TASKS
 
+DOCS = Path(__file__).resolve().parent.parent / "docs"
 MACHINES = 6
 UNLEARNT, LEAST, MOST = 0.6, 0.7, 0.95  # score of what has learnt nothing at most; of the expert
 
@@ -67,3 +71,12 @@ def test_the_score_of_a_task_is_the_share_of_the_horizons_rewards():
     found = evaluate(rest, "PoleBalance", episodes=4, seed=3_000_000)
     sums = [episode.rewards.sum() / TASKS["ServoDrive/PoleBalance-v1"].steps for episode in found.episodes]
     assert found.score == "score [0...1]" and found.values[found.score] == pytest.approx(sums)
+
+
+def test_the_page_is_what_the_suite_and_the_kept_scores_make():
+    written = runpy.run_path(str(DOCS / "task_page.py"))["page"]()
+    assert (DOCS / "tasks.md").read_text(encoding="utf-8") == written
+    kept = json.loads((DOCS / "task_scores.json").read_text(encoding="utf-8"))
+    assert set(kept) == set(TASKS)
+    for scores in kept.values():
+        assert max(scores["unlearnt"].values()) < UNLEARNT and LEAST <= scores["baselines"]["expert"] <= MOST
