@@ -255,7 +255,7 @@ def judge(recipe: Recipe, policy: Any, machines: int, seed: int, dynamics: str =
     found = []
     for row in recipe.rows:
         with machines_of(recipe, row, machines, dynamics=dynamics) as env:
-            observation, info = env.reset(seed=seed)
+            observation, info = env.reset(seed=list(range(seed, seed + machines)))
             tried, costs, aborted = [info["gains"]], [info["robust_cost"]], []
             policy.reset()
             for _ in range(env.config.trials):
@@ -283,7 +283,7 @@ def factory_cost(recipe: Recipe, machines: int, seed: int) -> Floats:
     found = []
     for row in recipe.rows:
         with machines_of(recipe, row, machines, trials=1, step=WIDEST) as env:
-            _, info = env.reset(seed=seed)
+            _, info = env.reset(seed=list(range(seed, seed + machines)))
             change = np.log(np.maximum(factory, 1.0)) - np.log(info["gains"][:, 0][:, columns])
             _, _, _, _, after = env.step(change.astype(np.float32))
             found.append(after["trial_robust_cost"] / info["robust_cost"])
