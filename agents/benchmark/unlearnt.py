@@ -12,20 +12,29 @@ from drive_env.envs.suite import TASKS
 
 Floats = NDArray[np.float64]
 
-AXIS_ENTRIES = 8  # of an axis in Tracking's observation; the first is the following error
+AXIS_ENTRIES = 8  # of an axis in Tracking's observation; the first two are the errors of position and speed
+PAIRS = ((4.0, 0.5), (6.0, 0.5), (8.0, 1.0), (16.0, 1.0), (16.0, 0.1), (32.0, 0.1), (0.0, 1.0), (0.0, 3.0))
 CONSTANTS = (-1.0, -0.5, -0.2, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
-def _constant(value: float) -> Callable[[Floats, np.random.Generator], Floats]:
-    return lambda error, rng: np.full_like(error, value)
+Plain = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 
-# Name -> action of every entry from the following errors, shape (machines, entries), and a generator.
-POLICIES: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
-    "zero": lambda error, rng: np.zeros_like(error),
-    "random": lambda error, rng: rng.uniform(-1.0, 1.0, error.shape),
-    "bang-bang": lambda error, rng: np.sign(error),
+def _constant(value: float) -> Plain:
+    return lambda error, speed, rng: np.full_like(error, value)
+
+
+def _pair(proportional: float, derivative: float) -> Plain:
+    return lambda error, speed, rng: np.clip(proportional * error + derivative * speed, -1.0, 1.0)
+
+
+# Name -> action of every entry from the errors of position and speed, shape (machines, entries), and a generator.
+POLICIES: dict[str, Plain] = {
+    "zero": lambda error, speed, rng: np.zeros_like(error),
+    "random": lambda error, speed, rng: rng.uniform(-1.0, 1.0, error.shape),
+    "bang-bang": lambda error, speed, rng: np.sign(error),
     **{f"constant {value:g}": _constant(value) for value in CONSTANTS},
+    **{f"PD {pair[0]:g}, {pair[1]:g}": _pair(*pair) for pair in PAIRS},
 }
 
 
@@ -43,8 +52,8 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
         total, going = np.zeros(lanes.num_envs), np.ones(lanes.num_envs, bool)
         for _ in range(TASKS[name].steps):
             rows = np.asarray(seen, float)[:, : AXIS_ENTRIES * entries]
-            errors = rows.reshape(len(POLICIES), machines, entries, AXIS_ENTRIES)[..., 0]
-            action = np.stack([act(error, rng) for act, error in zip(POLICIES.values(), errors, strict=True)])
+            errors = np.moveaxis(rows.reshape(len(POLICIES), machines, entries, AXIS_ENTRIES)[..., :2], -1, 1)
+            action = np.stack([act(*both, rng) for act, both in zip(POLICIES.values(), errors, strict=True)])
             seen, reward, terminated, _, _ = lanes.step(action.reshape(-1, entries).astype(np.float32))
             if np.any((reward < 0.0) | (reward > 1.0)):
                 raise ValueError(f"a reward of {name} is {reward.min():g} to {reward.max():g}; it must lie in 0...1")

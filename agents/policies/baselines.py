@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.experts import CarriageServo, ComputedTorque, Pendulum, SpeedCurve, SwingUp, TorqueCascade
+from agents.policies.experts import CarriageServo, ComputedTorque, LeadAndFeedback, Pendulum, SwingUp, TorqueCascade
 from agents.training.tasks import environment_name
 
 Array = NDArray[np.float32]
@@ -136,12 +136,11 @@ BASELINES: dict[str, dict[str, Any]] = {
 # of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole.
 SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/TorqueTracking-v1": {"rest": nothing, "cascade": TorqueCascade, "expert": ComputedTorque},
-    "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": feed_forward},
+    "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": LeadAndFeedback},
     "ServoDrive/Crane-v1": {"rest": nothing, "cascade": CarriageServo, "expert": Pendulum},
     "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
     "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
-    "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": feed_forward},
-    "ServoDrive/StepperRun-v1": {"rest": nothing, "expert": SpeedCurve},
+    "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": LeadAndFeedback},
 }
 
 
