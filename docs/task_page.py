@@ -35,11 +35,12 @@ The reward of a step lies in 0...1, nothing is earned after a fall or a trip, an
 rewards over the horizon. Every episode has a machine of its own, drawn from the load's distributions: inertia,
 friction, stiffness, motor, power stage, and the delays of the bus.
 
-What is in the table: the best of twelve policies that have learnt nothing (zero, random, bang-bang on the following
-error, nine constants); the *cascade* that a drive or a master has anyway; the *expert*, which is what a motion engineer
-would program who knows the parameters of each machine; and agents, trained as `drive-agent benchmark --seeds 3` trains
-them. Baselines and agents have the same 64 held-out episodes; the figure is the interquartile mean, of agents with its
-95 % interval and with the mean, which sees rare failures. Agents see only what the drives tell.
+What is in the table: the best of twenty policies that have learnt nothing (zero, random, bang-bang on the following
+error, nine constants, eight pairs of gains on the errors of position and speed); the *cascade* that a drive or a master
+has anyway; the *expert*, which is what a motion engineer would program who knows the parameters of each machine; and
+agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out episodes;
+the figure is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare failures. Agents
+see only what the drives tell.
 
 """
 

@@ -69,7 +69,7 @@ class Row:
         """Read a row.
 
         Raises:
-            RowError: If the file is none, or its digest is not that of its content.
+            RowError: If the file is not a row, or its digest does not match its content.
         """
         try:
             table: dict[str, Any] = read_json(path)

@@ -53,7 +53,7 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
         for _ in range(TASKS[name].steps):
             rows = np.asarray(seen, float)[:, : AXIS_ENTRIES * entries]
             errors = np.moveaxis(rows.reshape(len(POLICIES), machines, entries, AXIS_ENTRIES)[..., :2], -1, 1)
-            action = np.stack([act(*both, rng) for act, both in zip(POLICIES.values(), errors, strict=True)])
+            action = np.stack([act(both[0], both[1], rng) for act, both in zip(POLICIES.values(), errors, strict=True)])
             seen, reward, terminated, _, _ = lanes.step(action.reshape(-1, entries).astype(np.float32))
             if np.any((reward < 0.0) | (reward > 1.0)):
                 raise ValueError(f"a reward of {name} is {reward.min():g} to {reward.max():g}; it must lie in 0...1")

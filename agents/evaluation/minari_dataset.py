@@ -33,7 +33,7 @@ def save(name: str, found: Evaluation) -> None:
         gymnasium.make(f"drive_env:{found.environment}", config=found.configuration) as env,
         warnings.catch_warnings(),
     ):
-        warnings.simplefilter("ignore", UserWarning)  # it asks for author and address, which nobody has told
+        warnings.simplefilter("ignore", UserWarning)  # it wants an author and an address, which are not known here
         space = env.observation_space
         first = 0
         for number, episode in enumerate(found.episodes):

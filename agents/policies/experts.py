@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 
 AXIS_ENTRIES = 8
 ERROR, SPEED_ERROR, POSITION, SPEED, TORQUE, WANTED_SPEED, WANTED_SPEED_LATER = range(7)  # of an axis in Tracking
+FEEDBACK = {"gantry": 4.0, "robot": 2.0}  # of LeadAndFeedback: lead per following error [rev/rev]
 PREVIEW = 0.01  # s, how much later
 GRAVITY = 9.81  # m/s^2
 
@@ -160,11 +161,10 @@ class SwingUp(Pendulum):
 class LeadAndFeedback(Expert):
     """Set-points that lead by the cascade's lags, and by a share of the following error besides, of axes in csp.
 
-    The lags are times of velocity and acceleration of the profile, as a step of the velocity and one of the acceleration
-    show them (Lambrechts et al. 2005); all three numbers were found by trying, the same for every machine.
+    Feed-forward of velocity and acceleration (Lambrechts et al. 2005); its two lags and the feedback were found by
+    trying, the same for every machine.
     """
 
-    FEEDBACK = {"gantry": 4.0, "robot": 2.0}  # lead per following error [rev/rev]
     LAG, LAG_OF_SPEED = 0.030, 4e-4  # s, s^2
 
     def actions(self, rows: Floats) -> Floats:
@@ -173,7 +173,7 @@ class LeadAndFeedback(Expert):
         axes = rows[:, : rows.shape[1] // AXIS_ENTRIES * AXIS_ENTRIES].reshape(len(rows), -1, AXIS_ENTRIES)
         acceleration = configuration.speed * (axes[..., WANTED_SPEED_LATER] - axes[..., WANTED_SPEED]) / PREVIEW
         lead = self.LAG * configuration.speed * axes[..., WANTED_SPEED] + self.LAG_OF_SPEED * acceleration
-        lead += self.FEEDBACK[configuration.load] * configuration.amplitude * axes[..., ERROR]
+        lead += FEEDBACK[configuration.load] * configuration.amplitude * axes[..., ERROR]
         return np.asarray(lead / (1.25 * configuration.offset * configuration.amplitude))
 
 

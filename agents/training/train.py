@@ -296,7 +296,7 @@ def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: R
     with _settings_of(f"imitate {name}"):
         wanted = inspect.signature(imitate).bind(model, teacher, seed=seed, told=told, **settings)
     left = imitate(*wanted.args, **wanted.kwargs)
-    lanes.forget()  # the teacher's episodes are none of the training's
+    lanes.forget()  # the teacher's episodes do not count as the training's
     logger.info("the policy begins as %s, its actions within %.3g", name, left)
 
 

@@ -328,7 +328,7 @@ class EmulatedDrives(Saved):
             group.load.restore_state(saved)
 
     def _description(self) -> State:
-        """Return what drives must have in common to have the same states."""
+        """Return what must be equal in two sets of drives so that one can restore the state of the other."""
         groups = [(group.load.copies, group.load.h, group.load.staggered) for group in self._groups]
         return {
             "device": self.device.name, "load": str(self.load.name), "motor": self.motor.name,

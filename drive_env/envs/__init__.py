@@ -46,7 +46,7 @@ def environment_of(name: str) -> str:
     """Return the configurable environment that a name stands for: a task's own, or itself.
 
     Raises:
-        ValueError: For a name that is none.
+        ValueError: For an unknown name.
     """
     if name in TASKS:
         return TASKS[name].environment
@@ -68,7 +68,7 @@ def make_vector(num_envs: int = 1, *, name: str, **options: Any) -> VectorEnviro
             of its configuration; of a task num_threads alone.
 
     Raises:
-        ValueError: For a name or an option that is none.
+        ValueError: For an unknown name, or an option that the task or environment does not have.
     """
     module, kind = ENVIRONMENTS[environment_of(name)]
     if name in TASKS:
@@ -94,7 +94,7 @@ def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
         options: Of the environment.
 
     Raises:
-        ValueError: For a name that is none; ImportError without Stable-Baselines3 (the extra `agents`).
+        ValueError: For an unknown name; ImportError without Stable-Baselines3 (the extra `agents`).
     """
     environment_of(name)
     try:

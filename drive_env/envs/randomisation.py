@@ -331,7 +331,7 @@ class RandomMachines(Saved):
             self.values["fault.at"][lane] = order.at
 
     def _checked(self, given: Mapping[str, ArrayLike]) -> dict[str, Floats]:
-        """Return given values of all machines; ValueError for a name or value that is none."""
+        """Return given values of all machines; ValueError for an unknown name or a value that is not a number."""
         machines, fixed = self._drives.num_machines, {}
         for name, value in given.items():
             check_known(name, self._defaults)

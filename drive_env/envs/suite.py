@@ -44,7 +44,7 @@ def _tracking(about: str, solved: float, reward: str, load: str, duration: float
 TASKS: dict[str, SuiteTask] = {
     "ServoDrive/TorqueTracking-v1": _tracking(
         "moves of a disc on an elastic shaft by torque alone: inertia, stiffness, friction and the bus' delays differ",
-        0.80, "tracking", "two_mass", 1.0, mode="cst", margins={"tracking": 0.06},
+        0.80, "tracking", "two_mass", 1.0, mode="cst", margins={"tracking": 0.05},
     ),
     "ServoDrive/GantryBeam-v1": _tracking(
         "two drives pull one beam along a trajectory: the agent leads both set-points, the drives close the loops",

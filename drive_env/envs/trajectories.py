@@ -51,7 +51,7 @@ def draw(
 
 
 def checked(rows: ArrayLike, *shapes: tuple[int, ...]) -> Floats:
-    """Return somebody's own rows of position, velocity and acceleration; ValueError if they are none."""
+    """Return a user's position, velocity and acceleration; ValueError if shape or values are wrong."""
     found = np.asarray(rows, float)
     if found.shape not in shapes or not np.isfinite(found).all():
         what = "numbers that are not finite" if found.shape in shapes else f"shape {found.shape}"

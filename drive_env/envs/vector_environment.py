@@ -132,7 +132,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return observation, own.copy(), terminated, truncated, info
 
     def _present(self) -> tuple[Observation, Info]:
-        """Return what a reset that led to the present state would have: observations, and what is to be told."""
+        """Return the observations and info of the present state, as a reset returns them."""
         raise NotImplementedError
 
     @property
@@ -171,8 +171,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     def save_state(self) -> State:
         """Return all that the environments go on from, as plain data that pickles: continued from it, they do the same.
 
-        It holds drives, machines, trajectories, delays, random generators and how far each episode is; a function that
-        was given, as a reward, is none of it.
+        It holds drives, machines, trajectories, delays, random generators and how far each episode is; functions that
+        were given (reward, trajectory) are not in it.
 
         Raises:
             ValueError: On a bus: real drives cannot be put back.
@@ -201,11 +201,13 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     def _emulated_drives(self) -> Any:
         machine = self.drives.machine
         if machine is None:
-            raise ValueError("a state is of emulated drives; on a bus nobody can put machines back to it")
+            raise ValueError(
+                "only emulated drives have a state that can be saved and restored; a machine on a bus cannot be put back"
+            )
         return machine.drives
 
     def _description(self) -> State:
-        """Return what environments must have in common to have the same states."""
+        """Return what must be equal in two vectors of environments so that one can restore the state of the other."""
         table = {one.name: _text(getattr(self.config, one.name)) for one in fields(self.config)}
         table.pop("num_threads", None)
         return {"environment": type(self).__name__, "version": version("drive-env"), "num_envs": self.num_envs, **table}
@@ -249,7 +251,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
                 environment's.
 
         Raises:
-            ValueError: For an option that there is not, naming those that there are, or a value that is none.
+            ValueError: For an unknown option, naming those that there are, or a value out of its range.
         """
         options = dict(options or {})
         for name in options:
