@@ -1,6 +1,6 @@
 """docs/tasks.md from the suite's table and docs/task_scores.json: `python docs/task_page.py` writes it anew.
 
-`python docs/task_page.py FOLDER` takes the scores from the folder of a `drive-agent benchmark` first, and plays the
+`python docs/task_page.py FOLDER ...` takes the scores from folders of `drive-agent benchmark` first, and plays the
 policies that have learnt nothing.
 """
 
@@ -38,9 +38,9 @@ friction, stiffness, motor, power stage, and the delays of the bus.
 What is in the table: the best of twenty policies that have learnt nothing (zero, random, bang-bang on the following
 error, nine constants, eight pairs of gains on the errors of position and speed); the *cascade* that a drive or a master
 has anyway; the *expert*, which is what a motion engineer would program who knows the parameters of each machine; and
-agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out episodes;
-the figure is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare failures. Agents
-see only what the drives tell.
+agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out
+episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare
+failures. Agents see only what the drives tell.
 
 """
 
@@ -116,31 +116,33 @@ def _toml(value: Any) -> str:
     )
 
 
-def measure(folder: Path) -> None:
-    """Take a benchmark's results into SCORES, with what policies reach that have learnt nothing."""
+def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:
+    """Take a benchmark's results into the scores, with what policies reach that have learnt nothing."""
     from agents.benchmark.unlearnt import unlearnt_scores
 
-    found: dict[str, dict[str, Any]] = {}
-    for row in json.loads((folder / "results.json").read_text(encoding="utf-8")):
-        if row["task"] not in TASKS:
-            continue
-        own = found.setdefault(row["task"], {"unlearnt": {}, "baselines": {}, "trained": {}})
+    rows = [row for row in json.loads((folder / "results.json").read_text(encoding="utf-8")) if row["task"] in TASKS]
+    for name in dict.fromkeys(row["task"] for row in rows):
+        unlearnt = {policy: round(score, 4) for policy, score in unlearnt_scores(name, MACHINES).items()}
+        scores[name] = {"unlearnt": unlearnt, "baselines": {}, "trained": {}}
+        curves = folder / name.partition("/")[2] / "learning_curves.png"
+        if curves.is_file():
+            with Image.open(curves) as picture:
+                picture.save(HERE / CURVES.format(short_name(name)), quality=82, method=6)
+    for row in rows:
+        own = scores[row["task"]]
         if row["kind"] == "baseline":
             own["baselines"][row["policy"]] = round(row["score"]["value"], 4)
         elif row["kind"] == "trained":
             figures = {key: round(row["score"][key], 4) for key in ("value", "low", "high")}
             kept = ("mean", "ended_early", "steps", "cpu_minutes", "seeds")
             own["trained"][row["policy"]] = figures | {key: round(row[key], 4) for key in kept}
-    for name, own in found.items():
-        own["unlearnt"] = {policy: round(score, 4) for policy, score in unlearnt_scores(name, MACHINES).items()}
-        curves = folder / name.partition("/")[2] / "learning_curves.png"
-        if curves.is_file():
-            with Image.open(curves) as picture:
-                picture.save(HERE / CURVES.format(short_name(name)), quality=82, method=6)
-    SCORES.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        measure(Path(sys.argv[1]))
+        kept = json.loads(SCORES.read_text(encoding="utf-8"))
+        for argument in sys.argv[1:]:
+            measure(Path(argument), kept)
+        kept = {name: kept[name] for name in TASKS if name in kept}
+        SCORES.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     (HERE / "tasks.md").write_text(page(), encoding="utf-8")

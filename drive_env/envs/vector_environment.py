@@ -202,7 +202,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         machine = self.drives.machine
         if machine is None:
             raise ValueError(
-                "only emulated drives have a state that can be saved and restored; a machine on a bus cannot be put back"
+                "only emulated drives have a state that can be saved and restored; real machines cannot be put back"
             )
         return machine.drives
 
