@@ -401,6 +401,17 @@ def test_wrong_tilts_margins_and_ramps_are_refused(options, message):
 
 
 # --- trajectories -----------------------------------------------------------------------------------------------------
+def test_every_joint_of_an_arm_follows_a_trajectory_of_its_own_that_meets_no_end_stop():
+    with tracking(2, load="robot", mode="csp", amplitude=1000.0, speed=2000.0, duration=2.0) as lanes:
+        lanes.reset(seed=0)
+        way = lanes._episodes.reference[:, 0].reshape(2, 6, -1) / lanes._per_turn[0] * 2.0 * np.pi  # rad of the rotors
+        load = ALL_LOADS["robot"]
+        ends = np.array([min(-low, high) for low, high in load.travel]) * np.array(load.gears)
+        assert np.all(np.abs(way).max(axis=2) <= 0.8 * ends + 1e-6)
+        assert np.all(np.abs(way).max(axis=2) > 0.2 * ends)
+        assert len(np.unique(np.round(way[0] / ends[:, None], 6), axis=0)) == 6
+
+
 def test_a_run_goes_on_at_its_speed_from_the_first_moment():
     position, velocity, acceleration = draw("run", np.random.default_rng(0), 1500, 1e-3, 2.0, 10.0)
     assert np.allclose(position, 0.01 * np.arange(1500)) and np.all(velocity == 10.0) and not acceleration.any()
