@@ -272,6 +272,9 @@ def test_a_reset_takes_parameters_of_the_machine_for_one_episode(kind, options):
         again = environments.reset(seed=4)[1]["parameters"]
         for name in usual:
             np.testing.assert_array_equal(again[name], drawn[name])
+        info = environments.reset(seed=4, options={"machine": drawn})[1]["parameters"]  # all that a reset tells
+        for name, values in drawn.items():
+            np.testing.assert_array_equal(info[name], values)
         environments.reset(options={"machine": given})
         mask = np.array([True, False])
         environments.reset(seed=4, options={"reset_mask": mask})

@@ -15,11 +15,15 @@ import pytest
 
 from agents.benchmark.unlearnt import unlearnt_scores
 from agents.evaluation.evaluation import evaluate
+from agents.evaluation.loop_sensitivity import check_kept, measure_sensitivity
+from agents.evaluation.sim_versus_bus import on_both_sides
 from agents.policies.agent_file import plain
 from agents.policies.baselines import SUITE_TASKS, baseline
+from agents.policies.guard import GuardLimits
 from agents.training.tasks import configuration_of, environment_name, make_environments
 from drive_env.envs.randomisation import SHIPPED
 from drive_env.envs.suite import TASKS
+from drive_env.loops.dynamics import find_dynamics
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 MACHINES = 24
@@ -101,6 +105,22 @@ def test_the_score_of_a_task_is_the_share_of_the_horizons_rewards():
     found = evaluate(rest, "PoleBalance", episodes=4, seed=3_000_000)
     sums = [episode.rewards.sum() / TASKS["ServoDrive/PoleBalance-v1"].steps for episode in found.episodes]
     assert found.score == "score [0...1]" and found.values[found.score] == pytest.approx(sums)
+
+
+def test_a_policy_acts_on_the_drives_of_a_bus_as_in_process():
+    lanes = make_environments("GantryBeam", 1)
+    expert = baseline("expert", "GantryBeam", lanes.config, 2)
+    lanes.close()
+    found = on_both_sides(expert, "GantryBeam", machines=1, lockstep=True, guard=GuardLimits(saturation=None))
+    assert found.bus.values == found.inside.values and found.bus.violations == {} and found.missing == {}
+
+
+@pytest.mark.parametrize("name", ["GantryBeam", "ArmPath"])
+def test_an_expert_in_the_loops_keeps_stiff_margins(name):
+    lanes = make_environments(name, 1)
+    expert = baseline("expert", name, lanes.config, lanes.single_action_space.shape[0])
+    lanes.close()
+    check_kept(measure_sensitivity(expert, name, machines=8, seed=0), find_dynamics("stiff"))
 
 
 def test_the_page_is_what_the_suite_and_the_kept_scores_make():

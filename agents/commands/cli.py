@@ -18,7 +18,7 @@ app = typer.Typer(
 )
 
 PANELS = {
-    "Use an agent": ("tune", "evaluate", "export"),
+    "Use an agent": ("tune", "evaluate", "margins", "export"),
     "Make one": ("train", "search", "benchmark"),
 }
 for panel, names in PANELS.items():

@@ -158,7 +158,7 @@ def evaluate(
             minari_dataset.check_name(minari)
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
         recorded = None if recording is None else recording.environment
-        loaded, configuration = _open(policy, environment, load, config, recorded, trust)
+        loaded, configuration = opened_for(policy, environment, load, config, recorded, trust)
         if replay is not None:
             _replay(loaded, configuration, replay, recording, json)
             return
@@ -203,7 +203,7 @@ class _Run:
     @property
     def environment(self) -> str:
         """Name of the environment."""
-        assert self.loaded.environment is not None, "_open fills it in"
+        assert self.loaded.environment is not None, "opened_for fills it in"
         return self.loaded.environment
 
     def evaluate(self, told: Callable[[float], None], on: GivenDrives | None = None) -> Evaluation:
@@ -256,11 +256,11 @@ def _way_back(out: Path | None) -> Path:
     return file_before("evaluate", out)
 
 
-def _open(
+def opened_for(
     text: str,
     environment: str | None,
-    load: str | None,
-    config: Path | None,
+    load: str | None = None,
+    config: Path | None = None,
     otherwise: str | None = None,
     trust: bool = False,
 ) -> tuple[Any, dict[str, Any]]:

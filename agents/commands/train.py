@@ -27,6 +27,8 @@ from agents.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from agents.evaluation.evaluation import Evaluation
+    from agents.policies.agent_file import AgentFile
     from agents.training.training_run import Progress, Report
 
 EPISODES = 64  # for the card
@@ -56,7 +58,7 @@ def train(
     """
     with errors_as_exit_codes():
         from agents.training.tasks import short_name
-        from agents.training.train import clear, run_to_resume, with_figures
+        from agents.training.train import clear, run_to_resume
         from agents.training.train import train as run_training
         from agents.training.training_run import AGENT, CHECKPOINT, CURVE, TrainingRun
 
@@ -95,10 +97,8 @@ def train(
                 left = "this was before the first checkpoint, and the run's files were removed"
             raise OSError(error.errno, f"{error.strerror}; {left}", error.filename or str(folder)) from None
         print(f"evaluating it in {EPISODES} episodes with seeds not used for training", file=sys.stderr)
-        evaluation = judge(bundle)
-        figures = {name: evaluation.interval(name)._asdict() for name in evaluation.values}
-        seeds = {"evaluation": f"{evaluation.seeds[0]}...{evaluation.seeds[-1]}"}
-        with_figures(bundle, {**figures, "violations": evaluation.violations}, seeds).save(folder / AGENT)
+        agent, evaluation = judged(bundle)
+        agent.save(folder / AGENT)
         for name in evaluation.values:
             found = evaluation.interval(name)
             print(f"{name}: {found.mean:.4g} (95 % of {found.low:.4g} to {found.high:.4g}), median {found.median:.4g}")
@@ -111,12 +111,15 @@ def given_options(context: typer.Context) -> list[str]:
     return [one.opts[0] for one, source in sources if source is not None and source.name == "COMMANDLINE"]
 
 
-def judge(bundle: Any) -> Any:
-    """Return the evaluation of a bundle on emulated machines."""
+def judged(bundle: AgentFile) -> tuple[AgentFile, Evaluation]:
+    """Return an agent with what it reaches on its card, and its evaluation on emulated machines."""
     from agents.evaluation.evaluation import evaluate
     from agents.policies.policy import policy_of
+    from agents.training.train import with_figures
 
-    return evaluate(policy_of(bundle), bundle.environment, bundle.configuration, episodes=EPISODES)
+    found = evaluate(policy_of(bundle), bundle.environment, bundle.configuration, episodes=EPISODES)
+    figures = {name: found.interval(name)._asdict() for name in found.values} | {"violations": found.violations}
+    return with_figures(bundle, figures, {"evaluation": f"{found.seeds[0]}...{found.seeds[-1]}"}), found
 
 
 def with_load(

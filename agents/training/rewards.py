@@ -90,3 +90,30 @@ class SmallErrors(VecEnvWrapper):  # type: ignore[misc]
     def _axes(self, observation: Any) -> Any:
         axes = self.action_space.shape[0]
         return np.asarray(observation)[:, : AXIS_ENTRIES * axes].reshape(len(observation), axes, AXIS_ENTRIES)
+
+
+class Logarithm(VecEnvWrapper):  # type: ignore[misc]
+    """The logarithm of a reward in 0...1, in 0...1 again: of a task that pays next to nothing until an error is small.
+
+    It is ln(1 + reward / least) / ln(1 + 1 / least), which grows as much from 0.01 to 0.1 as from 0.1 to 1.
+
+    Args:
+        venv: Of a task of the suite.
+        least: Below it the reward is as good as 0.
+    """
+
+    def __init__(self, venv: Any, least: float = 0.001) -> None:
+        super().__init__(venv)
+        if not 0.0 < least < 1.0:
+            raise ValueError(f"least must lie in 0...1, not {least:g}")
+        self._least = least
+
+    def reset(self) -> Any:
+        """Begin an episode in every environment."""
+        return self.venv.reset()
+
+    def step_wait(self) -> tuple[Any, Any, Any, Any]:
+        """Return the step with this reward in place of the environment's."""
+        observation, reward, ended, infos = self.venv.step_wait()
+        found = np.log1p(np.maximum(reward, 0.0) / self._least) / np.log1p(1.0 / self._least)
+        return observation, found.astype(np.float32), ended, infos

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from drive_env.envs.vector_environment import VectorEnvironment
 
 
+OF_MACHINES = ("distributions", "privileged", "stage")  # options that only machines have that are drawn
+
+
 class TrainingTask(NamedTuple):
     """An environment.
 
@@ -72,12 +75,16 @@ def make_environments(
         environment: Its name.
         num_envs: Number of environments.
         configuration: The environment's own options; a task of the suite takes none but its own.
-        options: drives, sensor, autoreset_mode, render_mode, as the environment takes them.
+        options: drives, sensor, autoreset_mode, render_mode, as the environment takes them. Of a task on given drives,
+            which are what they are, no machines are drawn.
 
     Raises:
         ValueError: For a name or a value that is none.
     """
     name, own = environment_name(environment), dict(configuration or {})
+    if name in SUITE and options.get("drives") is not None:
+        given = {**SUITE[name].options, **own}
+        name, own = environment_of(name), {key: value for key, value in given.items() if key not in OF_MACHINES}
     if name in SUITE:
         whole = _whole_configuration(name)  # an agent's file has all of it
         own = {key: value for key, value in own.items() if key not in whole or plain({key: value})[key] != whole[key]}

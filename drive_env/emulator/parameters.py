@@ -133,6 +133,7 @@ def draw_parameters(
 # Parameters that may be negative: errors, offsets and phases. Those that may be 0: losses and faults. All others are
 # positive.
 _SIGNED = ("offset", "error", "phase", "ambient", "index_angle")
+_VANISHING_GROUPS = ("load.", "bus.", "fault.")  # whose values may be 0, whatever they are
 _MAY_VANISH = (
     "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
     "short_conductance", "short_a", "short_b", "index_inverted", "brake_opens_in", "brake_closes_in", "noise",
@@ -165,7 +166,7 @@ def check_parameter(name: str, values: Floats) -> None:
     if name == "stage.adc_bits" and values.min() < 1.0:
         raise ValueError(f"{name} must be 1 or more, not {values.min():g}")
     # Of a load, its field decides whether it may vanish: mechanics/load_values.py refuses a body without mass.
-    if name.startswith("load.") or any(name.endswith(word) for word in _MAY_VANISH):
+    if name.startswith(_VANISHING_GROUPS) or any(name.endswith(word) for word in _MAY_VANISH):
         if values.min() < 0.0:
             raise ValueError(f"{name} must be 0 or more, not {values.min():g}")
     elif values.min() <= 0.0:
