@@ -19,7 +19,7 @@ import numpy as np
 from agents.evaluation.scores import Episode, Interval, figures, interval
 from agents.policies.agent_file import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
-from agents.training.tasks import OF_MACHINES, configuration_of, environment_name, make_environments, row_of
+from agents.training.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
 from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
@@ -174,8 +174,7 @@ def evaluate(
     if on is None:
         count, how = at_once or environments_for(episodes), {"autoreset_mode": "NextStep"}
     else:
-        # Machines are drawn on emulators alone.
-        options = {key: value for key, value in options.items() if key not in OF_MACHINES}
+        options = without_machines(environment, options)
         count, how = _num_envs_of(environment, on.drives, options), _how_to_act_on(on)
     with ExitStack() as care:
         if on is not None:

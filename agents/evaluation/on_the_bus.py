@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.policies.guard import GuardLimits
-from agents.training.tasks import environment_name, make_environments
+from agents.training.tasks import OF_MACHINES, environment_name, make_environments
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.envs import environment_of
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
     from tuning.target import Target
 
-# increments of a revolution
 # Of the task's amplitude and speed: what a policy may do beyond them before the envelope stops it.
 POSITION_SLACK, SPEED_SLACK = 1.5, 2.0
 
@@ -101,4 +100,4 @@ def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:
 
 
 def _emulated(configuration: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in configuration.items() if key not in ("distributions", "privileged", "stage")}
+    return {key: value for key, value in configuration.items() if key not in OF_MACHINES}

@@ -83,13 +83,18 @@ def make_environments(
     """
     name, own = environment_name(environment), dict(configuration or {})
     if name in SUITE and options.get("drives") is not None:
-        given = {**SUITE[name].options, **own}
-        name, own = environment_of(name), {key: value for key, value in given.items() if key not in OF_MACHINES}
+        name, own = environment_of(name), without_machines(name, own)
     if name in SUITE:
         whole = _whole_configuration(name)  # an agent's file has all of it
         own = {key: value for key, value in own.items() if key not in whole or plain({key: value})[key] != whole[key]}
         return make_vector(num_envs, name=name, **own, **options)
     return make_vector(num_envs, name=name, config=own, **options)
+
+
+def without_machines(environment: str, configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of an environment, or of a task of the suite, for drives that are what they are."""
+    own = SUITE[environment].options if environment in SUITE else {}
+    return {key: value for key, value in {**own, **configuration}.items() if key not in OF_MACHINES}
 
 
 def _whole_configuration(task: str) -> dict[str, Any]:
