@@ -456,7 +456,7 @@ def test_recorded_episodes_are_repeated(tmp_path):
     assert json.loads(told.output) == {"largest": 0.0, "rms": 0.0, "steps": 100}
     told = run("evaluate", "gain_tuning", "--replay", path)
     assert told.exit_code == 2 and "was recorded in ServoDrive/Tracking-v0, and gain_tuning acts in" in told.output
-    told = run("evaluate", "tracking_gantry", "--replay", path)  # two axes
+    told = run("evaluate", "gantry_beam", "--replay", path)  # two axes
     assert told.exit_code == 1 and "the policy takes 16 entries" in told.output
 
 
@@ -599,7 +599,7 @@ def test_the_export_command_prints_differences_and_latency(tmp_path, monkeypatch
     assert run("export", path, "--out", tmp_path / "agent.txt").exit_code == 2
     assert run("evaluate", tmp_path / "agent.onnx", "--episodes", 1).exit_code == 0
     monkeypatch.chdir(tmp_path)  # one that ships is written here, not beside the package's file
-    assert run("export", "tracking_gantry").exit_code == 0 and (tmp_path / "tracking_gantry.onnx").is_file()
+    assert run("export", "gantry_beam").exit_code == 0 and (tmp_path / "gantry_beam.onnx").is_file()
 
 
 # --- on processes and clusters ----------------------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def test_json_for_programs(tmp_path):
 @pytest.mark.parametrize(("arguments", "message"), [
     (["nobody"], "no agent named 'nobody' ships; there are gain_tuning"),
     (["nothing.npz"], "there is no file nothing.npz"),
-    (["tracking_gantry"], "acts in ServoDrive/Tracking-v0; a tuner acts in ServoDrive/GainTuning-v0"),
+    (["gantry_beam"], "acts in ServoDrive/GantryBeam-v1; a tuner acts in ServoDrive/GainTuning-v0"),
     (["--channel", "can0", "--travel", "-1:1"], "channel 'can0' needs an interface"),
     (["--node", "1", "--travel", "-1:1"], "no CAN channel is given"),
     (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),

@@ -10,6 +10,7 @@ from tables import table
 from agents.policies.agent_file import AgentFile
 from agents.shipped import shipped, shipped_names
 from drive_env.envs import ENVIRONMENTS
+from drive_env.envs.suite import TASKS
 
 PAGE = """# Agents that ship
 
@@ -31,14 +32,25 @@ def section(name: str) -> str:
     """Return what is known of an agent."""
     agent = AgentFile.load(shipped(name))
     card = agent.card
-    module, _ = ENVIRONMENTS[agent.environment]
+    if agent.environment in TASKS:
+        page = f"../tasks.md#{agent.environment.partition('/')[2].lower()}"
+    else:
+        page = f"environments/{ENVIRONMENTS[agent.environment][0]}.md"
     rows = [
-        ("environment", f"[`{agent.environment}`](environments/{module}.md)"),
+        ("environment", f"[`{agent.environment}`]({page})"),
         ("options that it was trained with", options(agent)),
         ("machines", named(card["distribution"])),
         ("training", card["trained"]),
         ("limits", named(card["limits"])),
     ]
+    if margins := card.get("margins"):
+        rows.append(
+            (
+                f"loops on {margins['machines']} machines",
+                f"keep `{margins['dynamics']}` dynamics: Ms {margins['Ms median']:.2f} in the median, "
+                f"{margins['Ms greatest']:.2f} at most",
+            )
+        )
     return "\n".join([f"## {name}\n", table(("", ""), rows), figures(card["figures"])])
 
 
@@ -55,20 +67,13 @@ def named(value: Any) -> str:
 
 
 def figures(known: Mapping[str, Any]) -> str:
-    """Return the figures: means over episodes with their 95 % interval, and ratios against other controllers."""
+    """Return the figures: means over episodes with their 95 % interval."""
     plain = [(key, number(value)) for key, value in known.items() if is_figure(value)]
     text = table(("figure", "mean [95 % interval]"), plain) if any("[" in row[1] for row in plain) else table(
         ("figure", "value"), plain)  # fmt: skip
     for key, value in known.items():
-        if isinstance(value, Mapping) and not is_figure(value) and key != "against":
+        if isinstance(value, Mapping) and not is_figure(value):
             text += f"\n{key}:\n\n" + table(("", "value"), [(f"{k}", number(v)) for k, v in value.items()])
-    if known.get("against"):
-        kinds = sorted({kind for row in known["against"].values() for kind in row})
-        rows = [(who, *(number(row.get(kind)) for kind in kinds)) for who, row in known["against"].items()]
-        text += (
-            "\nRatio to other controllers on the same machines, below 1 where the agent is better (mean, 95 % "
-            "interval):\n\n" + table(("against", *kinds), rows)
-        )
     return text
 
 
