@@ -30,6 +30,7 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
+from agents.training.seeds import EVALUATION
 from drive_env.commands.options import DeviceName, Yes, was_typed
 from drive_env.commands.tables import print_lines
 from tuning.commands.options import ask_to_turn
@@ -70,7 +71,7 @@ def evaluate(
     episodes: Annotated[
         int | None, typer.Option("--episodes", help="Episodes.", show_default=f"{EPISODES}, on a bus {BUS_EPISODES}")
     ] = None,
-    seed: Seed = 1_000_000,
+    seed: Seed = EVALUATION[0],
     bus: Annotated[
         bool, typer.Option("--bus", help="Act on drives on a bus; the next three options imply it.")
     ] = False,
