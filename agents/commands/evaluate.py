@@ -271,6 +271,7 @@ def _open(
     from agents.policies.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
     from agents.training.tasks import environment_name
     from drive_env.envs.randomisation import shipped as shipped_distributions
+    from drive_env.envs.suite import TASKS
     from mechanics.untrusted import read_toml
     from tuning.runs.inputs import taken_options
 
@@ -284,7 +285,7 @@ def _open(
     if loaded.environment is None:
         raise ValueError(f"policy {text} does not name its environment; give --environment")
     configuration = dict(loaded.configuration)
-    if config is None and is_checkpoint(text) and not configuration:
+    if config is None and is_checkpoint(text) and not configuration and loaded.environment not in TASKS:
         logger.warning(
             "%s does not say with which options of the environment it was trained: the defaults are used; if it was "
             "trained with others, give them with --config FILE.toml",
