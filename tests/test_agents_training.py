@@ -336,7 +336,7 @@ def test_a_section_of_a_load_replaces_the_environments(tmp_path):
     ("arguments", "message"),
     [
         (("walking", "ppo"), "there is no environment 'walking'; there are ServoDrive/GainTuning-v0"),
-        (("tracking", "dqn"), "there is no algorithm 'dqn'; there are ppo, sac, recurrent_ppo, tqc"),
+        (("tracking", "dqn"), "there is no algorithm 'dqn'; there are ppo, sac, recurrent_ppo, tqc, crossq"),
         (("tracking", "ppo", "slow"), "there is no preset 'slow'; there are quick, full"),
         (("tracking", "ppo", "quick", None, "moon"), "has no section moon; it has ServoDrive/Tracking-v0, quick"),
         (("tracking", "ppo", "quick", "missing.yaml"), "there is no file missing.yaml"),

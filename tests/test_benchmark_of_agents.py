@@ -16,14 +16,18 @@ from agents.benchmark import report, runs
 from agents.benchmark.results import RESULT, Row, RowError
 from agents.benchmark.statistics import interquartile_mean, probability_of_improvement
 from agents.commands.cli import app
+from agents.evaluation.evaluation import evaluate
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
+from agents.policies.policy import policy_of
 from agents.training import hyperparameters, seeds
 from agents.training.imitation import imitate
+from agents.training.search import search
 from agents.training.tasks import make_environments
-from agents.training.train import make_env, make_model, train
+from agents.training.train import IMITATION, make_env, make_model, train
 from agents.training.training_run import TrainingRun, segment_seed
 from drive_env.envs.suite import TASKS
+from drive_env.envs.vector_environment import VectorEnvironment
 
 TASK = "ServoDrive/TorqueTracking-v1"
 EPISODES = 4
@@ -89,13 +93,41 @@ def test_the_probability_of_improvement_has_the_binomial_interval():
 
 
 # --- the seeds --------------------------------------------------------------------------------------------------------
-def test_training_validation_and_test_never_meet():
-    ranges = (seeds.TRAINING, seeds.VALIDATION, seeds.TEST)
+def test_seeds_of_two_purposes_never_meet():
+    ranges = [one for one in vars(seeds).values() if isinstance(one, range)]
+    assert len(ranges) == 4
     for one, other in itertools.combinations(ranges, 2):
         assert one[-1] < other[0] or other[-1] < one[0]
     assert len(seeds.TEST) >= runs.EPISODES
-    assert segment_seed(3, 0) in seeds.TRAINING
-    assert 2**31 + 100_000 in seeds.TRAINING  # the greatest of segment_seed, and as many environments
+
+
+def test_everything_has_the_seeds_of_its_purpose(tmp_path, monkeypatch):
+    """A training's, a search's, the benchmark's, and those of `drive-agent evaluate` and of a training's card."""
+    met = []
+    begin = VectorEnvironment.reset
+
+    def reset(self, *, seed=None, options=None):
+        met.extend(seed if isinstance(seed, list) else [seed])
+        return begin(self, seed=seed, options=options)
+
+    monkeypatch.setattr(VectorEnvironment, "reset", reset)
+    given = hyperparameters.load(TASK, "ppo")
+    bundle = train(TrainingRun(TASK, "ppo", given, seed=3), tmp_path / "run")
+    assert met and all(seed is None or seed in seeds.TRAINING for seed in met)
+    assert all(segment_seed(seed, IMITATION) in seeds.TRAINING for seed in range(100))
+    small = dict(given)
+    for purpose, judged in {
+        "VALIDATION": lambda: search(TASK, "ppo", small, tmp_path / "study", trials=1, episodes=2),
+        "TEST": lambda: runs.judge(policy_of(bundle), TASK, 2),
+        "EVALUATION": lambda: evaluate(policy_of(bundle), TASK, episodes=2),
+    }.items():
+        met.clear()
+        judged()
+        assert set(met[-2:]) == set(getattr(seeds, purpose)[:2])
+    met.clear()
+    path = bundle.save(tmp_path / "agent.npz")
+    assert CliRunner().invoke(app, ["evaluate", str(path), "--episodes", "2"]).exit_code == 0
+    assert set(met) == set(seeds.EVALUATION[:2])
 
 
 def test_an_episode_of_the_test_is_not_the_trainings_of_the_same_low_bits():

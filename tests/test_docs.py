@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -27,6 +29,9 @@ OLD_WORDS = (
 )
 
 
+RECIPES = DOCS / "how-to/recipes.md"  # each of its sections stands for itself: it may need what is not installed
+
+
 def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
@@ -42,7 +47,12 @@ WRITTEN_HERE = [*HOW_TO, *sorted((DOCS / "tutorials").glob("*.md"))]
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(page, id=name(page), marks=() if name(page) in QUICK else pytest.mark.slow) for page in PAGES]
+    "page",
+    [
+        pytest.param(page, id=name(page), marks=() if name(page) in QUICK else pytest.mark.slow)
+        for page in PAGES
+        if page != RECIPES
+    ],
 )
 def test_a_page_can_be_followed(page, tmp_path):
     text = "".join(block.text for block in blocks(page))
@@ -50,6 +60,28 @@ def test_a_page_can_be_followed(page, tmp_path):
         pytest.skip("the port of `drive-env serve` is taken")
     if TRAINS.search(text):
         pytest.importorskip("stable_baselines3")
+    follow(page, tmp_path)
+
+
+def recipes() -> dict[str, str]:
+    """Return the text of each section of the page by its title."""
+    _, *sections = re.split(r"^## ", RECIPES.read_text(encoding="utf-8"), flags=re.M)
+    return {section.partition("\n")[0]: f"# {section}" for section in sections}
+
+
+@pytest.mark.parametrize("recipe", recipes())
+def test_a_recipe_can_be_followed(recipe, tmp_path):
+    text = recipes()[recipe]
+    pytest.importorskip("stable_baselines3")
+    for needed in re.findall(r"[\w.]+", "".join(re.findall(r"<!-- needs: (.*?) -->", text))):
+        if needed != "CLEANRL_SOURCE":
+            pytest.importorskip(needed)
+        elif needed in os.environ:
+            shutil.copytree(os.environ[needed], tmp_path / "cleanrl")
+        else:
+            pytest.skip("CLEANRL_SOURCE is no folder of CleanRL's repository")
+    page = tmp_path / "recipe.md"
+    page.write_text(text, encoding="utf-8")
     follow(page, tmp_path)
 
 

@@ -30,6 +30,7 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
+from agents.training.seeds import EVALUATION
 from drive_env.commands.options import DeviceName, Yes, was_typed
 from drive_env.commands.tables import print_lines
 from tuning.commands.options import ask_to_turn
@@ -70,7 +71,7 @@ def evaluate(
     episodes: Annotated[
         int | None, typer.Option("--episodes", help="Episodes.", show_default=f"{EPISODES}, on a bus {BUS_EPISODES}")
     ] = None,
-    seed: Seed = 1_000_000,
+    seed: Seed = EVALUATION[0],
     bus: Annotated[
         bool, typer.Option("--bus", help="Act on drives on a bus; the next three options imply it.")
     ] = False,
@@ -270,6 +271,7 @@ def opened_for(
     from agents.policies.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
     from agents.training.tasks import environment_name
     from drive_env.envs.randomisation import shipped as shipped_distributions
+    from drive_env.envs.suite import TASKS
     from mechanics.untrusted import read_toml
     from tuning.runs.inputs import taken_options
 
@@ -283,7 +285,7 @@ def opened_for(
     if loaded.environment is None:
         raise ValueError(f"policy {text} does not name its environment; give --environment")
     configuration = dict(loaded.configuration)
-    if config is None and is_checkpoint(text) and not configuration:
+    if config is None and is_checkpoint(text) and not configuration and loaded.environment not in TASKS:
         logger.warning(
             "%s does not say with which options of the environment it was trained: the defaults are used; if it was "
             "trained with others, give them with --config FILE.toml",

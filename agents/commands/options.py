@@ -34,7 +34,7 @@ OF_EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "onnx", 
 EXTRA = "pip install 'drive-env[agents]'"
 
 Environment = Annotated[str, typer.Argument(help="gain_tuning, gain_scheduling or tracking.")]
-Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="ppo, sac, recurrent_ppo or tqc.")]
+Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="ppo, sac, recurrent_ppo, tqc or crossq.")]
 Preset = Annotated[str, typer.Option("--preset", help="quick (minutes) or full (half an hour).")]
 Load = Annotated[str | None, typer.Option("--load", help="Load, instead of the configuration's.")]
 Config = Annotated[Path | None, typer.Option("--config", help="Hyper-parameters (YAML), instead of the shipped ones.")]

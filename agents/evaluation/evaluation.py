@@ -19,6 +19,7 @@ import numpy as np
 from agents.evaluation.scores import Episode, Interval, figures, interval
 from agents.policies.agent_file import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
+from agents.training.seeds import EVALUATION
 from agents.training.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
 from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives
@@ -30,7 +31,6 @@ from mechanics.untrusted import read_json
 from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in
 
 LANES = 64
-FIRST_SEED = 1_000_000  # far from those of a training
 TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
@@ -147,7 +147,7 @@ def evaluate(
     *,
     name: str = "policy",
     episodes: int = 64,
-    seed: int = FIRST_SEED,
+    seed: int = EVALUATION[0],
     on: GivenDrives | None = None,
     told: Callable[[float], None] = lambda share: None,
     at_once: int | None = None,

@@ -11,9 +11,13 @@ ALGORITHMS = {
     "sac": "stable_baselines3:SAC",
     "recurrent_ppo": "sb3_contrib:RecurrentPPO",
     "tqc": "sb3_contrib:TQC",
+    "crossq": "sb3_contrib:CrossQ",
 }
-# Algorithm -> the one whose hyper-parameters it takes: TQC is SAC with critics of quantiles (arXiv:2005.04269).
-SAME_HYPERPARAMETERS = {"tqc": "sac"}
+# Algorithm -> the one whose hyper-parameters it takes: TQC is SAC with critics of quantiles (arXiv:2005.04269), CrossQ
+# SAC with normalised layers in place of target networks (arXiv:1902.05605).
+SAME_HYPERPARAMETERS = {"tqc": "sac", "crossq": "sac"}
+# Algorithm -> hyper-parameters of those that it has no use for.
+NOT_TAKEN = {"crossq": ("tau",)}
 
 
 class MissingPackageError(ImportError):

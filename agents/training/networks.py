@@ -43,8 +43,8 @@ def bundle_of(
         squashes = bool(getattr(model.policy, "squash_output", False))
     activation, layers = _layers([*hidden, last])
     arrays: dict[str, Any] = {}
-    for k, layer in enumerate(layers):
-        arrays[f"weight_{k}"], arrays[f"bias_{k}"] = _array(layer.weight).T, _array(layer.bias)
+    for k, (weight, bias) in enumerate(layers):
+        arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
     kind = "mlp"
     lstm = getattr(model.policy, "lstm_actor", None)
     if lstm is not None:
@@ -73,9 +73,17 @@ def bundle_of(
 
 
 def _layers(modules: list[Any]) -> tuple[str, list[Any]]:
-    """Return the activation between fully connected layers, and the layers."""
-    layers = [one for one in modules if type(one).__name__ == "Linear"]
-    between = {type(one).__name__ for one in modules if type(one).__name__ != "Linear"}
+    """Return the activation between fully connected layers, and weight (in, out) and bias of each layer."""
+    layers, between, before = [], set(), None
+    for one in modules:
+        name = type(one).__name__
+        if name == "Linear":
+            layers.append(_layer(one, before))
+            before = None
+        elif name == "BatchRenorm1d":
+            before = one
+        else:
+            between.add(name)
     unknown = between - set(_ACTIVATIONS)
     if unknown or len(between) > 1:
         raise BundleError(
@@ -84,6 +92,18 @@ def _layers(modules: list[Any]) -> tuple[str, list[Any]]:
         )
     name = _ACTIVATIONS[between.pop()] if between else next(iter(ACTIVATIONS))
     return name, layers
+
+
+def _layer(layer: Any, before: Any) -> tuple[Any, Any]:
+    """Return weight and bias of a fully connected layer, which take in CrossQ's normalisation before it, if any.
+
+    While an agent acts, that is (x - ra_mean) / sqrt(ra_var + eps) * scale + bias, with statistics that do not change.
+    """
+    weight, bias = _array(layer.weight).T, _array(layer.bias)
+    if before is None:
+        return weight, bias
+    scale = _array(before.scale) / np.sqrt(_array(before.ra_var) + before.eps)
+    return scale[:, None] * weight, bias + (_array(before.bias) - scale * _array(before.ra_mean)) @ weight
 
 
 def _normaliser(normaliser: Any, entries: int) -> tuple[Any, Any, float | None]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import yaml
 
-from agents.training.algorithms import ALGORITHMS
+from agents.training.algorithms import ALGORITHMS, NOT_TAKEN
 from agents.training.hyperparameters import merge
 from agents.training.seeds import VALIDATION
 from agents.training.train import DivergedError, train, with_inputs
@@ -66,6 +66,7 @@ SPACES: dict[str, tuple[SearchRow, ...]] = {
     ),
 }
 SPACES["tqc"] = SPACES["sac"]
+SPACES["crossq"] = tuple(row for row in SPACES["sac"] if row.key not in NOT_TAKEN["crossq"])
 
 
 class SearchTrial(NamedTuple):

@@ -1,7 +1,9 @@
-"""Seeds of training, validation and test: ranges that never meet, so that no agent is judged on what it has seen."""
+"""Seeds by purpose: ranges that never meet, so that no agent is judged in episodes that it has learnt from."""
 
 from __future__ import annotations
 
-TRAINING = range(2**32)  # a segment's 31 bits (training_run.segment_seed), and one more for each environment
+# Of trainings, a segment's 31 bits (training_run.segment_seed): environments of a seed are told apart by a spawn key.
+TRAINING = range(2**32)
 VALIDATION = range(2**32, 2**33)  # of a search for hyper-parameters
 TEST = range(2**33, 2**34)  # of the benchmark: its episode k has the seed TEST[k]
+EVALUATION = range(20_000_000_000, 30_000_000_000)  # of `drive-agent evaluate`, and of the figures on a training's card

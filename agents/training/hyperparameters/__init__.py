@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from agents.training.algorithms import ALGORITHMS, SAME_HYPERPARAMETERS
+from agents.training.algorithms import ALGORITHMS, NOT_TAKEN, SAME_HYPERPARAMETERS
 from agents.training.tasks import environment_name, row_of
 from drive_env.envs import environment_of
 from drive_env.envs.suite import TASKS
@@ -82,6 +82,9 @@ def load(
         merge(found, {name: read_value(value) for name, value in (table.get(key) or {}).items()})
     if task in TASKS:
         found.pop("env_kwargs", None)  # the task has its own
+    if path is None:  # in a file of the user's it is a mistake
+        for key in NOT_TAKEN.get(algorithm, ()):
+            found.pop(key, None)
     for key in ("n_envs", "n_timesteps", "policy"):
         if found.get(key) is None:
             raise HyperparameterError(f"{file}: {key} is missing in section {name}")
