@@ -324,6 +324,8 @@ def _episodes(
     while open_.any():
         action = policy.act(rows[-1])
         observation, reward, terminated, truncated, info = lanes.step(action)
+        if hasattr(lanes.config, "payload"):  # which changes within an episode
+            policy.told(info.get("parameters"), open_)
         rows.append(_seen(observation))
         actions.append(np.array(action, np.float32).reshape(count, -1))
         rewards.append(reward)
