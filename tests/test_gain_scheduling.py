@@ -7,8 +7,8 @@ from test_parity import WorldBus
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.envs.gain_scheduling import GainScheduling, GainSchedulingConfig
-from drive_env.envs.kept_margins import KeptMargins
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
+from drive_env.envs.online_margins import OnlineMargins
 from drive_env.gains import read_gains, rule_gains
 from drive_env.loops.dynamics import find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LoopRates
@@ -79,7 +79,7 @@ def test_the_kept_margins_are_those_of_the_exact_linear_model(mode):
         raw[:, 2:] = np.rint(raw[:, 2:] * np.exp(rng.uniform(-1.5, 2.2, (64, 3))))
         if mode == "csv":
             raw[:, 4] = 1  # an open position loop, nearly
-        margins = KeptMargins(drives, find_dynamics("standard"), mode)
+        margins = OnlineMargins(drives, find_dynamics("standard"), mode)
         margins.take_in(raw, every)
         exact, _ = loop_clearance(
             find_dynamics("standard"), LoopRates.of(drives.device), true_machines(drives),

@@ -23,8 +23,8 @@ from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import NO_PAYLOAD, PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
-from drive_env.envs.kept_margins import KeptMargins
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
+from drive_env.envs.online_margins import OnlineMargins
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
@@ -99,7 +99,7 @@ class GainSchedulingConfig:
     payload: Parameter of the load that changes; "auto" takes its payload, mass or inertia, "none" changes nothing.
     payload_low, payload_high: Range of its factor on the nominal value; None is the load's own.
     payload_every: Mean time between two changes [s].
-    payload_observed: Whether the agent is told the payload, as a machine is that has picked it by a recipe.
+    payload_observed: Whether the agent sees the payload, as a machine knows it that picks by a recipe.
     dynamics: Whose margins the outer loops must keep with the payload of the moment, as `dynamics.find_dynamics` takes
         it: the tracking term is multiplied by how far they do. None asks for no margins.
     distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
@@ -283,7 +283,7 @@ class GainScheduling(VectorEnvironment):
         nothing = np.zeros((self._cycles, num_envs * self._axes))
         self._samples = nothing, nothing, nothing  # of the last step, as they have come: error, velocity, current
         self._parameters: dict[str, Floats] = {}  # the true machines
-        self._margins: KeptMargins | None = None
+        self._margins: OnlineMargins | None = None
         c = self.config
         self._payload = find_payload(row, c.payload, c.payload_low, c.payload_high)
         self._pictures: Pictures | None = None
@@ -453,7 +453,7 @@ class GainScheduling(VectorEnvironment):
         self._gain_objects = [known.keys[column] for column in columns]
         self._columns, self._scheduled, self._highest = columns, self.base_gains[:, columns], known.highest[columns]
         if self.config.dynamics is not None:
-            self._margins = KeptMargins(drives, find_dynamics(self.config.dynamics), self.config.mode)
+            self._margins = OnlineMargins(drives, find_dynamics(self.config.dynamics), self.config.mode)
 
     # --- a step ---------------------------------------------------------------------------------------------------
     def _gains_of(self, action: Floats) -> Integers:

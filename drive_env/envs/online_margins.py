@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 LOWEST, POINTS = 2.0, 100  # frequencies looked at: from [Hz], how many; enough for what moves as one
 
 
-class KeptMargins(Saved):
+class OnlineMargins(Saved):
     """The outer loops of emulated machines against the margins of some dynamics, in every step.
 
     Args:
