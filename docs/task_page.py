@@ -18,6 +18,7 @@ from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import SUITE_TASKS
 from agents.shipped import shipped, shipped_names
 from agents.training.tasks import short_name
+from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.suite import TASKS, SuiteTask
 from drive_env.envs.tracking import Tracking
 
@@ -31,16 +32,18 @@ Tasks to train on and to compare agents by. Each is an id that never changes: de
 horizon and reward belong to it, and it takes no options. `gymnasium.make("ServoDrive/Crane-v1")` makes one,
 `drive_env.envs.make_vec_env("ServoDrive/Crane-v1", num_envs=64)` many for Stable-Baselines3, `drive-agent train
 --environment Crane-v1` trains, and `drive-agent benchmark --task Crane-v1` trains with several seeds and judges in
-held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0`, whose configurations these are.
+held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0` and `ServoDrive/GainScheduling-v0`,
+whose configurations these are.
 
 The reward of a step lies in 0...1, nothing is earned after a fall or a trip, and the score of an episode is the sum of
 rewards over the horizon. Every episode has a machine of its own, drawn from the load's distributions: inertia,
 friction, stiffness, motor, power stage, and the delays of the bus.
 
-What is in the table: the best of twenty policies that have learnt nothing (zero, random, bang-bang on the following
-error, nine constants, eight pairs of gains on the errors of position and speed); the *cascade* that a drive or a master
-has anyway; the *expert*, which is what a motion engineer would program who knows the parameters of each machine; and
-agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out
+What is in the table: the best of some twenty policies that have learnt nothing (zero, random, bang-bang on the
+following error, nine constants; of Tracking eight pairs of gains on the errors of position and speed, of
+GainScheduling five constant sets of gains, the best of a search over 141 among them); the *cascade* that a drive or a
+master has anyway; the *expert*, which is what a motion engineer would program who knows the parameters of each machine;
+and agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out
 episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare
 failures. Agents see only what the drives tell. An agent ships where it is better than the expert with 95 % confidence,
 and keeps its loops within margins on 32 drawn machines: it then answers following errors by less than it had learnt
@@ -111,12 +114,13 @@ def _section(name: str, task: SuiteTask) -> str:
 
 
 def _spaces() -> str:
-    text = inspect.cleandoc(Tracking.__doc__ or "").partition("\nArgs:\n")[0]
-    return (
-        "\n## Actions, observations, terms\n\nOf all of them, as of `ServoDrive/Tracking-v0`:\n\n"
-        + text.partition("\n\n")[2].rstrip()
-        + "\n"
-    )
+    """Return what the docstrings of the environments say of actions, observations and rewards."""
+    parts = []
+    for kind in (Tracking, GainScheduling):
+        tasks = [name.partition("/")[2] for name, task in TASKS.items() if kind.__name__ in task.environment]
+        text = inspect.cleandoc(kind.__doc__ or "").partition("\nArgs:\n")[0].partition("\n\n")[2].rstrip()
+        parts.append(f"\n## Actions, observations, terms of {kind.__name__}\n\nOf {', '.join(tasks)}:\n\n{text}\n")
+    return "".join(parts)
 
 
 def _anchor(name: str) -> str:

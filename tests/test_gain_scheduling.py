@@ -8,8 +8,14 @@ from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.envs.gain_scheduling import GainScheduling, GainSchedulingConfig
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
+from drive_env.envs.online_margins import OnlineMargins
+from drive_env.gains import read_gains, rule_gains
+from drive_env.loops.dynamics import find_dynamics, loop_clearance
+from drive_env.loops.sampled import CascadeGains, LoopRates
+from drive_env.loops.true_plant import true_machines
 
 NOMINAL = {"parameters": {}}
+ONE_PAYLOAD = {"load": "inertia", "distributions": NOMINAL, "payload": "none"}
 POSITION_P, VELOCITY_P = (0x2043, 1), (0x2042, 1)
 
 
@@ -41,6 +47,78 @@ def test_an_action_is_the_logarithm_of_each_gain_over_its_base():
     assert gains[POSITION_P].tolist() == np.rint(base[POSITION_P] * np.exp([0.5, -0.5])).tolist()
     assert gains[VELOCITY_P].tolist() == np.rint(base[VELOCITY_P] * np.exp([0.0, 0.2])).tolist()
     assert np.array_equal(gains[0x2042, 2], base[0x2042, 2])
+
+
+def test_the_middle_is_the_rule_for_the_mean_of_the_lightest_and_the_heaviest_machine():
+    environment = env(base="middle", load="inertia", payload_low=0.2, payload_high=20.0, distributions=NOMINAL)
+    motor, load = environment.drives.motor, environment.drives.machine.parameters["load.inertia"][0]
+    mean = np.sqrt((motor.inertia + 0.2 * load) * (motor.inertia + 20.0 * load))
+    assert environment.base_gains[0].tolist() == rule_gains(environment.drives.device, motor, mean)[0].tolist()
+
+
+def test_gains_for_another_payload_break_the_margins_and_earn_less_though_they_track_as_well():
+    tracked = []
+    for dynamics in ("soft", None):
+        environment = env(1, dynamics=dynamics, span=2.0, **ONE_PAYLOAD)  # velocity P over what this payload takes
+        environment.reset(seed=1)
+        terms = [environment.step(np.array([[1.0, -1.0, 0.0]]))[4]["reward_terms"]["tracking"] for _ in range(50)]
+        tracked.append(np.mean(terms))
+        if dynamics is not None:
+            shares = environment._margins.share(read_gains(environment.drives))
+    assert shares[0] == 0.0 == tracked[0]
+    assert tracked[1] > 0.2
+
+
+@pytest.mark.parametrize("mode", ["csp", "csv"])
+def test_the_kept_margins_are_those_of_the_exact_linear_model(mode):
+    with EmulatedDrives("tmcm1636", "inertia", None, 64, num_threads=1) as drives:
+        rng, every = np.random.default_rng(1), np.ones(64, bool)
+        inertia = drives.machine.parameters["load.inertia"] * np.exp(rng.uniform(-1.6, 2.1, 64))
+        drives.machine.set_all({"load.inertia": inertia}, every)
+        raw = rule_gains(drives.device, drives.motor, inertia + drives.motor.inertia)
+        raw[:, 2:] = np.rint(raw[:, 2:] * np.exp(rng.uniform(-1.5, 2.2, (64, 3))))
+        if mode == "csv":
+            raw[:, 4] = 1  # an open position loop, nearly
+        margins = OnlineMargins(drives, find_dynamics("standard"), mode)
+        margins.take_in(raw, every)
+        exact, _ = loop_clearance(
+            find_dynamics("standard"), LoopRates.of(drives.device), true_machines(drives),
+            CascadeGains.of(drives.device, raw[:, None]),
+        )  # fmt: skip
+        assert np.any(exact > 1.0) and np.any(exact <= 0.0)
+        assert margins.share(raw) == pytest.approx(np.clip(exact, 0.0, 1.0), abs=0.05)
+
+
+def test_the_payload_is_observed_if_asked_for_and_the_margins_follow_it():
+    options = {
+        "load": "inertia",
+        "distributions": NOMINAL,
+        "payload_low": 0.1,
+        "payload_high": 10.0,
+        "payload_every": 0.1,
+    }
+    environment = env(8, payload_observed=True, dynamics="soft", duration=0.5, **options)
+    seen, info = environment.reset(seed=2)
+    assert seen[:, -1] == pytest.approx(0.0)  # the nominal one, in the middle of 1 : 100
+    nominal, before = info["parameters"]["load.inertia"].copy(), environment._margins._plant.copy()
+    for _ in range(30):
+        seen, _, _, _, info = environment.step(np.zeros((8, 3)))
+    factor = info["parameters"]["load.inertia"] / nominal
+    assert seen[:, -1] == pytest.approx(np.log10(factor), abs=1e-5)
+    assert np.all(np.abs(environment._margins._plant - before).max(axis=(1, 2, 3)) > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"payload": "none", "payload_observed": True}, "the load has no payload that changes"),
+        ({"dynamics": "brisk"}, "dynamics 'brisk': give soft, standard, stiff"),
+        ({"device": "tmcm3313", "dynamics": "soft"}, "tmcm3313 names no cascade"),
+    ],
+)
+def test_margins_and_payload_are_refused_where_there_are_none(options, says):
+    with pytest.raises(ValueError, match=says):
+        env(load="inertia", **options)
 
 
 def test_present_gains_are_those_that_the_drives_hold():
@@ -225,7 +303,7 @@ def test_over_a_bus_the_same_policy_sees_the_same(mode):
     [
         ({"mode": "pp"}, "mode is one of 'csp', 'csv', not 'pp'"),
         ({"excitation": "step"}, "excitation is one of 'moves', 'sine', not 'step'"),
-        ({"base": "best"}, "base is one of 'rule', 'present', not 'best'"),
+        ({"base": "best"}, "base is one of 'rule', 'middle', 'present', not 'best'"),
         ({"gains": ("torque_p",)}, "a gain is one of 'velocity_p', 'velocity_i', 'position_p', not 'torque_p'"),
         ({"gains": ()}, "gains must be different ones of velocity_p"),
         ({"payload": "load.weight"}, "payload is one of 'auto', 'none', 'load.mass', .*not 'load.weight'"),

@@ -52,6 +52,8 @@ FROZEN = {
     "ServoDrive/PoleBalance-v1": "87bf81fa814f7439",
     "ServoDrive/PoleSwingUp-v1": "a176bbc9569535f4",
     "ServoDrive/ArmPath-v1": "099611bdd54fcb38",
+    "ServoDrive/PayloadScheduling-v1": "d1d5e2d9c1429870",
+    "ServoDrive/KnownPayload-v1": "447388779bbab8c4",
 }
 
 

@@ -594,6 +594,19 @@ def test_a_stepper_that_loses_its_steps_ends_the_episode():
         assert info["fault"][1] == "following_error"
 
 
+def test_steppers_that_lose_their_steps_one_after_the_other_each_tell_their_own_fault():
+    """A drive's message may come a step before its statusword: another's end must not take it away."""
+    run_up = {"mode": "csv", "action": "ramp", "ramp": 6.75, "trajectory": "run", "amplitude": 20.0, "speed": 16.0}
+    found = []
+    with tracking(64, device="tmcm6212", load="inertia", distributions="inertia", **run_up) as lanes:
+        lanes.reset(seed=3)
+        for _ in range(180):
+            *_, info = lanes.step(np.full((64, 1), 0.9, np.float32))
+            found += [info["fault"][lane] for lane in np.flatnonzero(info.get("_fault", []))]
+    assert len(found) >= 20
+    assert set(found) == {"following_error"}
+
+
 def test_a_stepper_has_the_modes_and_speeds_that_suit_it():
     config = TrackingConfig(device="tmcm3313", load="two_mass")
     assert (config.mode, config.speed, config.motor) == ("csp", 5.0, "qsh4218_51")

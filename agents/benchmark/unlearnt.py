@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.envs import make_vector
+from drive_env.envs import environment_of, make_vector
 from drive_env.envs.suite import TASKS
 
 Floats = NDArray[np.float64]
@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation; the first two are the errors of position and speed
 PAIRS = ((4.0, 0.5), (6.0, 0.5), (8.0, 1.0), (16.0, 1.0), (16.0, 0.1), (32.0, 0.1), (0.0, 1.0), (0.0, 3.0))
 CONSTANTS = (-1.0, -0.5, -0.2, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)
+# Velocity P, velocity I and position P: the best of 141 constant sets of the payload tasks, and others near it.
+SETS = ((-0.575, -1.0, 0.05), (-0.41, -0.83, 0.06), (-0.49, -0.78, 0.17), (-0.45, -0.66, -0.07), (-0.25, -0.9, 0.0))
 
 
 Plain = Callable[[Floats, Floats, np.random.Generator], Floats]
@@ -28,13 +30,22 @@ def _pair(proportional: float, derivative: float) -> Plain:
     return lambda error, speed, rng: np.clip(proportional * error + derivative * speed, -1.0, 1.0)
 
 
+def _set(values: tuple[float, ...]) -> Plain:
+    return lambda error, speed, rng: np.broadcast_to(values, error.shape)
+
+
 # Name -> action of every entry from the errors of position and speed, shape (machines, entries), and a generator.
 POLICIES: dict[str, Plain] = {
     "zero": lambda error, speed, rng: np.zeros_like(error),
     "random": lambda error, speed, rng: rng.uniform(-1.0, 1.0, error.shape),
     "bang-bang": lambda error, speed, rng: np.sign(error),
     **{f"constant {value:g}": _constant(value) for value in CONSTANTS},
-    **{f"PD {pair[0]:g}, {pair[1]:g}": _pair(*pair) for pair in PAIRS},
+}
+OF_ENVIRONMENT: dict[str, dict[str, Plain]] = {
+    "ServoDrive/Tracking-v0": {f"PD {pair[0]:g}, {pair[1]:g}": _pair(*pair) for pair in PAIRS},
+    "ServoDrive/GainScheduling-v0": {
+        f"gains {', '.join(f'{one:g}' for one in values)}": _set(values) for values in SETS
+    },
 }
 
 
@@ -44,16 +55,16 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
     Raises:
         ValueError: If a reward is not in 0...1.
     """
-    lanes = make_vector(len(POLICIES) * machines, name=name, autoreset_mode="NextStep")
+    policies = POLICIES | OF_ENVIRONMENT[environment_of(name)]
+    lanes = make_vector(len(policies) * machines, name=name, autoreset_mode="NextStep")
     try:
         entries = lanes.single_action_space.shape[0]  # type: ignore[index]
-        seen, _ = lanes.reset(seed=list(range(machines)) * len(POLICIES))  # every policy meets the same ones
+        seen, _ = lanes.reset(seed=list(range(machines)) * len(policies))  # every policy meets the same ones
         rng = np.random.default_rng(0)
         total, going = np.zeros(lanes.num_envs), np.ones(lanes.num_envs, bool)
         for _ in range(TASKS[name].steps):
-            rows = np.asarray(seen, float)[:, : AXIS_ENTRIES * entries]
-            errors = np.moveaxis(rows.reshape(len(POLICIES), machines, entries, AXIS_ENTRIES)[..., :2], -1, 1)
-            action = np.stack([act(both[0], both[1], rng) for act, both in zip(POLICIES.values(), errors, strict=True)])
+            errors = _errors(name, np.asarray(seen, float), entries).reshape(2, len(policies), machines, entries)
+            action = np.stack([act(*both, rng) for act, *both in zip(policies.values(), *errors, strict=True)])
             seen, reward, terminated, _, _ = lanes.step(action.reshape(-1, entries).astype(np.float32))
             if np.any((reward < 0.0) | (reward > 1.0)):
                 raise ValueError(f"a reward of {name} is {reward.min():g} to {reward.max():g}; it must lie in 0...1")
@@ -61,5 +72,14 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
             going &= ~terminated
     finally:
         lanes.close()
-    means = total.reshape(len(POLICIES), machines).mean(axis=1) / TASKS[name].steps
-    return dict(zip(POLICIES, means.tolist(), strict=True))
+    means = total.reshape(len(policies), machines).mean(axis=1) / TASKS[name].steps
+    return dict(zip(policies, means.tolist(), strict=True))
+
+
+def _errors(name: str, rows: Floats, entries: int) -> Floats:
+    """Return the errors of position and speed that go with each entry of the action, (2, environments, entries)."""
+    if environment_of(name) == "ServoDrive/GainScheduling-v0":  # of one axis, whose gains are the entries
+        both = np.stack([rows[:, 0], rows[:, 4] - rows[:, 3]])
+        return np.repeat(both[:, :, None], entries, axis=2)
+    axes = rows[:, : AXIS_ENTRIES * entries].reshape(len(rows), entries, AXIS_ENTRIES)
+    return np.moveaxis(axes[..., :2], -1, 0)

@@ -322,7 +322,7 @@ def _episodes(
     start = last_told = time.perf_counter()
     while open_.any():
         action = policy.act(rows[-1])
-        observation, reward, terminated, truncated, info = lanes.step(action)
+        observation, reward, terminated, truncated, info = _stepped(policy, lanes, action, open_)
         rows.append(_seen(observation))
         actions.append(np.array(action, np.float32).reshape(count, -1))
         rewards.append(reward)
@@ -361,6 +361,14 @@ def _episodes(
         for lane in range(count)
     ]
     return episodes, seconds
+
+
+def _stepped(policy: Any, lanes: Any, action: Any, open_: Any) -> Any:
+    """Make a step; a policy that knows its machines is given those whose payload changes within an episode anew."""
+    found = lanes.step(action)
+    if hasattr(lanes.config, "payload"):
+        policy.told(found[4].get("parameters"), open_)
+    return found
 
 
 def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[dict[str, Any]]) -> None:

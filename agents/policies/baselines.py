@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.experts import CarriageServo, ComputedTorque, LeadAndFeedback, Pendulum, SwingUp, TorqueCascade
+from agents.policies.experts import (
+    CarriageServo,
+    ComputedTorque,
+    LeadAndFeedback,
+    PayloadSchedule,
+    Pendulum,
+    SwingUp,
+    TorqueCascade,
+)
 from agents.training.tasks import environment_name
 
 Array = NDArray[np.float32]
@@ -141,6 +149,8 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
     "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
     "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": LeadAndFeedback},
+    "ServoDrive/PayloadScheduling-v1": {"cascade": nothing, "expert": PayloadSchedule},
+    "ServoDrive/KnownPayload-v1": {"cascade": nothing, "expert": PayloadSchedule},
 }
 
 

@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices import find_device
+from drive_env.envs.gain_scheduling import base_inertia
+from drive_env.gains import Rule, rule_gains
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 
@@ -35,7 +38,12 @@ class Expert:
         self._machine: dict[str, Floats] = {}
 
     def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
-        """Take the parameters of the machines whose episodes begin where the mask is true, (environments,) each."""
+        """Take the parameters of machines that begin, or whose payload has changed, where the mask is true.
+
+        Args:
+            parameters: By name, (environments,) each.
+            mask: Which, (environments,).
+        """
         for name, values in parameters.items():
             kept = self._machine.setdefault(name, np.array(values, float))
             kept[mask] = np.asarray(values, float)[mask]
@@ -175,6 +183,29 @@ class LeadAndFeedback(Expert):
         lead = self.LAG * configuration.speed * axes[..., WANTED_SPEED] + self.LAG_OF_SPEED * acceleration
         lead += self.FEEDBACK * configuration.amplitude * axes[..., ERROR]
         return np.asarray(lead / (1.25 * configuration.offset * configuration.amplitude))
+
+
+class PayloadSchedule(Expert):
+    """Gains that are scheduled by the known payload (Astrom and Wittenmark, Adaptive Control, 1995, chapter 9).
+
+    They follow a rule as the baseline rule is (drive_env/gains.py), whose constants are those of least lag with soft
+    dynamics, found by trying, the same for every machine.
+    """
+
+    RULE = Rule(current_hz=1000.0, speed=0.226, integration=18.0, position=0.77)
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the gains of one axis as an action."""
+        configuration, motor = self.configuration, find_motor(self.configuration.motor)
+        device = find_device(configuration.device)
+        nominal = float(base_inertia(configuration)[0]) - motor.inertia
+        inertia = self.parameter("motor.inertia", motor.inertia) + self.parameter("load.inertia", nominal)
+        inertia = inertia * motor.psi_m / self.parameter("motor.psi_m", motor.psi_m)  # as a drive identifies it
+        columns = device.gains.columns(configuration.chosen)
+        wanted = rule_gains(device, motor, inertia, self.RULE)[:, columns]
+        base = rule_gains(device, motor, base_inertia(configuration))[:, columns]
+        action = np.log(wanted / base) / configuration.span
+        return np.broadcast_to(action, (len(rows), action.shape[1]))
 
 
 class CarriageServo(Expert):

@@ -89,11 +89,12 @@ def draw_tasks() -> None:
             lanes = env.unwrapped.vector  # type: ignore[attr-defined]
             expert = baseline("expert", name, lanes.config, lanes.single_action_space.shape[0])
             observation, info = env.reset(seed=1)
-            if hasattr(expert, "told"):
-                known = {key: np.atleast_1d(value) for key, value in info["parameters"].items()}
-                expert.told(known, np.ones(1, bool))
             for _ in range(task.steps // 3):
-                observation, *_ = env.step(expert.act(observation))
+                if hasattr(expert, "told") and "parameters" in info:  # at the begin, and while a payload changes
+                    expert.told(
+                        {key: np.atleast_1d(value) for key, value in info["parameters"].items()}, np.ones(1, bool)
+                    )
+                observation, _, _, _, info = env.step(expert.act(observation))
             save(np.asarray(env.render()), ASSETS / "tasks" / f"{short_name(name)}.webp")
 
 

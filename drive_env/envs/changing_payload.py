@@ -67,6 +67,7 @@ class PayloadChanges(Saved):
         count: Changes in an episode.
 
     Attributes:
+        nominal: The payload's value that a factor of 1 means, shape (num_envs,); of a payload alone.
         at: Step of each change, shape (num_envs, count).
         factor: On the nominal value, from then on, shape (num_envs, count).
     """
@@ -78,7 +79,7 @@ class PayloadChanges(Saved):
         self._machines = machines
         self._steps = steps
         if payload.name != NO_PAYLOAD:
-            self._nominal = machines.parameters[payload.name]
+            self.nominal = machines.parameters[payload.name]
         self.at = np.zeros((num_envs, count), np.int64)
         self.factor = np.ones((num_envs, count))
 
@@ -108,7 +109,7 @@ class PayloadChanges(Saved):
             return parameters
         last = self.at.shape[1] - 1 - due[:, ::-1].argmax(axis=1)
         factors = np.take_along_axis(self.factor, last[:, None], axis=1)[:, 0]
-        values = self._nominal * factors
+        values = self.nominal * factors
         try:
             self._machines.set_all({name: values}, lanes)
         except ValueError:

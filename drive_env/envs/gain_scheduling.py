@@ -21,13 +21,21 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays
-from drive_env.envs.changing_payload import PayloadChanges, find_payload
+from drive_env.envs.changing_payload import NO_PAYLOAD, PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
+from drive_env.envs.online_margins import OnlineMargins
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
-from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, small_time_constants, write_gains
+from drive_env.gains import (
+    BASELINE_RULE,
+    read_gains,
+    rule_gains,
+    small_time_constants,
+    write_gains,
+)
+from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
@@ -42,7 +50,7 @@ Mask = NDArray[np.bool_]
 CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
 MODES = ("csp", "csv")
-BASES = ("rule", "present")
+BASES = ("rule", "middle", "present")
 ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
 
 POSITION, VELOCITY, CURRENT, STATUSWORD = (
@@ -84,12 +92,16 @@ class GainSchedulingConfig:
     duration: Of an episode [s].
     gains: Which gains the agent sets, of the velocity and the position loop; all of those by default: velocity_p,
         velocity_i, position_p of the TMCM-1636.
-    base: What an action of 0 means: "rule", the baseline rule's gains for the nominal machine, or "present", those that
-        the drives hold when the environment is made; on a bus it is always these.
+    base: What an action of 0 means: "rule", the baseline rule's gains for the nominal machine; "middle", those for the
+        geometric mean of the inertia with the lightest and with the heaviest payload; or "present", those that the
+        drives hold when the environment is made; on a bus it is always these.
     span: ln of the largest factor on a gain.
     payload: Parameter of the load that changes; "auto" takes its payload, mass or inertia, "none" changes nothing.
     payload_low, payload_high: Range of its factor on the nominal value; None is the load's own.
     payload_every: Mean time between two changes [s].
+    payload_observed: Whether the agent sees the payload, as a machine knows it that picks by a recipe.
+    dynamics: Whose margins the outer loops must keep with the payload of the moment, as `dynamics.find_dynamics` takes
+        it: the tracking term is multiplied by how far they do. None asks for no margins.
     distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
         {"parameters": {}} the nominal machine in every episode.
     stage: Of its curriculum, 0...1.
@@ -112,6 +124,8 @@ class GainSchedulingConfig:
     payload_low: float | None = None
     payload_high: float | None = None
     payload_every: float = 0.4
+    payload_observed: bool = False
+    dynamics: str | None = None
     distributions: Any = None
     stage: float = 1.0
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -138,6 +152,8 @@ class GainSchedulingConfig:
         cycles = self.step / CYCLE
         if not STEPS[0] - 1e-9 <= self.step <= STEPS[1] + 1e-9 or abs(cycles - round(cycles)) > 1e-6:
             raise ValueError(f"step must be {STEPS[0]:g}...{STEPS[1]:g} s in whole milliseconds, not {self.step:g} s")
+        if self.dynamics is not None:
+            find_dynamics(self.dynamics)
         for name in ("duration", "span", "payload_every"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be above 0 and finite, not {getattr(self, name):g}")
@@ -156,6 +172,16 @@ class GainSchedulingConfig:
     def chosen(self) -> tuple[str, ...]:
         """The gains that the agent sets."""
         return self.gains or ()
+
+
+def base_inertia(config: GainSchedulingConfig) -> Floats:
+    """Return the inertia that the base's gains are for, rotor included [kg*m^2], shape (axes,); not of "present"."""
+    row = find_load(config.load)
+    payload = find_payload(row, config.payload, config.payload_low, config.payload_high)
+    rotor, load = config.motor_row.inertia, shaft_load(one(row)).inertia[0]
+    if config.base == "middle":
+        return np.asarray(np.sqrt((rotor + payload.low * load) * (rotor + payload.high * load)))
+    return np.asarray(rotor + load)
 
 
 class GainScheduling(VectorEnvironment):
@@ -185,13 +211,22 @@ class GainScheduling(VectorEnvironment):
     | 10 | current_increment, RMS from sample to sample | of rated | 0 | 4 |
     | 11 ... 10+G | the last action's entries for this axis | span | -1 | 1 |
 
+    and, with `payload_observed`, one more after those of all axes:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | last | payload: logarithm of its factor, from the least to the greatest | 1 | -1 | 1 |
+
     The error scale is what the baseline rule's gains would leave: in csp, where this drive has no feed-forward and lags
     by v/k_v, at a fifth of the programme's top speed; in csv a/w_v at its top acceleration. What lies beyond its bounds
     is cut off there.
 
     Reward: the weighted sum of the terms, each in 0...1: tracking = 1/(1 + (error_rms/scale)^2), smoothness =
-    1/(1 + (current_increment/3 %)^2), the worst axis counting, less trip when the drive trips. `terminated`: a drive of
-    its drive went into fault, or its machine left physics; `truncated`: the programme's time ran out.
+    1/(1 + (current_increment/3 %)^2), the worst axis counting, less trip when the drive trips. With `dynamics` tracking
+    is multiplied by how far velocity and position loop (in csv the velocity loop) keep the margins with the payload and
+    the gains at the step's end: 1 where all are kept, 0 where a loop is unstable, by the true machine's linear model.
+
+    `terminated`: a drive went into fault, or its machine left physics; `truncated`: the programme's time ran out.
 
     `info`: "reward_terms" by name; "parameters", not on a bus, the true machine as it is now; "fault", the name of the
     emergency that ended the episode, "diverged", or "".
@@ -210,7 +245,7 @@ class GainScheduling(VectorEnvironment):
 
     STATE = (
         *VectorEnvironment.STATE, "_machines", "_payload_changes", "_programme", "_bus", "_gain_bus", "_now", "_origin",
-        "_action", "_acting", "_parameters", "_samples",
+        "_action", "_acting", "_parameters", "_samples", "_margins",
     )  # fmt: skip
 
     def __init__(
@@ -229,7 +264,11 @@ class GainScheduling(VectorEnvironment):
         self._axes = row.num_axes
         width = len(self.config.chosen)
         bounds = [[entry[k] for entry in ENTRIES] + [sign] * width for k, sign in ((2, -1.0), (3, 1.0))]
-        self._low, self._high = (np.tile(np.array(bound, np.float32), self._axes) for bound in bounds)
+        beside = [1.0] * self.config.payload_observed  # of the machine, after those of its axes
+        self._low, self._high = (
+            np.array([*bound * self._axes, *(sign * one for one in beside)], np.float32)
+            for bound, sign in zip(bounds, (-1.0, 1.0), strict=True)
+        )
         super().__init__(
             num_envs,
             Box(self._low, self._high, dtype=np.float32),
@@ -244,6 +283,7 @@ class GainScheduling(VectorEnvironment):
         nothing = np.zeros((self._cycles, num_envs * self._axes))
         self._samples = nothing, nothing, nothing  # of the last step, as they have come: error, velocity, current
         self._parameters: dict[str, Floats] = {}  # the true machines
+        self._margins: OnlineMargins | None = None
         c = self.config
         self._payload = find_payload(row, c.payload, c.payload_low, c.payload_high)
         self._pictures: Pictures | None = None
@@ -277,6 +317,8 @@ class GainScheduling(VectorEnvironment):
         self._now[mask] = 0
         self._action[axes] = 0.0
         write_gains(self.drives, self.base_gains, where=axes)
+        if self._margins is not None:
+            self._margins.take_in(self.base_gains, mask)
         position = self.drives.read(POSITION)
         self._origin[axes] = position[axes]
         self.drives.write(TARGETS[self.config.mode], self._origin if self.config.mode == "csp" else 0, where=axes)
@@ -301,7 +343,11 @@ class GainScheduling(VectorEnvironment):
         chosen = np.clip(np.asarray(action, float).reshape(self._action.shape), -1.0, 1.0)
         self._action = np.nan_to_num(chosen)
         if self._machines is not None:
-            self._parameters = self._payload_changes.apply(self._now, self._parameters)
+            before = self._parameters
+            self._parameters = self._payload_changes.apply(self._now, before)
+            if self._margins is not None and self._parameters is not before:
+                name = self._payload.name
+                self._margins.take_in(self.base_gains, self._parameters[name] != before[name])
         targets = self._through_bus()
         rows = self._run(targets)
         error, velocity, current = self._measured(targets, rows)
@@ -346,13 +392,13 @@ class GainScheduling(VectorEnvironment):
         self._now = np.zeros(n, np.int64)  # steps since the environment's reset
         self._origin = np.zeros(axes, np.int64)
         self._action = np.zeros((axes, len(self.config.chosen)))
+        self._in_force = self.base_gains.copy()  # raw gains that the drives have at a step's end
         self._acting = np.zeros((n, self._axes), np.int64)
 
     def _prepare_scales(self, load: Load) -> None:
         """Set what the programme may ask for: half of what motor and travel give, with the heaviest payload."""
         motor, alone = self.config.motor_row, one(load)
         shaft, turning = shaft_load(alone), way(alone)
-        self._nominal_inertia = motor.inertia + shaft.inertia[0]
         heaviest = motor.inertia + self._payload.high * shaft.inertia[0]
         torque = np.maximum(motor.rated_torque - shaft.gravity[0] - shaft.friction[0], 0.3 * motor.rated_torque)
         room = np.minimum(np.minimum(-turning.low, turning.high) * 0.8, 4.0 * 2.0 * np.pi)
@@ -377,9 +423,16 @@ class GainScheduling(VectorEnvironment):
         machine, laws = self.drives.machine, self.config.distributions
         self._machines: RandomMachines | None = None
         if machine is None:
-            if laws is not None:
-                raise ValueError("distributions are of emulated machines; leave them out on a bus")
+            for name in ("distributions", "dynamics", "payload_observed"):
+                if getattr(self.config, name):
+                    raise ValueError(
+                        f"{name}: needs emulated machines, whose parameters are known; leave it out on a bus"
+                    )
             return
+        if self.config.payload_observed and self._payload.name == NO_PAYLOAD:
+            raise ValueError(
+                "payload_observed: the load has no payload that changes; name a parameter of it as payload"
+            )
         if laws is None:
             load, known = self.config.load, self.drives.device
             laws = laws_of(load, known, machine.parameters) if known and load in shipped() else {"parameters": {}}
@@ -389,16 +442,18 @@ class GainScheduling(VectorEnvironment):
 
     def _prepare_gains(self) -> None:
         """Keep the raw gains of every axis that an action of 0 means, shape (num_axes, count)."""
-        drives = self.drives
+        drives, device = self.drives, device_of(self.drives)
         if drives.machine is None or self.config.base == "present":
             self.base_gains = read_gains(drives)
         else:
-            motor = self.config.motor_row
-            self.base_gains = np.tile(rule_gains(device_of(drives), motor, self._nominal_inertia), (self.num_envs, 1))
-        known = device_of(drives).gains
+            rule = rule_gains(device, self.config.motor_row, base_inertia(self.config))
+            self.base_gains = np.tile(rule, (self.num_envs, 1))
+        known = device.gains
         columns = known.columns(self.config.chosen)
         self._gain_objects = [known.keys[column] for column in columns]
-        self._scheduled, self._highest = self.base_gains[:, columns], known.highest[columns]
+        self._columns, self._scheduled, self._highest = columns, self.base_gains[:, columns], known.highest[columns]
+        if self.config.dynamics is not None:
+            self._margins = OnlineMargins(drives, find_dynamics(self.config.dynamics), self.config.mode)
 
     # --- a step ---------------------------------------------------------------------------------------------------
     def _gains_of(self, action: Floats) -> Integers:
@@ -429,6 +484,7 @@ class GainScheduling(VectorEnvironment):
             sent = np.broadcast_to(wanted, (self._cycles, *wanted.shape))
             by_lane = self._gain_bus.act_unlatched(sent.reshape(self._cycles, self.num_envs, -1))
             arriving = by_lane.reshape(sent.shape)
+            self._in_force[:, self._columns] = arriving[-1]
             play |= {key: arriving[:, :, k] for k, key in enumerate(self._gain_objects)}
         objects = (POSITION, VELOCITY, CURRENT, STATUSWORD)
         # A picture looks at every cycle.
@@ -482,14 +538,24 @@ class GainScheduling(VectorEnvironment):
             _rms(amperes),
             _rms(np.diff(amperes, axis=0)),
         ]
-        found = np.concatenate([np.stack(columns, axis=-1), self._action], axis=1).astype(np.float32)
-        return np.clip(np.nan_to_num(found.reshape(self.num_envs, -1)), self._low, self._high)
+        found = np.concatenate([np.stack(columns, axis=-1), self._action], axis=1).reshape(self.num_envs, -1)
+        if self.config.payload_observed:
+            found = np.column_stack([found, self._payload_share()])
+        return np.clip(np.nan_to_num(found.astype(np.float32)), self._low, self._high)
+
+    def _payload_share(self) -> Floats:
+        """Return the logarithm of each payload's factor, -1 for the least, 1 for the greatest, (num_envs,)."""
+        name, low, high = self._payload
+        factor = self._parameters[name] / self._payload_changes.nominal
+        return np.asarray(2.0 * np.log(factor / low) / np.log(high / low) - 1.0)
 
     def _terms(self, error: Floats, current: Floats, terminated: Mask) -> dict[str, Floats]:
         off = _rms(error / self._error_scale)
         rough = _rms(np.diff(current, axis=0)) / self._rated_current / ROUGH
         per_axis = {"tracking": 1.0 / (1.0 + off**2), "smoothness": 1.0 / (1.0 + rough**2)}
         terms = {name: values.reshape(self.num_envs, -1).min(axis=1) for name, values in per_axis.items()}
+        if self._margins is not None:
+            terms["tracking"] *= self._margins.share(self._in_force)
         return terms | {"trip": -1.0 * terminated}
 
     def _faults(self, tripped: Mask) -> NDArray[np.object_]:

@@ -41,6 +41,14 @@ def _tracking(about: str, solved: float, reward: str, load: str, duration: float
     return SuiteTask("ServoDrive/Tracking-v0", about, steps, solved, own | options)
 
 
+def _scheduling(about: str, solved: float, **options: Any) -> SuiteTask:
+    """Return a task of GainScheduling on a disc whose inertia changes by 1 : 45, rotor included."""
+    weights = {"tracking": 1.0, "smoothness": 0.0, "trip": 0.0}
+    own = {"load": "inertia", "distributions": "payload", "duration": 2.0, "step": 0.01, "weights": weights,
+           "base": "middle", "span": 2.5, "payload_low": 0.2, "payload_high": 30.0, "dynamics": "soft"}  # fmt: skip
+    return SuiteTask("ServoDrive/GainScheduling-v0", about, 200, solved, own | options)
+
+
 TASKS: dict[str, SuiteTask] = {
     "ServoDrive/TorqueTracking-v1": _tracking(
         "moves of a disc on an elastic shaft by torque alone: inertia, stiffness, friction and the bus' delays differ",
@@ -69,6 +77,13 @@ TASKS: dict[str, SuiteTask] = {
         "six joints of an arm follow a path under gravity with an unknown tool: the agent leads their set-points",
         0.80, "tracking", "robot", 2.0, mode="csp", action="offset", offset=0.05, amplitude=12.0, speed=20.0,
         margins={"tracking": 0.0026},
+    ),
+    "ServoDrive/PayloadScheduling-v1": _scheduling(
+        "gains follow a payload that changes unseen while an axis moves: little lag, and loops that keep their margins",
+        0.80,
+    ),
+    "ServoDrive/KnownPayload-v1": _scheduling(
+        "gains follow a payload that changes while an axis moves, and that is known", 0.80, payload_observed=True,
     ),
 }  # fmt: skip
 

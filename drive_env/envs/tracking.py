@@ -305,7 +305,7 @@ class Tracking(VectorEnvironment):
     """
 
     OPTIONS = (*VectorEnvironment.OPTIONS, "trajectory")
-    STATE = (*VectorEnvironment.STATE, "_machines", "_bus", "_episodes")
+    STATE = (*VectorEnvironment.STATE, "_machines", "_bus", "_episodes", "_causes")
 
     def __init__(
         self,
@@ -383,6 +383,7 @@ class Tracking(VectorEnvironment):
         config, drives, n = self.config, self.drives, self.num_envs
         machine = drives.machine
         self._machines = self._new_machines()
+        self._causes: list[list[str]] = [[] for _ in range(n)]  # of each environment's episode: its emergencies
         self._sensor = sensor
         if self._has_sensor and sensor is None:
             if machine is None:
@@ -472,7 +473,9 @@ class Tracking(VectorEnvironment):
             self._tilt(mask)
         else:
             self._return_to_start(axes)
-        self.drives.emergencies()
+        self._take_emergencies()
+        for lane in np.flatnonzero(mask):
+            self._causes[lane] = []
         samples = np.stack([self.drives.read(name) for name in self._sampled])
         own = self._episodes
         own.origin[axes] = samples[1][axes]
@@ -648,20 +651,24 @@ class Tracking(VectorEnvironment):
 
     def _faults(self, lanes: Mask) -> NDArray[np.object_]:
         """Return what ended each lane: emergencies by name, "diverged", "fell", "not enabled"; "" where nothing did."""
-        names: list[list[str]] = [[] for _ in range(self.num_envs)]
-        for message in self.drives.emergencies():
-            if message.code:
-                names[message.axis // self._axes].append(message.name)
+        self._take_emergencies()
         machine = self.drives.machine
         diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)
         found = np.full(self.num_envs, "", object)
         for lane in np.flatnonzero(lanes):
+            names = list(self._causes[lane])
             if diverged[lane]:
-                names[lane].append("diverged")
+                names.append("diverged")
             if self._episodes.lanes["fallen"][lane]:
-                names[lane].append("fell")
-            found[lane] = ", ".join(names[lane]) or "not enabled"
+                names.append("fell")
+            found[lane] = ", ".join(dict.fromkeys(names)) or "not enabled"
         return found
+
+    def _take_emergencies(self) -> None:
+        """Keep what drives tell, until their episodes end: a statusword may show a fault a step later."""
+        for message in self.drives.emergencies():
+            if message.code:
+                self._causes[message.axis // self._axes].append(message.name)
 
     def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         return None if self._pictures is None else self._pictures.draw(lane)

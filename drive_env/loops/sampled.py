@@ -244,11 +244,24 @@ def open_loops(
         f: Frequencies [Hz] above 0 and below half the velocity loop's rate, (machines, n).
         one: The window of these machines and gains; computed by default.
     """
+    plant = mean_velocity(rates, window(rates, machines, gains) if one is None else one, f)
+    return loops_around(rates, plant, machines.velocity_filter, gains, f)
+
+
+def loops_around(rates: LoopRates, plant: Complex, corner: Floats, gains: CascadeGains, f: Floats) -> OuterLoops:
+    """Return the open outer loops around machines whose current loops are closed; arguments as `open_loops` has them.
+
+    Args:
+        rates: Of the drive.
+        plant: What `mean_velocity` returns of the machines.
+        corner: Of each axis's velocity filter [Hz], (machines, axes).
+        gains: Of the outer loops.
+        f: Frequencies of the plant [Hz], (machines, n).
+    """
     from drive_env.emulator.parameters import velocity_filter
 
-    plant = mean_velocity(rates, window(rates, machines, gains) if one is None else one, f)
     back = np.exp(-2j * math.pi * f / rates.velocity_rate)[..., None]
-    b, a1, a2 = (value[:, None, :] for value in velocity_filter(machines.velocity_filter, rates.velocity_rate))
+    b, a1, a2 = (value[:, None, :] for value in velocity_filter(corner, rates.velocity_rate))
     filtered = b * (1.0 + back) ** 2 / (1.0 + a1 * back + a2 * back**2)
     P, share, outer = (values[:, None, :] for values in gains[2:])
     regulator = P * (1.0 + share / (1.0 - back))
