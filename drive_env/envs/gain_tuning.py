@@ -49,11 +49,12 @@ class GainTuningConfig:
     gains: Which gains the action changes, of the device's: those of the TMCM-1636 are torque_p, torque_i, velocity_p,
         velocity_i, position_p. None is those of the velocity and the position loop.
     trials: Of an episode.
-    step: Largest change of a gain's logarithm; the reach of gains, 10.4, is the most that makes sense.
+    step: Change of a gain's logarithm that an action of 1 makes; the reach of gains, 10.4, is the most that makes
+        sense.
     distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set, and of a
         load of your own the default machine in every episode, as {"parameters": {}} is.
     stage: Of its curriculum, 0...1.
-    abort_cost: What a stopped trial takes from the reward.
+    abort_cost: What a stopped trial of other gains than the incumbent's takes from the reward.
     waveform: Points of the last move's error that are observed besides, 0...250.
     privileged: Whether the observation is a dict with the true machine beside it, for asymmetric critics.
     travel: How far the rotors may turn from where they are, with the sign [rev]; None is the load's own.
@@ -120,11 +121,11 @@ class GainTuning(VectorEnvironment):
     included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
 
     Action, float32, for each axis of the machine, with G gains of the configuration; gains are rounded and stay within
-    the device's range; the bounds are the configuration's `step`:
+    the device's range:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
-    | 0 ... G-1 | ln of the gain over the incumbent's, in the configuration's order | 1 | -0.7 | 0.7 |
+    | 0 ... G-1 | ln of the gain over the incumbent's, in the configuration's order | `step` | -1 | 1 |
 
     Observation, float32, for each axis of the machine, with W points of waveform:
 
@@ -165,9 +166,9 @@ class GainTuning(VectorEnvironment):
     over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
     The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a
-    discount of 1, less `abort_cost` for a trial that was stopped. On given drives, and of the settings of a load
-    detection, there is no robust cost; it is that of ln J by measured terms. The episode is `truncated` when its
-    trials are used up, `terminated` if a given drive cannot be cleared.
+    discount of 1, less `abort_cost` for a trial of other gains than the incumbent's that was stopped. On given drives,
+    and of the settings of a load detection, there is no robust cost; it is that of ln J by measured terms. The episode
+    is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
     the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
@@ -282,7 +283,7 @@ class GainTuning(VectorEnvironment):
         if c.privileged:
             true = Box(-RATIO_MAX, RATIO_MAX, (len(self._defaults),), np.float32)
             observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
-        return observation, Box(-c.step, c.step, (self._axes * len(c.chosen),), np.float32)
+        return observation, Box(-1.0, 1.0, (self._axes * len(c.chosen),), np.float32)
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
@@ -363,6 +364,7 @@ class GainTuning(VectorEnvironment):
         if not active.any():  # the step between the end of all episodes and their autoreset
             return self._observe(), zero, np.zeros(n, bool), np.ones(n, bool), self._told()
         gains = self._changed(action)
+        other = (gains != self._best).reshape(n, -1).any(axis=1)
         tried = self._try(gains, active)
         measured = self._measure(gains, tried)
         better = active & (measured < self._measured)
@@ -373,7 +375,7 @@ class GainTuning(VectorEnvironment):
             self._robust_cost = np.where(better, trial_robust_cost, self._robust_cost)
         after = self._measured if self._score is None else self._robust_cost
         aborted = active & self._stopped(tried)
-        terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * aborted}
+        terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * (aborted & other)}
         self._left[active] -= 1
         info = self._told()
         info["reward_terms"] = terms
@@ -391,8 +393,8 @@ class GainTuning(VectorEnvironment):
         return self._changed(action).reshape(self.num_envs, self._axes, -1)
 
     def _changed(self, action: ArrayLike) -> Integers:
-        step = self.config.step
-        change = np.nan_to_num(np.clip(np.asarray(action, float), -step, step)).reshape(-1, len(self._columns))
+        change = self.config.step * np.nan_to_num(np.clip(np.asarray(action, float), -1.0, 1.0))
+        change = change.reshape(-1, len(self._columns))
         return self._device.gains.changed(self._best, change, self._columns, self._highest)
 
     # --- a trial --------------------------------------------------------------------------------------------------
