@@ -16,6 +16,7 @@ from PIL import Image
 
 from agents.policies.baselines import SUITE_TASKS
 from agents.training.tasks import short_name
+from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.suite import TASKS, SuiteTask
 from drive_env.envs.tracking import Tracking
 
@@ -29,18 +30,19 @@ Tasks to train on and to compare agents by. Each is an id that never changes: de
 horizon and reward belong to it, and it takes no options. `gymnasium.make("ServoDrive/Crane-v1")` makes one,
 `drive_env.envs.make_vec_env("ServoDrive/Crane-v1", num_envs=64)` many for Stable-Baselines3, `drive-agent train
 --environment Crane-v1` trains, and `drive-agent benchmark --task Crane-v1` trains with several seeds and judges in
-held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0`, whose configurations these are.
+held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0` and `ServoDrive/GainTuning-v0`,
+whose configurations these are.
 
 The reward of a step lies in 0...1, nothing is earned after a fall or a trip, and the score of an episode is the sum of
 rewards over the horizon. Every episode has a machine of its own, drawn from the load's distributions: inertia,
 friction, stiffness, motor, power stage, and the delays of the bus.
 
-What is in the table: the best of twenty policies that have learnt nothing (zero, random, bang-bang on the following
-error, nine constants, eight pairs of gains on the errors of position and speed); the *cascade* that a drive or a master
-has anyway; the *expert*, which is what a motion engineer would program who knows the parameters of each machine; and
-agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out
-episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare
-failures. Agents see only what the drives tell.
+What is in the table: the best of twenty and more policies that have learnt nothing (zero, random, bang-bang on the
+following error or by turns, constants, pairs of gains on the errors of position and speed); the *cascade* that a drive
+or a master has anyway, in a tuning with the gains that it is commissioned with; the *expert*, which is what a motion
+engineer would program who knows the parameters of each machine; and agents, trained as `drive-agent benchmark --seeds
+3` trains them. Baselines and agents have the same 64 held-out episodes; the figure is the interquartile mean, of agents
+with its 95 % interval and with the mean, which sees rare failures. Agents see only what the drives tell.
 
 """
 
@@ -77,7 +79,7 @@ def _row(name: str, task: SuiteTask, scores: dict[str, Any]) -> str:
 def _section(name: str, task: SuiteTask) -> str:
     options = "\n".join(f"{key} = {_toml(value)}" for key, value in task.options.items() if not isinstance(value, dict))
     tables = "\n".join(
-        f"{key} = {{ {', '.join(f'{one} = {number:g}' for one, number in value.items() if number)} }}"
+        f"{key} = {_toml({one: part for one, part in value.items() if part})}"
         for key, value in task.options.items()
         if isinstance(value, dict)
     )
@@ -96,12 +98,12 @@ def _section(name: str, task: SuiteTask) -> str:
 
 
 def _spaces() -> str:
-    text = inspect.cleandoc(Tracking.__doc__ or "").partition("\nArgs:\n")[0]
-    return (
-        "\n## Actions, observations, terms\n\nOf all of them, as of `ServoDrive/Tracking-v0`:\n\n"
-        + text.partition("\n\n")[2].rstrip()
-        + "\n"
-    )
+    found = ""
+    for kind, name in ((Tracking, "Tracking-v0"), (GainTuning, "GainTuning-v0")):
+        text = inspect.cleandoc(kind.__doc__ or "").partition("\nArgs:\n")[0].partition("\n\n")[2].rstrip()
+        whose = f"of the tasks that are configurations of `ServoDrive/{name}`"
+        found += f"\n## Actions, observations, rewards {whose}\n\n{text}\n"
+    return found
 
 
 def _anchor(name: str) -> str:
@@ -109,11 +111,16 @@ def _anchor(name: str) -> str:
 
 
 def _toml(value: Any) -> str:
-    return (
-        f"[{', '.join(map(_toml, value))}]"
-        if isinstance(value, tuple)
-        else json.dumps(value).replace("Infinity", "inf")
-    )
+    if isinstance(value, dict):
+        rows = (
+            f"{name if name.isidentifier() else json.dumps(name)} = "
+            + (f"{one:g}" if isinstance(one, float) else _toml(one))
+            for name, one in value.items()
+        )
+        return f"{{ {', '.join(rows)} }}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value).replace("Infinity", "inf")
 
 
 def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:

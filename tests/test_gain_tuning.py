@@ -83,6 +83,23 @@ def test_the_incumbent_never_gets_worse_by_measured_terms_and_changes_only_when_
         np.testing.assert_array_equal(info["reward_terms"]["tuning"][~better], 0.0)
 
 
+def test_a_judged_trial_earns_what_its_gains_are_worth_whatever_the_incumbent_is():
+    env = GainTuning(2, load="two_mass", judged="trial", half=4.0, step=2.0, **FEW)
+    _, info = env.reset(seed=6)
+    rule, rules_cost = info["gains"], info["robust_cost"]
+    for action in (np.zeros((2, 3)), np.full((2, 3), -1.0), np.zeros((2, 3))):
+        _, reward, _, _, info = env.step(action)
+        expected = np.clip(np.rint(rule[..., 2:] * np.exp(2.0 * action[:, None])), 1, 32767)
+        np.testing.assert_array_equal(info["trial_gains"][..., 2:], expected)
+        np.testing.assert_allclose(reward, 1.0 / (1.0 + (info["trial_robust_cost"] / 4.0) ** 2))
+        np.testing.assert_array_equal(reward, info["reward_terms"]["worth"])
+        if not action.any():
+            np.testing.assert_array_equal(info["trial_robust_cost"], rules_cost)  # as at the begin, each time
+        else:
+            assert np.all(info["trial_robust_cost"] != rules_cost)
+    env.close()
+
+
 def test_an_action_is_a_change_of_the_logarithm_of_the_chosen_gains_from_the_incumbent():
     env = GainTuning(1, gains=("velocity_p", "torque_p"), **FEW)
     env.reset(seed=0)
@@ -435,6 +452,8 @@ def test_over_can_in_lockstep_the_observations_are_the_same(safety):
     ({"motor": "qbl"}, "qbl4208"),
     ({"trials": 0}, "1 or more"),
     ({"step": 0.0}, "step must be finite and more than 0, not 0"),
+    ({"half": 0.0}, "half must be finite and more than 0, not 0"),
+    ({"judged": "best"}, "judged is one of 'incumbent', 'trial', not 'best'"),
     ({"stage": 2.0}, "0...1"),
     ({"waveform": 251}, "0...250"),
     ({"reward": 1}, "reward is a function of observations, actions and info, not 1"),

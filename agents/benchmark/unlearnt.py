@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,26 +16,36 @@ Floats = NDArray[np.float64]
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation; the first two are the errors of position and speed
 PAIRS = ((4.0, 0.5), (6.0, 0.5), (8.0, 1.0), (16.0, 1.0), (16.0, 0.1), (32.0, 0.1), (0.0, 1.0), (0.0, 3.0))
 CONSTANTS = (-1.0, -0.5, -0.2, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)
+CORNERS = (-2.0 / 3.0, 0.0, 2.0 / 3.0)  # of a tuning's actions, of which each entry is a gain of its own
 
-
+# Action of every entry from the errors of position and speed, shape (machines, entries), and a generator. In a tuning
+# there are none: position is +1 and -1 in turn.
 Plain = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 
-def _constant(value: float) -> Plain:
-    return lambda error, speed, rng: np.full_like(error, value)
+def _constant(*values: float) -> Plain:
+    return lambda error, speed, rng: np.zeros_like(error) + values
 
 
 def _pair(proportional: float, derivative: float) -> Plain:
     return lambda error, speed, rng: np.clip(proportional * error + derivative * speed, -1.0, 1.0)
 
 
-# Name -> action of every entry from the errors of position and speed, shape (machines, entries), and a generator.
-POLICIES: dict[str, Plain] = {
+EVERYWHERE: dict[str, Plain] = {
     "zero": lambda error, speed, rng: np.zeros_like(error),
     "random": lambda error, speed, rng: rng.uniform(-1.0, 1.0, error.shape),
     "bang-bang": lambda error, speed, rng: np.sign(error),
     **{f"constant {value:g}": _constant(value) for value in CONSTANTS},
-    **{f"PD {pair[0]:g}, {pair[1]:g}": _pair(*pair) for pair in PAIRS},
+}
+# Environment -> name of a policy -> the policy.
+POLICIES: dict[str, dict[str, Plain]] = {
+    "ServoDrive/Tracking-v0": EVERYWHERE | {f"PD {pair[0]:g}, {pair[1]:g}": _pair(*pair) for pair in PAIRS},
+    "ServoDrive/GainTuning-v0": EVERYWHERE
+    | {
+        f"constant {', '.join(f'{value:.2g}' for value in corner)}": _constant(*corner)
+        for corner in product(CORNERS, repeat=3)
+        if any(corner)
+    },
 }
 
 
@@ -44,16 +55,23 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
     Raises:
         ValueError: If a reward is not in 0...1.
     """
-    lanes = make_vector(len(POLICIES) * machines, name=name, autoreset_mode="NextStep")
+    environment = TASKS[name].environment
+    policies = POLICIES[environment]
+    lanes = make_vector(len(policies) * machines, name=name, autoreset_mode="NextStep")
     try:
         entries = lanes.single_action_space.shape[0]  # type: ignore[index]
-        seen, _ = lanes.reset(seed=list(range(machines)) * len(POLICIES))  # every policy meets the same ones
+        seen, _ = lanes.reset(seed=list(range(machines)) * len(policies))  # every policy meets the same ones
+        shape = (len(policies), machines, entries)
         rng = np.random.default_rng(0)
         total, going = np.zeros(lanes.num_envs), np.ones(lanes.num_envs, bool)
-        for _ in range(TASKS[name].steps):
-            rows = np.asarray(seen, float)[:, : AXIS_ENTRIES * entries]
-            errors = np.moveaxis(rows.reshape(len(POLICIES), machines, entries, AXIS_ENTRIES)[..., :2], -1, 1)
-            action = np.stack([act(both[0], both[1], rng) for act, both in zip(POLICIES.values(), errors, strict=True)])
+        for step in range(TASKS[name].steps):
+            if environment == "ServoDrive/Tracking-v0":
+                rows = np.asarray(seen, float)[:, : AXIS_ENTRIES * entries]
+                error, speed = np.moveaxis(rows.reshape(*shape, AXIS_ENTRIES)[..., :2], -1, 0)
+            else:
+                error, speed = np.full(shape, (-1.0) ** step), np.zeros(shape)
+            each = zip(policies.values(), error, speed, strict=True)
+            action = np.stack([act(of_position, of_speed, rng) for act, of_position, of_speed in each])
             seen, reward, terminated, _, _ = lanes.step(action.reshape(-1, entries).astype(np.float32))
             if np.any((reward < 0.0) | (reward > 1.0)):
                 raise ValueError(f"a reward of {name} is {reward.min():g} to {reward.max():g}; it must lie in 0...1")
@@ -61,5 +79,5 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
             going &= ~terminated
     finally:
         lanes.close()
-    means = total.reshape(len(POLICIES), machines).mean(axis=1) / TASKS[name].steps
-    return dict(zip(POLICIES, means.tolist(), strict=True))
+    means = total.reshape(len(policies), machines).mean(axis=1) / TASKS[name].steps
+    return dict(zip(policies, means.tolist(), strict=True))

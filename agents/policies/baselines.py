@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.experts import CarriageServo, ComputedTorque, LeadAndFeedback, Pendulum, SwingUp, TorqueCascade
+from agents.policies.experts import (
+    CarriageServo,
+    ComputedTorque,
+    LeadAndFeedback,
+    MarginDesign,
+    Pendulum,
+    SwingUp,
+    TorqueCascade,
+    TrialsOnModel,
+)
 from agents.training.tasks import environment_name
 
 Array = NDArray[np.float32]
@@ -133,7 +142,8 @@ BASELINES: dict[str, dict[str, Any]] = {
 
 
 # Task of the suite -> name of a baseline -> what makes it. A baseline that cannot act has no row: the set-points
-# of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole.
+# of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole. In a tuning the
+# cascade is as the drive is commissioned.
 SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/TorqueTracking-v1": {"rest": nothing, "cascade": TorqueCascade, "expert": ComputedTorque},
     "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": LeadAndFeedback},
@@ -141,6 +151,9 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
     "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
     "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": LeadAndFeedback},
+    "ServoDrive/ServoTuning-v1": {"cascade": nothing, "expert": MarginDesign},
+    "ServoDrive/AmplifierTuning-v1": {"cascade": nothing, "expert": MarginDesign},
+    "ServoDrive/StepperTuning-v1": {"cascade": nothing, "expert": TrialsOnModel},
 }
 
 

@@ -40,6 +40,8 @@ from drive_env.trials.score import RobustScore
 
 Integers = NDArray[np.int64]
 
+JUDGED = ("incumbent", "trial")
+
 
 @dataclass(frozen=True)
 class GainTuningConfig:
@@ -59,6 +61,9 @@ class GainTuningConfig:
     privileged: Whether the observation is a dict with the true machine beside it, for asymmetric critics.
     travel: How far the rotors may turn from where they are, with the sign [rev]; None is the load's own.
     dynamics: What the loops must keep for the robust cost: soft, standard, stiff, or numbers as 45/8/2.0.
+    judged: "incumbent": actions change the incumbent's gains, and what these improve is rewarded; "trial": actions
+        change the rule's gains, and what each trial's own are worth is rewarded, 0...1.
+    half: Robust cost of a trial that is worth 0.5.
     num_threads: As `EmulatedDrives` takes it.
     """
 
@@ -77,6 +82,8 @@ class GainTuningConfig:
     travel: float | None = None
     num_threads: int | None = None
     dynamics: str = DEFAULT
+    judged: str = "incumbent"
+    half: float = 3.0
 
     def __post_init__(self) -> None:
         known = find_device(self.device).gains
@@ -90,6 +97,7 @@ class GainTuningConfig:
         if not self.chosen or len(set(self.chosen)) != len(self.chosen):
             raise ValueError(f"gains must be different ones of {', '.join(known.searched)}, not {self.gains}")
         find_dynamics(self.dynamics)
+        check_choice("judged", self.judged, JUDGED)
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.step < math.inf:
@@ -100,6 +108,8 @@ class GainTuningConfig:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
         if not 0.0 <= self.abort_cost < math.inf:
             raise ValueError(f"abort_cost must be 0 or more, not {self.abort_cost:g}")
+        if not 0.0 < self.half < math.inf:
+            raise ValueError(f"half must be finite and more than 0, not {self.half:g}")
         if self.travel is not None and not 0.0 < abs(self.travel) < math.inf:
             raise ValueError(f"travel must be finite and not 0, not {self.travel:g} rev")
 
@@ -125,7 +135,7 @@ class GainTuning(VectorEnvironment):
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
-    | 0 ... G-1 | ln of the gain over the incumbent's, in the configuration's order | `step` | -1 | 1 |
+    | 0 ... G-1 | ln of the gain over the incumbent's or the rule's (`judged`) | `step` | -1 | 1 |
 
     Observation, float32, for each axis of the machine, with W points of waveform:
 
@@ -170,11 +180,15 @@ class GainTuning(VectorEnvironment):
     and of the settings of a load detection, there is no robust cost; it is that of ln J by measured terms. The episode
     is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
 
-    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
-    the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
-    this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, and "faults",
-    names of the trial's emergencies, tuples, of the rule's trial at the begin as well; "parameters", the true machine.
-    Given drives have no robust cost.
+    With `judged` = "trial" it is what the trial's gains are worth instead, 1 / (1 + (robust cost / `half`)^2), which is
+    hardly anything where the constraints are broken (30 and more) or a trial is stopped. Nothing is earned or lost
+    besides: what a trial is good for later, it must earn later.
+
+    `info`: "reward_terms" ("tuning", "abort"; or "worth"); "gains", the incumbent's, (environments, axes, count) raw
+    integers in the order of the device's set; "measured", its J by measured terms, and "robust_cost";
+    "trial_robust_cost", that of this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was
+    stopped, and "faults", names of the trial's emergencies, tuples, of the rule's trial at the begin as well;
+    "parameters", the true machine. Given drives have no robust cost.
 
     Args:
         num_envs: Number of environments.
@@ -375,7 +389,11 @@ class GainTuning(VectorEnvironment):
             self._robust_cost = np.where(better, trial_robust_cost, self._robust_cost)
         after = self._measured if self._score is None else self._robust_cost
         aborted = active & self._stopped(tried)
-        terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * (aborted & other)}
+        if self.config.judged == "trial":
+            cost = measured if trial_robust_cost is None else trial_robust_cost
+            terms = {"worth": active / (1.0 + (cost / self.config.half) ** 2)}
+        else:
+            terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * (aborted & other)}
         self._left[active] -= 1
         info = self._told()
         info["reward_terms"] = terms
@@ -386,7 +404,7 @@ class GainTuning(VectorEnvironment):
         if trial_robust_cost is not None:
             info["trial_robust_cost"] = trial_robust_cost
         dead = zero.astype(bool) if self._owned else active & self._dead()
-        return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
+        return self._observe(), np.asarray(sum(terms.values())), dead, self._left <= 0, info
 
     def gains_of(self, action: ArrayLike) -> Integers:
         """Return the gains of an action, without trying them: (environments, axes, count), as `info["gains"]`."""
@@ -395,7 +413,8 @@ class GainTuning(VectorEnvironment):
     def _changed(self, action: ArrayLike) -> Integers:
         change = self.config.step * np.nan_to_num(np.clip(np.asarray(action, float), -1.0, 1.0))
         change = change.reshape(-1, len(self._columns))
-        return self._device.gains.changed(self._best, change, self._columns, self._highest)
+        since = self._best if self.config.judged == "incumbent" else self._rule
+        return self._device.gains.changed(since, change, self._columns, self._highest)
 
     # --- a trial --------------------------------------------------------------------------------------------------
     def _begin_trial(self, mask: Mask) -> None:
