@@ -19,6 +19,7 @@ from agents.policies.baselines import SUITE_TASKS
 from agents.shipped import shipped, shipped_names
 from agents.training.tasks import short_name
 from drive_env.envs.gain_scheduling import GainScheduling
+from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.suite import TASKS, SuiteTask
 from drive_env.envs.tracking import Tracking
 
@@ -28,27 +29,27 @@ CURVES = "assets/tasks/{}_curves.webp"
 MACHINES = 24
 INTRODUCTION = """# Learning tasks
 
-Tasks to train on and to compare agents by. Each is an id that never changes: device, load, mode, action, distributions,
-horizon and reward belong to it, and it takes no options. `gymnasium.make("ServoDrive/Crane-v1")` makes one,
-`drive_env.envs.make_vec_env("ServoDrive/Crane-v1", num_envs=64)` many for Stable-Baselines3, `drive-agent train
+Tasks to train on and to compare agents by. Each is an id that never changes: device, load, mode, action,
+distributions, horizon and reward belong to it, and it takes no options. `gymnasium.make("ServoDrive/Crane-v1")` makes
+one, `drive_env.envs.make_vec_env("ServoDrive/Crane-v1", num_envs=64)` many for Stable-Baselines3, `drive-agent train
 --environment Crane-v1` trains, and `drive-agent benchmark --task Crane-v1` trains with several seeds and judges in
-held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0` and `ServoDrive/GainScheduling-v0`,
-whose configurations these are.
+held-out episodes. For other loads, modes and rewards take `ServoDrive/Tracking-v0`, `ServoDrive/GainScheduling-v0`
+and `ServoDrive/GainTuning-v0`, whose configurations these are.
 
 The reward of a step lies in 0...1, nothing is earned after a fall or a trip, and the score of an episode is the sum of
 rewards over the horizon. Every episode has a machine of its own, drawn from the load's distributions: inertia,
 friction, stiffness, motor, power stage, and the delays of the bus.
 
 What is in the table: the best of some twenty policies that have learnt nothing (zero, random, bang-bang on the
-following error, nine constants; of Tracking eight pairs of gains on the errors of position and speed, of
-GainScheduling five constant sets of gains, the best of a search over 141 among them); the *cascade* that a drive or a
-master has anyway; the *expert*, which is what a motion engineer would program who knows the parameters of each machine;
-and agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out
-episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare
-failures. Agents see only what the drives tell. An agent ships where it is better than the expert with 95 % confidence,
-and keeps its loops within margins on 32 drawn machines: it then answers following errors by less than it had learnt
-(`drive-agent margins agent.npz --dynamics standard --out calm.npz`), which costs some of its score. Where none ships,
-take the expert.
+following error or by turns, nine constants; of Tracking eight pairs of gains on the errors of position and speed, of
+GainScheduling five constant sets of gains, the best of a search over 141 among them, of GainTuning 26 constant sets);
+the *cascade* that a drive or a master has anyway, in a tuning with the gains that it is commissioned with; the
+*expert*, which is what a motion engineer would program who knows the parameters of each machine; and agents, trained
+as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out episodes; the figure
+is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare failures. Agents see
+only what the drives tell. An agent ships where it is better than the expert with 95 % confidence, and keeps its loops
+within margins on 32 drawn machines: it then answers following errors by less than it had learnt (`drive-agent margins
+agent.npz --dynamics standard --out calm.npz`), which costs some of its score. Where none ships, take the expert.
 
 """
 
@@ -95,7 +96,7 @@ def _ships(scores: dict[str, Any]) -> str:
 def _section(name: str, task: SuiteTask) -> str:
     options = "\n".join(f"{key} = {_toml(value)}" for key, value in task.options.items() if not isinstance(value, dict))
     tables = "\n".join(
-        f"{key} = {{ {', '.join(f'{one} = {number:g}' for one, number in value.items() if number)} }}"
+        f"{key} = {_toml({one: part for one, part in value.items() if part})}"
         for key, value in task.options.items()
         if isinstance(value, dict)
     )
@@ -116,7 +117,7 @@ def _section(name: str, task: SuiteTask) -> str:
 def _spaces() -> str:
     """Return what the docstrings of the environments say of actions, observations and rewards."""
     parts = []
-    for kind in (Tracking, GainScheduling):
+    for kind in (Tracking, GainScheduling, GainTuning):
         tasks = [name.partition("/")[2] for name, task in TASKS.items() if kind.__name__ in task.environment]
         text = inspect.cleandoc(kind.__doc__ or "").partition("\nArgs:\n")[0].partition("\n\n")[2].rstrip()
         parts.append(f"\n## Actions, observations, terms of {kind.__name__}\n\nOf {', '.join(tasks)}:\n\n{text}\n")
@@ -128,11 +129,16 @@ def _anchor(name: str) -> str:
 
 
 def _toml(value: Any) -> str:
-    return (
-        f"[{', '.join(map(_toml, value))}]"
-        if isinstance(value, tuple)
-        else json.dumps(value).replace("Infinity", "inf")
-    )
+    if isinstance(value, dict):
+        rows = (
+            f"{name if name.isidentifier() else json.dumps(name)} = "
+            + (f"{one:g}" if isinstance(one, float) else _toml(one))
+            for name, one in value.items()
+        )
+        return f"{{ {', '.join(rows)} }}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value).replace("Infinity", "inf")
 
 
 def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:

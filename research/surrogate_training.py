@@ -134,11 +134,11 @@ def collect(
         for _ in range(trials):
             if policy is None:
                 wanted = _random_gains(rng, recipe, machines)
-                action = wanted - observation[:, IDENTIFIED + G : IDENTIFIED + 2 * G]
+                change = wanted - observation[:, IDENTIFIED + G : IDENTIFIED + 2 * G]
             else:
                 shake = SHAKE * rng.choice(SHAKES, (machines, 1))
-                action = policy.act(observation) + shake * rng.standard_normal((machines, G))
-            observation, _, _, _, info = env.step(action.astype(np.float32))
+                change = STEP * policy.act(observation) + shake * rng.standard_normal((machines, G))
+            observation, _, _, _, info = env.step(change / env.config.step)
             worth = np.log(info["trial_robust_cost"])
             found = (observation[:, IDENTIFIED : IDENTIFIED + G], _shown(observation, G), worth)
             for column, value in zip(columns, found, strict=True):
@@ -285,7 +285,7 @@ def factory_cost(recipe: Recipe, machines: int, seed: int) -> Floats:
         with machines_of(recipe, row, machines, trials=1, step=WIDEST) as env:
             _, info = env.reset(seed=list(range(seed, seed + machines)))
             change = np.log(np.maximum(factory, 1.0)) - np.log(info["gains"][:, 0][:, columns])
-            _, _, _, _, after = env.step(change.astype(np.float32))
+            _, _, _, _, after = env.step(change / WIDEST)
             found.append(after["trial_robust_cost"] / info["robust_cost"])
     return np.array(found)
 

@@ -265,7 +265,7 @@ class Acting(Gentle):
         self._weights = 0.2 * np.random.default_rng(3).standard_normal((64, actions))
 
     def act(self, observation):
-        return np.clip(observation @ self._weights[: observation.shape[1]], -0.7, 0.7)
+        return np.clip(observation @ self._weights[: observation.shape[1]], -1.0, 1.0)
 
 
 @pytest.mark.slow

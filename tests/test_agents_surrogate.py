@@ -152,20 +152,20 @@ def test_the_next_trial_is_the_best_of_all_candidates_wherever_the_incumbent_is(
     seen = after(np.zeros((2, G)))
     incumbent = np.array([0.3, -0.3, 0.9], np.float32)
     seen[1, IDENTIFIED + G : IDENTIFIED + 2 * G] = incumbent
-    action = policy.act(seen)
+    action = training.STEP * policy.act(seen)
     assert action[0] == pytest.approx(best, abs=0.3)
     assert action[1] + incumbent == pytest.approx(action[0], abs=1e-6)
 
 
-def test_trials_lie_within_the_range_and_the_action_within_its_bound(bundle, monkeypatch):
+def test_trials_lie_within_the_range_and_the_action_is_a_share_of_the_step(bundle, monkeypatch):
     narrow = AgentFile(bundle.kind, bundle.arrays, {**bundle.settings, "step": 0.5}, "none")
-    for one, bound in ((bundle, np.inf), (narrow, 0.5)):
+    for one, step in ((bundle, training.STEP), (narrow, 0.5)):
         policy = SurrogatePolicy(one)
         monkeypatch.setattr(policy, "_ask", says(lambda gains: -gains.sum(axis=-1)))
         action = policy.act(after(np.zeros((1, G))))[0]
-        assert np.all(action <= HIGH + 1e-6)
-        assert np.abs(action).max() <= bound
-    assert action == pytest.approx([0.5, 0.5, 0.5])
+        assert np.all(step * action <= HIGH + 1e-6)
+        assert np.abs(action).max() <= 1.0
+    assert action == pytest.approx([1.0, 1.0, 1.0])
 
 
 def test_curiosity_seeks_what_is_not_known(bundle, monkeypatch):
@@ -176,7 +176,7 @@ def test_curiosity_seeks_what_is_not_known(bundle, monkeypatch):
         )
         far = says(lambda gains: gains[..., 2], scale=lambda gains: gains[..., 2])
         monkeypatch.setattr(policy, "_ask", far)
-        reached[curiosity] = policy.act(after(np.zeros((1, G))))[0, 2]
+        reached[curiosity] = training.STEP * policy.act(after(np.zeros((1, G))))[0, 2]
     assert reached[0.0] < LOW[2] + 0.1
     assert reached[2.0] > HIGH[2] - 0.1
 
@@ -211,7 +211,7 @@ def test_the_answer_is_the_trial_with_the_least_median_that_is_sure(bundle, monk
     monkeypatch.setattr(policy, "_ask", lambda memory, gains: (np.array([median]), np.array([scale])))
     last = after(TRIED[-1])
     last[:, IDENTIFIED + G : IDENTIFIED + 2 * G] = TRIED[1]  # the incumbent, from which an action counts
-    assert policy.answer(last)[0] == pytest.approx(TRIED[answer] - TRIED[1], abs=1e-6)
+    assert training.STEP * policy.answer(last)[0] == pytest.approx(TRIED[answer] - TRIED[1], abs=1e-6)
 
 
 def test_the_axes_of_a_machine_stay_with_one_trial(policy, monkeypatch):
@@ -221,7 +221,7 @@ def test_the_axes_of_a_machine_stay_with_one_trial(policy, monkeypatch):
     steps = [np.concatenate([after(gains)[0, :-1]] * 2 + [np.zeros(1)]) for gains in TRIED]
     for seen in steps[:-1]:
         policy._take(seen)
-    assert policy.answer(steps[-1]) == pytest.approx(np.tile(TRIED[3], 2), abs=1e-6)
+    assert training.STEP * policy.answer(steps[-1]) == pytest.approx(np.tile(TRIED[3], 2), abs=1e-6)
 
 
 # --- what it remembers ------------------------------------------------------------------------------------------------
@@ -385,4 +385,4 @@ def test_what_was_stopped_in_any_phase_is_no_answer(phase, monkeypatch):
     second[0, 10 + 5 * phase + 4] = 1.0  # of the first machine it was stopped
     policy.act(first)
     monkeypatch.setattr(policy, "_ask", lambda memory, gains: (-gains.sum(axis=-1), np.zeros(gains.shape[:2])))
-    assert policy.answer(second).tolist() == [[0.0] * 3, [1.0] * 3]
+    assert (policy.bundle.settings["step"] * policy.answer(second)).tolist() == [[0.0] * 3, [1.0] * 3]

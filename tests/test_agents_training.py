@@ -238,7 +238,7 @@ def test_each_trial_earns_its_own_hidden_j_over_the_rules():
     lanes, (_, told), env, _ = both("gain_tuning", {"trials": 2}, {"agents.training.rewards:EachTrial": {"limit": 0.4}})
     rng, rule, limited = np.random.default_rng(0), told["robust_cost"], 0
     for _ in range(4):  # two episodes: the second one's machines have other rules
-        action = rng.uniform(-0.7, 0.7, (4, 3)).astype(np.float32)
+        action = rng.uniform(-1.0, 1.0, (4, 3)).astype(np.float32)
         _, _, _, ended, told = lanes.step(action)
         gained = np.log(rule) - np.log(told.get("final_info", told)["trial_robust_cost"])
         env.step_async(action)

@@ -196,15 +196,16 @@ class Contrary:
 
     def __init__(self):
         self.bundle = load_policy(shipped("gain_tuning")).bundle
+        self.step = self.bundle.settings["step"]
 
     def reset(self, mask=None):
         pass
 
     def act(self, observation):
-        return np.full((len(observation), 3), -0.2, np.float32)
+        return np.full((len(observation), 3), -0.2 / self.step)
 
     def answer(self, observation):
-        return -observation[:, 7:10]  # ln of the incumbent's gains over the rule's
+        return -observation[:, 7:10] / self.step  # ln of the incumbent's gains over the rule's
 
 
 def test_the_answer_is_the_tuners_own_where_it_makes_one():
@@ -219,7 +220,7 @@ class Reckless(Contrary):
     """A tuner that raises all gains tenfold, which no axis bears, and would stay with that."""
 
     def act(self, observation):
-        return np.full((len(observation), 3), 2.3, np.float32)
+        return np.full((len(observation), 3), 2.3 / self.step)
 
     def answer(self, observation):
         return self.act(observation)

@@ -91,10 +91,6 @@ def mend_machine(lanes):
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------
-# That +-0.7 is not +-1 is all that the checkers may say: it is what a gain's logarithm may change by.
-NOT_NORMALIZED = ".*symmetric and normalized Box action space.*"
-
-
 @pytest.mark.every(4)
 @EVERY_KIND_AND_LOAD
 def test_the_checkers_of_gymnasium_and_stable_baselines_find_nothing_to_say(kind, load):
@@ -103,8 +99,6 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_find_nothing_to_say(kind
     single = gymnasium.make(f"ServoDrive/{kind}-v0", load=load, num_threads=1, **KINDS[kind][1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        if kind == "GainTuning":
-            warnings.filterwarnings("ignore", NOT_NORMALIZED)
         check_env(single.unwrapped, skip_render_check=True)
         check_for_stable_baselines(single.unwrapped, warn=True)
     single.close()

@@ -25,7 +25,7 @@ FEW = {"trials": 3, "num_threads": 1}
 def actions(env, steps, seed=0):
     """Return the actions of a random agent, the same for environment k of any number of environments."""
     shape = env.single_action_space.shape
-    lanes = [np.random.default_rng((seed, lane)).uniform(-0.7, 0.7, (steps, *shape)) for lane in range(env.num_envs)]
+    lanes = [np.random.default_rng((seed, lane)).uniform(-1.0, 1.0, (steps, *shape)) for lane in range(env.num_envs)]
     return np.stack(lanes, axis=1).astype(np.float32)
 
 
@@ -83,26 +83,43 @@ def test_the_incumbent_never_gets_worse_by_measured_terms_and_changes_only_when_
         np.testing.assert_array_equal(info["reward_terms"]["tuning"][~better], 0.0)
 
 
+def test_a_judged_trial_earns_what_its_gains_are_worth_whatever_the_incumbent_is():
+    env = GainTuning(2, load="two_mass", judged="trial", half=4.0, step=2.0, **FEW)
+    _, info = env.reset(seed=6)
+    rule, rules_cost = info["gains"], info["robust_cost"]
+    for action in (np.zeros((2, 3)), np.full((2, 3), -1.0), np.zeros((2, 3))):
+        _, reward, _, _, info = env.step(action)
+        expected = np.clip(np.rint(rule[..., 2:] * np.exp(2.0 * action[:, None])), 1, 32767)
+        np.testing.assert_array_equal(info["trial_gains"][..., 2:], expected)
+        np.testing.assert_allclose(reward, 1.0 / (1.0 + (info["trial_robust_cost"] / 4.0) ** 2))
+        np.testing.assert_array_equal(reward, info["reward_terms"]["worth"])
+        if not action.any():
+            np.testing.assert_array_equal(info["trial_robust_cost"], rules_cost)  # as at the begin, each time
+        else:
+            assert np.all(info["trial_robust_cost"] != rules_cost)
+    env.close()
+
+
 def test_an_action_is_a_change_of_the_logarithm_of_the_chosen_gains_from_the_incumbent():
     env = GainTuning(1, gains=("velocity_p", "torque_p"), **FEW)
     env.reset(seed=0)
     rule = env._rule[0].copy()
-    env.step(np.array([[0.7, -0.7]], np.float32))
+    env.step(np.array([[1.0, -1.0]], np.float32))
     expected = rule.copy()
-    expected[P] = round(rule[P] * np.exp(np.float32(0.7)))
-    expected[0] = round(rule[0] * np.exp(np.float32(-0.7)))
+    expected[P] = round(rule[P] * np.exp(0.7))
+    expected[0] = round(rule[0] * np.exp(-0.7))
     assert env._last[0].tolist() == expected.tolist()
     env.close()
 
 
-def test_the_step_bounds_an_action_and_gains_of_says_what_one_means_without_trying_it():
+def test_an_action_of_1_is_the_step_and_gains_of_says_what_one_means_without_trying_it():
     for step in (0.2, 2.5):
         env = GainTuning(2, step=step, **FEW)
         _, before = env.reset(seed=0)
-        assert env.single_action_space.high == pytest.approx([step] * 3)
+        assert env.single_action_space.high == pytest.approx([1.0] * 3)
         action = np.array([[9.0, 0.1, -9.0], [0.0, 0.0, 0.0]], np.float32)
         meant = env.gains_of(action)
-        factors = np.exp([[0.0, 0.0, step, 0.1, -step], [0.0] * 5])
+        factors = np.exp([[0.0, 0.0, step, 0.1 * step, -step], [0.0] * 5])
         assert meant[:, 0] == pytest.approx(np.clip(np.rint(before["gains"][:, 0] * factors), 1, 32767), abs=1)
         _, _, _, _, info = env.step(action)
         np.testing.assert_array_equal(info["trial_gains"], meant)
@@ -115,7 +132,7 @@ def test_what_shakes_is_stopped_costs_and_leaves_the_incumbent(four):
     aborted = np.zeros(4, bool)
     for _ in range(3):
         before = four._best.copy()
-        observation, reward, _, _, info = four.step(np.full((4, 3), [0.7, 0.7, 0.7], np.float32))
+        observation, reward, _, _, info = four.step(np.ones((4, 3), np.float32))
         lanes = info["aborted"] & (four._best == before).all(axis=1)
         aborted |= lanes
         assert np.all(reward[lanes] == -0.05)
@@ -351,19 +368,23 @@ def test_given_drives_are_taken_as_they_are_and_rewarded_by_measured_terms():
         drives.advance(0.001)  # still open
 
 
-def test_a_given_drive_that_cannot_be_cleared_terminates_its_lane_alone():
-    """The enable input of machine 1 opens in the first cycle of its trial, and stays open."""
+@pytest.mark.parametrize(("action", "cost"), [(-0.1, 0.05), (0.0, 0.0)])
+def test_a_given_drive_that_cannot_be_cleared_terminates_its_lane_alone(action, cost):
+    """The enable input of machine 1 opens in the first cycle of its trial, and stays open.
+
+    A trial of the incumbent's own gains costs nothing: whoever changes nothing is not to blame.
+    """
     with EmulatedDrives(num_machines=2, num_threads=1) as drives:
         env = GainTuning(2, drives=drives, autoreset_mode="Disabled", **FEW)
         env.reset(seed=0)
         _, _, terminated, truncated, info = env.step(np.zeros((2, 3), np.float32))
         assert not terminated.any() and not truncated.any() and info["faults"].tolist() == [(), ()]
         drives.machine.enable_input = [True, False]
-        _, reward, terminated, truncated, info = env.step(np.zeros((2, 3), np.float32))
+        _, reward, terminated, truncated, info = env.step(np.full((2, 3), action, np.float32))
         assert terminated.tolist() == [False, True] and not truncated.any()
         assert info["aborted"].tolist() == [False, True]
         assert info["faults"][0] == () and "shutdown_switch" in info["faults"][1]
-        assert reward[1] == -env.config.abort_cost
+        assert reward[1] == -cost
         drives.machine.enable_input = True
         observation, _ = env.reset(options={"reset_mask": np.array([False, True])})
         assert observation[1, -1] == 1.0
@@ -431,6 +452,8 @@ def test_over_can_in_lockstep_the_observations_are_the_same(safety):
     ({"motor": "qbl"}, "qbl4208"),
     ({"trials": 0}, "1 or more"),
     ({"step": 0.0}, "step must be finite and more than 0, not 0"),
+    ({"half": 0.0}, "half must be finite and more than 0, not 0"),
+    ({"judged": "best"}, "judged is one of 'incumbent', 'trial', not 'best'"),
     ({"stage": 2.0}, "0...1"),
     ({"waveform": 251}, "0...250"),
     ({"reward": 1}, "reward is a function of observations, actions and info, not 1"),

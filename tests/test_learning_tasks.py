@@ -26,7 +26,8 @@ from drive_env.envs.suite import TASKS
 from drive_env.loops.dynamics import find_dynamics
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-MACHINES = 24
+# A trial of a tuning costs as much as 750 steps.
+MACHINES = {"ServoDrive/Tracking-v0": 24, "ServoDrive/GainScheduling-v0": 24, "ServoDrive/GainTuning-v0": 12}
 UNLEARNT, LEAST, MOST = 0.6, 0.7, 0.95  # score of what has learnt nothing at most; of the expert
 
 
@@ -34,7 +35,7 @@ UNLEARNT, LEAST, MOST = 0.6, 0.7, 0.95  # score of what has learnt nothing at mo
 def test_a_task_has_its_horizon_and_its_threshold_in_the_spec_and_takes_no_options(name):
     task = TASKS[name]
     with gymnasium.make(name) as env:
-        assert env.spec.max_episode_steps == task.steps == env.unwrapped.vector.config.steps
+        assert env.spec.max_episode_steps == task.steps == env.unwrapped.vector.max_episode_steps
         assert env.spec.reward_threshold == pytest.approx(task.solved * task.steps)
         assert np.all(env.action_space.low == -1.0) and np.all(env.action_space.high == 1.0)
     with contextlib.closing(gymnasium.make_vec(name, 2)) as envs:
@@ -54,6 +55,9 @@ FROZEN = {
     "ServoDrive/ArmPath-v1": "099611bdd54fcb38",
     "ServoDrive/PayloadScheduling-v1": "d1d5e2d9c1429870",
     "ServoDrive/KnownPayload-v1": "447388779bbab8c4",
+    "ServoDrive/ServoTuning-v1": "0a61b10e4c9c9160",
+    "ServoDrive/AmplifierTuning-v1": "d43013d4a4f8536a",
+    "ServoDrive/StepperTuning-v1": "7cf5101313ccfe0e",
 }
 
 
@@ -63,7 +67,8 @@ def test_a_published_task_never_changes(name):
 
 
 def digest(name):
-    sets, read = [str(TASKS[name].options["distributions"])], {}
+    laws, read = TASKS[name].options["distributions"], {}
+    sets = [*laws["include"]] if isinstance(laws, dict) else [laws]
     while sets:
         one = sets.pop()
         read[one] = tomllib.loads((SHIPPED / f"{one}.toml").read_text(encoding="utf-8"))
@@ -74,7 +79,7 @@ def digest(name):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_what_has_learnt_nothing_scores_less_than_0_6(name):
-    scores = unlearnt_scores(name, MACHINES)
+    scores = unlearnt_scores(name, MACHINES[TASKS[name].environment])
     assert max(scores.values()) < UNLEARNT, scores
 
 

@@ -316,7 +316,7 @@ def test_gain_tuning_and_its_robust_cost_tell_gains_of_the_closed_loop_apart():
     try:
         _, info = env.reset(seed=1)
         rule = float(info["robust_cost"][0])
-        _, _, _, _, info = env.step(np.array([[-0.7, -0.7]], np.float32))
+        _, _, _, _, info = env.step(np.array([[-1.0, -1.0]], np.float32))
         slow = float(info["trial_robust_cost"][0])
         assert slow > 1.05 * rule and info["trial_measured"][0] != info["measured"][0] and slow < 30.0
         tried = info["trial_gains"][0, 0]
@@ -451,7 +451,7 @@ def test_gain_tuning_and_its_robust_cost_tell_gains_of_the_pid_apart(prefix, slo
         _, info = env.reset(seed=1)
         rule = float(info["robust_cost"][0])
         assert 1.0 < rule < 30.0
-        _, _, _, _, info = env.step(np.array([[-0.7, 0.0]], np.float32))
+        _, _, _, _, info = env.step(np.array([[-1.0, 0.0]], np.float32))
         assert float(info["trial_robust_cost"][0]) > slow * rule, "less P resists a load less"
         assert info["trial_gains"][0, 0, DEVICE.gains.columns([f"{prefix}_p"])[0]] == 3973
     finally:

@@ -106,7 +106,7 @@ def _mean_term(name: str) -> Callable[[Episode, Any], float]:
 
 def stopped(episode: Episode, config: Any) -> float:
     """Return the share of trials stopped for oscillation or fault; NaN if that costs nothing."""
-    if not config.abort_cost:
+    if not config.abort_cost or "abort" not in episode.terms:
         return float("nan")
     return float(np.mean(np.asarray(episode.terms["abort"]) < 0.0))
 

@@ -17,10 +17,12 @@ from agents.policies.experts import (
     CarriageServo,
     ComputedTorque,
     LeadAndFeedback,
+    MarginDesign,
     PayloadSchedule,
     Pendulum,
     SwingUp,
     TorqueCascade,
+    TrialsOnModel,
 )
 from agents.training.tasks import environment_name
 
@@ -141,7 +143,8 @@ BASELINES: dict[str, dict[str, Any]] = {
 
 
 # Task of the suite -> name of a baseline -> what makes it. A baseline that cannot act has no row: the set-points
-# of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole.
+# of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole. In a tuning the
+# cascade is as the drive is commissioned.
 SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/TorqueTracking-v1": {"rest": nothing, "cascade": TorqueCascade, "expert": ComputedTorque},
     "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": LeadAndFeedback},
@@ -151,6 +154,9 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": LeadAndFeedback},
     "ServoDrive/PayloadScheduling-v1": {"cascade": nothing, "expert": PayloadSchedule},
     "ServoDrive/KnownPayload-v1": {"cascade": nothing, "expert": PayloadSchedule},
+    "ServoDrive/ServoTuning-v1": {"cascade": nothing, "expert": MarginDesign},
+    "ServoDrive/AmplifierTuning-v1": {"cascade": nothing, "expert": MarginDesign},
+    "ServoDrive/StepperTuning-v1": {"cascade": nothing, "expert": TrialsOnModel},
 }
 
 

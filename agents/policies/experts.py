@@ -7,6 +7,9 @@ takes the nominal ones. What it must cope with all the same: delays of the bus, 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -30,7 +33,7 @@ class Expert:
     """Base of the experts.
 
     Args:
-        configuration: Of Tracking.
+        configuration: Of the environment.
     """
 
     def __init__(self, configuration: Any) -> None:
@@ -235,3 +238,101 @@ class TorqueCascade(ComputedTorque):
         still = rows.copy()
         still[:, WANTED_SPEED] = still[:, WANTED_SPEED_LATER] = 0.0
         return super().actions(still)
+
+
+class MarginDesign(Expert):
+    """The fastest gains of a grid with which the machine's linear model keeps the margins, and its variants do.
+
+    As `drive-tune auto` designs (tuning/auto/design.py), without its trials on a model with friction and noise.
+    """
+
+    # ln over the rule's: bandwidth of the velocity loop; integration time and position gain, over that bandwidth.
+    BANDWIDTHS = np.linspace(-3.0, 0.8, 13)
+    INTEGRATIONS = np.log(4.0 / np.array([2.0, 4.0, 9.0]))
+    POSITIONS = np.log(3.0 * np.array([0.12, 0.2, 0.32, 0.5, 0.75]))
+    EACH = 3  # of a bandwidth, whose variants are looked at
+    AROUND = np.array(list(product((-1.0, 0.0, 1.0), repeat=3))) * (0.12, 0.3, 0.15)  # the best of these
+    SLACK = 0.05  # by which the constraints are kept, relative
+    SPEED = np.array([0.4, 0.4, 0.8])  # by which ln J falls with ln of velocity P and I and position P
+
+    def __init__(self, configuration: Any) -> None:
+        super().__init__(configuration)
+        self._design: Floats | None = None
+
+    def reset(self, mask: Any = None) -> None:
+        """Forget the designs."""
+        self._design = None
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the design's gains over the rule's, in steps, the same in each trial."""
+        if self._design is None:
+            self._design = self._designed(rows)
+        return np.asarray(self._design / self.configuration.step)
+
+    def _designed(self, rows: Floats) -> Floats:
+        """Return ln of the gains over the rule's, (environments, 3)."""
+        from drive_env.trials.method import new_score
+
+        c, count = self.configuration, len(rows)
+        device, motor = find_device(c.device), find_motor(c.motor)
+        supply = device.supply_of(motor)
+        rule = rule_gains(device, motor, 3.0 * motor.inertia * np.exp(rows[:, 0]), supply=supply)
+        columns = device.gains.columns(c.gains)
+        grid = np.array([(b, b + i, b + p) for b, i, p in product(self.BANDWIDTHS, self.INTEGRATIONS, self.POSITIONS)])
+        with closing(new_score(c.device, c.load, motor, count, num_threads=1, dynamics=c.dynamics)) as model:
+            model.set_machines(self._machine, np.full(count, supply))
+
+            def worth(sets: Floats, nominal: bool) -> Floats:
+                """Return how fast sets of gains are, (sets, environments, 3); of those that break the margins less."""
+                raw = [device.gains.changed(rule, one, columns, device.gains.highest) for one in sets]
+                slack = np.array([model.loop_slack(one, nominal=nominal) for one in raw])
+                return np.where(slack > self.SLACK, sets @ self.SPEED, slack - 1e9)
+
+            sets = np.repeat(grid[:, None], count, axis=1)
+            shape = (len(self.BANDWIDTHS), -1, count)
+            best = np.argsort(-worth(sets, nominal=True).reshape(shape), axis=1)[:, : self.EACH]
+            sets = np.take_along_axis(sets.reshape(*shape, 3), best[..., None], axis=1).reshape(-1, count, 3)
+            for around in (np.zeros((1, 3)), self.AROUND):
+                sets = (sets[None] + around[:, None, None]).reshape(-1, count, 3)
+                sets = sets[worth(sets, nominal=False).argmax(axis=0), np.arange(count)][None]
+        return np.asarray(sets[0])
+
+
+class TrialsOnModel(Expert):
+    """The best by robust cost of a table of gains, each tried on an emulated model of the machine.
+
+    As `drive-tune auto` tries designs on twins. The table was chosen among 260 sets of random gains, on 64 machines, so
+    that its best is good on as many as possible.
+    """
+
+    TABLE = np.array([
+        (0.0, -3.5, -1.1), (1.0, -2.2, -4.7), (-0.6, -3.6, -2.2), (0.9, -1.2, -3.3), (0.4, -3.0, -4.1),
+        (1.3, -1.4, -0.4), (-0.1, -4.5, -4.1), (0.4, -2.6, -3.0), (-0.4, -3.6, -0.8), (0.2, -3.8, -4.0),
+        (1.3, -0.9, -0.1), (-0.2, -3.0, -0.6), (1.4, -1.9, -3.3), (1.1, -2.7, -3.3), (0.5, -1.6, -1.0),
+        (-0.3, -3.2, 0.6),
+    ])  # fmt: skip
+    """ln over the values that the drive is commissioned with, of P, I and D of the position loop."""
+
+    def __init__(self, configuration: Any) -> None:
+        super().__init__(configuration)
+        self._chosen: Floats | None = None
+
+    def reset(self, mask: Any = None) -> None:
+        """Forget what was chosen."""
+        self._chosen = None
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the gains over the rule's, in steps, the same in each trial."""
+        if self._chosen is None:
+            self._chosen = self.TABLE[self._costs(len(rows)).argmin(axis=0)]
+        return np.asarray(self._chosen / self.configuration.step)
+
+    def _costs(self, count: int) -> Floats:
+        """Return the robust costs of the table on the machines, (sets, environments)."""
+        from drive_env.envs.gain_tuning import GainTuning
+
+        one = replace(self.configuration, trials=len(self.TABLE), num_threads=1)
+        with closing(GainTuning(count, config=vars(one))) as model:
+            model.reset(seed=0, options={"machine": self._machine})
+            changes = np.repeat((self.TABLE / one.step)[:, None], count, axis=1)
+            return np.array([model.step(change)[4]["trial_robust_cost"] for change in changes])

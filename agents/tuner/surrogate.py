@@ -146,8 +146,8 @@ class SurrogatePolicy:
     """Proposes gains for GainTuning, and answers: kind "surrogate" of a bundle.
 
     Arrays: those of NORMALISER, and those of WEIGHTS with the networks in the first dimension. Settings: gains (their
-    number), step (the action's bound), low, high (of what is tried, ln over the rule's, for each gain), curiosity (of
-    the scale, for trials), caution (of it, for the answer).
+    number), step (change of the log gains that an action of 1 makes), low, high (of what is tried, ln over the rule's,
+    for each gain), curiosity (of the scale, for trials), caution (of it, for the answer).
     """
 
     def __init__(self, bundle: AgentFile) -> None:
@@ -177,8 +177,8 @@ class SurrogatePolicy:
         else:
             self._known[np.repeat(mask, len(self._known) // len(mask))] = False
 
-    def act(self, observation: ArrayLike) -> Array:
-        """Return the change of the log gains to try, in the observation's shape.
+    def act(self, observation: ArrayLike) -> NDArray[np.float64]:
+        """Return the change of the log gains to try, in steps, in the observation's shape.
 
         Raises:
             PolicyError: If the observation is of another configuration, or holds NaN.
@@ -192,8 +192,8 @@ class SurrogatePolicy:
         chosen = self._least(memory, np.concatenate([chosen[:, None], self._around(chosen)], axis=1))
         return self._leave(chosen - incumbent, observation)
 
-    def answer(self, observation: ArrayLike) -> Array:
-        """Return the change of the log gains to the final choice: a trial's gains, or the rule's.
+    def answer(self, observation: ArrayLike) -> NDArray[np.float64]:
+        """Return the change of the log gains to the final choice, in steps: to a trial's gains, or the rule's.
 
         All axes of an environment get the same trial: that whose worst axis is best, of those that were not stopped. It
         is asked instead of `act`, with the observation after the last trial, and raises what that does.
@@ -267,10 +267,12 @@ class SurrogatePolicy:
         """Return candidates around gains of shape (machines, gains), within the range."""
         return np.asarray(np.clip(gains[:, None] + self._near, self._low, self._high))
 
-    def _leave(self, change: Array, observation: ArrayLike) -> Array:
+    def _leave(self, change: Array, observation: ArrayLike) -> NDArray[np.float64]:
         lanes = np.atleast_2d(observation)
-        action = np.clip(change, -self._step, self._step).astype(np.float32).reshape(len(lanes), -1)
-        return action[0] if np.ndim(observation) == 1 else action
+        # Not float32: times the step it is to be the change again, to the integer that was tried.
+        action = np.clip(change.astype(float), -self._step, self._step).reshape(len(lanes), -1) / self._step
+        found: NDArray[np.float64] = action[0] if np.ndim(observation) == 1 else action
+        return found
 
 
 def _pick(gains: Array, value: Array) -> Array:

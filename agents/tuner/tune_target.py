@@ -123,9 +123,10 @@ def tune_target(
     try:
         watched.warm_up(np.zeros(env.observation_space.shape or (), np.float32))
         with stopping(drives):
-            shown, observation = _make_trials(env, watched, show, margins, _step_of(policy.bundle.configuration))
+            share = _step_of(policy.bundle.configuration) / WIDEST
+            shown, observation = _make_trials(env, watched, show, margins, share)
             answer = watched.answer(observation)
-            wanted = None if answer is None else _flat(env.gains_of(answer))
+            wanted = None if answer is None else _flat(env.gains_of(share * answer))
             axes = target.axes_per_machine
             answers = np.array([_answer(shown, machine, axes, wanted) for machine in range(env.num_envs)])
             gains = np.stack([shown[answers[axis // axes]].gains[axis] for axis in range(target.num_axes)])
@@ -171,9 +172,16 @@ def _make_trials(
     policy: GuardedPolicy,
     show: Callable[[TrialShown], None],
     margins: KeptMargins | None,
-    step: float,
+    share: float,
 ) -> tuple[list[TrialShown], Floats]:
     """Return all trials of an episode, the baseline rule's first, and what the policy sees at its end.
+
+    Args:
+        env: The environment.
+        policy: What proposes.
+        show: Called after every trial.
+        margins: What gains must keep.
+        share: The step of the policy's training over that of the environment.
 
     Raises:
         RuntimeError: If a drive cannot be cleared any more.
@@ -191,11 +199,11 @@ def _make_trials(
     show(shown[-1])
     known = find_device(env.config.device).gains
     for number in range(1, env.config.trials + 1):
-        action = np.clip(policy.act(observation), -step, step)
+        action = share * np.clip(policy.act(observation), -1.0, 1.0)
         proposed = _flat(env.gains_of(action))
         if margins is not None:
             change = known.change(margins.lowered(proposed), _flat(info["gains"]), known.columns(env.config.chosen))
-            action = change.reshape(machines, -1)
+            action = change.reshape(machines, -1) / WIDEST
         before = info["measured"]
         observation, _, terminated, _, info = env.step(action)
         tried = _flat(info["trial_gains"])

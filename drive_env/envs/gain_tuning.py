@@ -40,6 +40,8 @@ from drive_env.trials.score import RobustScore
 
 Integers = NDArray[np.int64]
 
+JUDGED = ("incumbent", "trial")
+
 
 @dataclass(frozen=True)
 class GainTuningConfig:
@@ -49,15 +51,19 @@ class GainTuningConfig:
     gains: Which gains the action changes, of the device's: those of the TMCM-1636 are torque_p, torque_i, velocity_p,
         velocity_i, position_p. None is those of the velocity and the position loop.
     trials: Of an episode.
-    step: Largest change of a gain's logarithm; the reach of gains, 10.4, is the most that makes sense.
+    step: Change of a gain's logarithm that an action of 1 makes; the reach of gains, 10.4, is the most that makes
+        sense.
     distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set, and of a
         load of your own the default machine in every episode, as {"parameters": {}} is.
     stage: Of its curriculum, 0...1.
-    abort_cost: What a stopped trial takes from the reward.
+    abort_cost: What a stopped trial of other gains than the incumbent's takes from the reward.
     waveform: Points of the last move's error that are observed besides, 0...250.
     privileged: Whether the observation is a dict with the true machine beside it, for asymmetric critics.
     travel: How far the rotors may turn from where they are, with the sign [rev]; None is the load's own.
     dynamics: What the loops must keep for the robust cost: soft, standard, stiff, or numbers as 45/8/2.0.
+    judged: "incumbent": actions change the incumbent's gains, and what these improve is rewarded; "trial": actions
+        change the rule's gains, and what each trial's own are worth is rewarded, 0...1.
+    half: Robust cost of a trial that is worth 0.5.
     num_threads: As `EmulatedDrives` takes it.
     """
 
@@ -76,6 +82,8 @@ class GainTuningConfig:
     travel: float | None = None
     num_threads: int | None = None
     dynamics: str = DEFAULT
+    judged: str = "incumbent"
+    half: float = 3.0
 
     def __post_init__(self) -> None:
         known = find_device(self.device).gains
@@ -89,6 +97,7 @@ class GainTuningConfig:
         if not self.chosen or len(set(self.chosen)) != len(self.chosen):
             raise ValueError(f"gains must be different ones of {', '.join(known.searched)}, not {self.gains}")
         find_dynamics(self.dynamics)
+        check_choice("judged", self.judged, JUDGED)
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.step < math.inf:
@@ -99,6 +108,8 @@ class GainTuningConfig:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
         if not 0.0 <= self.abort_cost < math.inf:
             raise ValueError(f"abort_cost must be 0 or more, not {self.abort_cost:g}")
+        if not 0.0 < self.half < math.inf:
+            raise ValueError(f"half must be finite and more than 0, not {self.half:g}")
         if self.travel is not None and not 0.0 < abs(self.travel) < math.inf:
             raise ValueError(f"travel must be finite and not 0, not {self.travel:g} rev")
 
@@ -120,11 +131,11 @@ class GainTuning(VectorEnvironment):
     included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
 
     Action, float32, for each axis of the machine, with G gains of the configuration; gains are rounded and stay within
-    the device's range; the bounds are the configuration's `step`:
+    the device's range:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
-    | 0 ... G-1 | ln of the gain over the incumbent's, in the configuration's order | 1 | -0.7 | 0.7 |
+    | 0 ... G-1 | ln of the gain over the incumbent's or the rule's (`judged`) | `step` | -1 | 1 |
 
     Observation, float32, for each axis of the machine, with W points of waveform:
 
@@ -165,15 +176,19 @@ class GainTuning(VectorEnvironment):
     over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
     The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a
-    discount of 1, less `abort_cost` for a trial that was stopped. On given drives, and of the settings of a load
-    detection, there is no robust cost; it is that of ln J by measured terms. The episode is `truncated` when its
-    trials are used up, `terminated` if a given drive cannot be cleared.
+    discount of 1, less `abort_cost` for a trial of other gains than the incumbent's that was stopped. On given drives,
+    and of the settings of a load detection, there is no robust cost; it is that of ln J by measured terms. The episode
+    is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
 
-    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
-    the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
-    this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, and "faults",
-    names of the trial's emergencies, tuples, of the rule's trial at the begin as well; "parameters", the true machine.
-    Given drives have no robust cost.
+    With `judged` = "trial" it is what the trial's gains are worth instead, 1 / (1 + (robust cost / `half`)^2), which is
+    hardly anything where the constraints are broken (30 and more) or a trial is stopped. Nothing is earned or lost
+    besides: what a trial is good for later, it must earn later.
+
+    `info`: "reward_terms" ("tuning", "abort"; or "worth"); "gains", the incumbent's, (environments, axes, count) raw
+    integers in the order of the device's set; "measured", its J by measured terms, and "robust_cost";
+    "trial_robust_cost", that of this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was
+    stopped, and "faults", names of the trial's emergencies, tuples, of the rule's trial at the begin as well;
+    "parameters", the true machine. Given drives have no robust cost.
 
     Args:
         num_envs: Number of environments.
@@ -282,7 +297,7 @@ class GainTuning(VectorEnvironment):
         if c.privileged:
             true = Box(-RATIO_MAX, RATIO_MAX, (len(self._defaults),), np.float32)
             observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
-        return observation, Box(-c.step, c.step, (self._axes * len(c.chosen),), np.float32)
+        return observation, Box(-1.0, 1.0, (self._axes * len(c.chosen),), np.float32)
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
@@ -363,6 +378,7 @@ class GainTuning(VectorEnvironment):
         if not active.any():  # the step between the end of all episodes and their autoreset
             return self._observe(), zero, np.zeros(n, bool), np.ones(n, bool), self._told()
         gains = self._changed(action)
+        other = (gains != self._best).reshape(n, -1).any(axis=1)
         tried = self._try(gains, active)
         measured = self._measure(gains, tried)
         better = active & (measured < self._measured)
@@ -373,7 +389,11 @@ class GainTuning(VectorEnvironment):
             self._robust_cost = np.where(better, trial_robust_cost, self._robust_cost)
         after = self._measured if self._score is None else self._robust_cost
         aborted = active & self._stopped(tried)
-        terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * aborted}
+        if self.config.judged == "trial":
+            cost = measured if trial_robust_cost is None else trial_robust_cost
+            terms = {"worth": active / (1.0 + (cost / self.config.half) ** 2)}
+        else:
+            terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * (aborted & other)}
         self._left[active] -= 1
         info = self._told()
         info["reward_terms"] = terms
@@ -384,16 +404,17 @@ class GainTuning(VectorEnvironment):
         if trial_robust_cost is not None:
             info["trial_robust_cost"] = trial_robust_cost
         dead = zero.astype(bool) if self._owned else active & self._dead()
-        return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
+        return self._observe(), np.asarray(sum(terms.values())), dead, self._left <= 0, info
 
     def gains_of(self, action: ArrayLike) -> Integers:
         """Return the gains of an action, without trying them: (environments, axes, count), as `info["gains"]`."""
         return self._changed(action).reshape(self.num_envs, self._axes, -1)
 
     def _changed(self, action: ArrayLike) -> Integers:
-        step = self.config.step
-        change = np.nan_to_num(np.clip(np.asarray(action, float), -step, step)).reshape(-1, len(self._columns))
-        return self._device.gains.changed(self._best, change, self._columns, self._highest)
+        change = self.config.step * np.nan_to_num(np.clip(np.asarray(action, float), -1.0, 1.0))
+        change = change.reshape(-1, len(self._columns))
+        since = self._best if self.config.judged == "incumbent" else self._rule
+        return self._device.gains.changed(since, change, self._columns, self._highest)
 
     # --- a trial --------------------------------------------------------------------------------------------------
     def _begin_trial(self, mask: Mask) -> None:

@@ -49,6 +49,45 @@ def _scheduling(about: str, solved: float, **options: Any) -> SuiteTask:
     return SuiteTask("ServoDrive/GainScheduling-v0", about, 200, solved, own | options)
 
 
+def _tuning(about: str, solved: float, load: str, laws: Any, gains: tuple[str, ...], **options: Any) -> SuiteTask:
+    """Return a task of GainTuning: ten trials, each rewarded by what its own gains are worth."""
+    own = {"load": load, "distributions": laws, "gains": gains, "trials": 10, "dynamics": "standard"}
+    return SuiteTask("ServoDrive/GainTuning-v0", about, 10, solved, own | {"judged": "trial"} | options)
+
+
+def _log(low: float, high: float) -> dict[str, Any]:
+    """Return the law of a parameter between these multiples of its default."""
+    return {"law": "loguniform", "low": low, "high": high, "of": "default"}
+
+
+def _even(low: float, high: float) -> dict[str, Any]:
+    return _log(low, high) | {"law": "uniform"}
+
+
+CASCADE = ("velocity_p", "velocity_i", "position_p")
+# A geared joint of 16 times the inertia, stiffness and friction, for motors of 2 N m; what amplifiers on mains lack.
+LARGE_JOINT = {
+    "include": ["geared_joint", "servo_mains"],
+    "parameters": {
+        "load.inertia": _log(4.8, 64.0), "load.stiffness": _log(6.4, 40.0), "load.damping": _log(8.0, 32.0),
+        "load.coulomb": _even(0.0, 48.0), "load.breakaway": _even(16.0, 32.0), "load.viscous": _even(0.0, 80.0),
+        "stage.idle_current": False, "stage.supply_sinks": False,
+    },
+}  # fmt: skip
+# From hardly any disc to a large one: over a narrower range one set of values suits all. Steppers lack the others.
+ANY_DISC = {
+    "include": ["inertia", "stepper"],
+    "parameters": {
+        "load.inertia": _log(0.1, 40.0),
+        **dict.fromkeys((
+            "motor.L_d", "motor.L_q", "motor.cogging_torque", "motor.cogging_phase", "motor.commutation_offset",
+            "stage.adc_noise", "stage.adc_offset_a", "stage.adc_offset_b", "stage.adc_gain_error_a",
+            "stage.adc_gain_error_b", "stage.dead_time", "stage.dead_time_current", "stage.chopper_resistance",
+        ), False),
+    },
+}  # fmt: skip
+
+
 TASKS: dict[str, SuiteTask] = {
     "ServoDrive/TorqueTracking-v1": _tracking(
         "moves of a disc on an elastic shaft by torque alone: inertia, stiffness, friction and the bus' delays differ",
@@ -84,6 +123,19 @@ TASKS: dict[str, SuiteTask] = {
     ),
     "ServoDrive/KnownPayload-v1": _scheduling(
         "gains follow a payload that changes while an axis moves, and that is known", 0.80, payload_observed=True,
+    ),
+    "ServoDrive/ServoTuning-v1": _tuning(
+        "gains of a servo on an elastic shaft: as fast as each machine's margins allow, in ten trials",
+        0.80, "two_mass", "two_mass", CASCADE, step=3.0, half=3.0,
+    ),
+    "ServoDrive/AmplifierTuning-v1": _tuning(
+        "gains of a servo amplifier on mains for a geared joint with play, from a new gear to a worn one",
+        0.80, "geared_joint", LARGE_JOINT, CASCADE, device="tgz_d", motor="am3033_e", step=3.0, half=3.0,
+    ),
+    "ServoDrive/StepperTuning-v1": _tuning(
+        "the PID that closes a stepper's position loop, on any disc from a tenth to forty times the usual one",
+        0.80, "inertia", ANY_DISC, ("pid_v0_p", "pid_v0_i", "pid_v0_d"), device="tmcm3313", motor="qsh4218_51",
+        step=5.0, half=1.0,
     ),
 }  # fmt: skip
 
