@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 # The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
 # bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.
 BANDWIDTHS = np.geomspace(0.01, 1.2, 20)
-INTEGRATIONS = (1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
+INTEGRATIONS = (0.8, 1.1, 1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
 POSITIONS = (0.08, 0.12, 0.18, 0.25, 0.33, 0.42, 0.55, 0.75, 1.0)
 TORQUES = (1.0, 0.6, 0.36)
 LEAST_TORQUE = 0.3  # below it the current loop is a low-pass of the velocity loop, which no engineer signs
@@ -48,7 +48,7 @@ CURRENT_CROSSOVER, CURRENT_LAG = 0.52, 1.5
 # promises nothing by itself, but passes on less of what an encoder's counts make of the velocity.
 EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
-STEPS = (1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
+STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
@@ -238,9 +238,11 @@ def _whole(device: Device, rows: Floats) -> Integers:
 
 
 def _promise(device: Device, gains: Integers) -> Floats:
-    """Return ln J of gains without noise and resonances, up to a constant, (n, sets): less is better."""
-    _, _, velocity_p, velocity_i, position_p = (np.log(gains[..., k]) for k in cascade_columns(device))
-    return np.asarray(-0.8 * position_p - 0.4 * (velocity_p + velocity_i))
+    """Return ln J of gains without noise and resonances, over 0.4 and up to a constant, (n, sets): less is better.
+
+    Their product is what a load step leaves, and what dry friction leaves of a move.
+    """
+    return -np.log(gains[..., list(cascade_columns(device)[2:])]).sum(axis=-1)
 
 
 def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:
