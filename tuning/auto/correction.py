@@ -14,7 +14,7 @@ from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.design import design_axes
-from tuning.auto.loop_margins import MEASURED, measure, measured_axis
+from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
 from tuning.auto.moves import load, show, step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.stages import RecordedGains
@@ -106,7 +106,7 @@ def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
     """Return the cost of verified gains by J and margins, of each machine its worst axis, (num_axes,)."""
     # What was not measured is worth less than what is known to keep the dynamics.
     slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
-    slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot, 1.0) / bench.dynamics.overshoot)
+    slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot - OVERSHOOT_ERROR, 1.0) / bench.dynamics.overshoot)
     cost = robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack)
     cost = np.where(recorded.failed != "", 2.0 * TRIP + recorded.swing, cost)
     per_machine = bench.target.axes_per_machine

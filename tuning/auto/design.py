@@ -242,7 +242,7 @@ def _promise(device: Device, gains: Integers) -> Floats:
 
     Their product is what a load step leaves, and what dry friction leaves of a move.
     """
-    return -np.log(gains[..., list(cascade_columns(device)[2:])]).sum(axis=-1)
+    return np.asarray(-np.log(gains[..., list(cascade_columns(device)[2:])]).sum(axis=-1))
 
 
 def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:
