@@ -23,6 +23,7 @@ from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_c
 from drive_env.trials.score import robust_cost
 from tuning.auto.loop_margins import measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models
+from tuning.auto.proving import RESTLESS
 from tuning.auto.twin import WORLDS, Known, Twins, known_of, least_gains
 
 if TYPE_CHECKING:
@@ -72,13 +73,13 @@ def design_axes(
         say: Called with the share done.
         recorded: The present gains, and what was measured with them; nothing by default.
         dynamics: What the loops must keep; those of the run by default.
-        most: The greatest velocity P with which an axis may rest, raw, (num_axes,); infinite by default.
+        most: The greatest velocity P that an axis may have, raw, (num_axes,); infinite by default.
     """
     target, axes = bench.target, np.flatnonzero(where).tolist()
     gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
     if not axes:
         return gains, cost, present
-    known = [_known(bench, basis, recorded, k, restless=most is not None and bool(np.isfinite(most[k]))) for k in axes]
+    known = [_known(bench, basis, recorded, k) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
     # The response of a linked axis was measured without the other one; what both say is in their model.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
@@ -97,7 +98,7 @@ def design_axes(
     return gains, cost, present
 
 
-def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
+def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
     """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
 
     What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
@@ -110,6 +111,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
         return known_of(rigid, found, reach)
     plant, found = fitted_plant(basis.identified, recorded, k)
     known = known_of(plant, found, reach)
+    restless = recorded is not None and recorded.swing[k] > RESTLESS
     return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known
 
 
