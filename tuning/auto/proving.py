@@ -276,8 +276,8 @@ class ProvingGround:
         """Return how far axes go beyond a step of their set-point in csp, there and back, over the step, (num_axes,).
 
         The step is STEP_SIZE counts of an encoder of 4096, or of a coarser one of the motor: small enough for the loops
-        to stay linear, and large enough for friction and noise not to matter. Those there and back at first do not count: they let go
-        of what dry friction has kept in the integrator since the last move. Linked axes step together.
+        to stay linear, and large enough for friction and noise not to matter. A first one, there and back, does not
+        count: by it the integrator lets go of what dry friction has kept in it. Linked axes step together.
         """
         drives, where = self.target.drives, self.target.together(where)
         self._fallback.begin()
