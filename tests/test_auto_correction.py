@@ -42,7 +42,7 @@ class Ground:
         self.tried.append(gains[:, VELOCITY_P].tolist())
         n = len(gains)
         reason = tuple("it shook" if self.fails(p) else "" for p in gains[:, VELOCITY_P])
-        return Proof(np.ones(n), reason)
+        return Proof(np.ones(n), reason, np.array(reason) != "")
 
 
 def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=None, overshoot=None, axes=1,
@@ -174,7 +174,8 @@ def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless,
     basis_ = SimpleNamespace(
         trial_reach=lambda bench: np.array([2.0]), identified=SimpleNamespace(known=lambda k: ("plant", "found"))
     )
-    found = design._known(bench, basis_, None, 0, restless)
+    swing = np.array([1.01 * RESTLESS if restless else RESTLESS])
+    found = design._known(bench, basis_, recorded([FIRST], swing=swing), 0)
     assert (found.coulomb, found.viscous, found.reach) == (pytest.approx(0.5 * share), 0.01, 2.0)
 
 
@@ -208,7 +209,7 @@ def test_a_design_that_failed_its_trial_bounds_the_next_one(monkeypatch):
         monkeypatch, [1100, 980], slack=lambda p: -0.1 if p == 1000 else 0.1, fails=lambda p: p > 1000
     )
     assert bench.ground.tried == [[1100], [980]] and verified == [[1000], [980]]
-    assert bench.most == [[np.inf], [0.9 * 1100]] and found.gains[0, VELOCITY_P] == 980
+    assert bench.most == [[np.inf], [1048]] and found.gains[0, VELOCITY_P] == 980, "halfway to what passed"
 
 
 def test_a_correction_that_does_not_rest_bounds_the_next_one_although_it_is_not_kept(monkeypatch):
@@ -220,7 +221,7 @@ def test_a_correction_that_does_not_rest_bounds_the_next_one_although_it_is_not_
         failed=lambda p: "it swung" if p > 1100 else "",
     )
     assert verified == [[1000], [1200], [500]] and found.gains[0, VELOCITY_P] == 500
-    assert bench.most == [[np.inf], [pytest.approx(np.floor(1200 * 0.9 / np.sqrt(2.0)))]]
+    assert bench.most == [[np.inf], [0.9 * 1200]]
 
 
 def test_an_axis_that_no_correction_helps_is_rejected_with_its_reason(monkeypatch):
@@ -272,7 +273,15 @@ def test_what_gains_fall_short_of_is_told_in_words(known, text):
 @pytest.mark.parametrize(("swing", "share"), [(0.0, np.inf), (RESTLESS, np.inf), (1.01 * RESTLESS, 0.895),
                                               (2.25 * RESTLESS, 0.6), (9.0 * RESTLESS, 0.5)])  # fmt: skip
 def test_what_does_not_rest_gets_less_velocity_p_by_the_root_of_what_it_swings(swing, share):
-    assert _most_velocity_p(DEVICE, recorded([FIRST], swing=np.array([swing])), 0) == pytest.approx(1000.0 * share)
+    shook = recorded([FIRST], swing=np.array([swing]))
+    assert _most_velocity_p(bench_of(), None, shook) == pytest.approx([1000.0 * share])
+    assert _most_velocity_p(bench_of(), shook, shook) == pytest.approx([1000.0 * share]), "these do not rest either"
+
+
+@pytest.mark.parametrize(("rested", "most"), [(810, 900), (640, 800), (100, 500), (1200, 900)])
+def test_what_does_not_rest_goes_halfway_to_the_gains_that_do(rested, most):
+    calm, shook = recorded([gains_of(rested)]), recorded([FIRST], swing=np.array([1.0]))
+    assert _most_velocity_p(bench_of(), calm, shook) == pytest.approx([most])
 
 
 @pytest.mark.parametrize("measured", [True, False])

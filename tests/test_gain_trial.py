@@ -138,11 +138,11 @@ def test_a_swing_at_rest_is_about_its_trend_and_of_the_last_45_ms_before_the_loa
 
 # --- identification -------------------------------------------------------------------------------------------------
 def there_and_back(share=1.0):
-    """Angle and speed of a triangular move and back, of a speed that has its peak at 40 rad/s."""
+    """Angle and speed of a smooth move and back, of a speed that has its peak at 40 rad/s."""
     t = np.arange(TRIAL)
-    speed = np.interp(t, [0, 30, 60, TRIAL], [0.0, 40.0, 0.0, 0.0]) * share
+    speed = 40.0 * np.sin(np.pi * np.minimum(t / 60.0, 1.0)) ** 2 * share
     speed = np.concatenate([speed, -speed])[:, None]
-    return np.cumsum(speed, axis=0) * CYCLE, speed
+    return np.cumsum(0.5 * (speed + np.roll(speed, 1, axis=0)), axis=0) * CYCLE, speed
 
 
 @pytest.mark.parametrize("offset", [0.3, -0.3, 0.0])
@@ -150,12 +150,25 @@ def test_what_a_machine_takes_is_found_from_its_own_signals(offset):
     """i = J alpha / K_t + coulomb sign(omega) + viscous omega + offset: the fit gets back what made the current."""
     angle, speed = there_and_back()
     J, coulomb, viscous = 4.0 * MOTOR.inertia, 0.5, 0.01
-    acceleration = np.diff(speed, axis=0, prepend=0.0) / CYCLE
+    acceleration = np.gradient(speed, CYCLE, axis=0)
     current = J / MOTOR.torque_constant * acceleration + coulomb * np.clip(speed, -1, 1) + viscous * speed + offset
     found = momentum_balance(angle, speed, current, MOTOR)
     np.testing.assert_allclose(found.inertia, J, rtol=0.01)
     np.testing.assert_allclose([found.coulomb[0], found.viscous[0]], [coulomb, viscous], rtol=0.02)
     np.testing.assert_allclose(found.offset, offset, atol=0.01)
+
+
+def test_the_lag_of_a_filtered_speed_is_not_taken_for_friction_of_an_axis_that_swings():
+    t = np.arange(2 * TRIAL)[:, None] * CYCLE
+    speed = 40.0 * np.exp(-3.0 * t) * np.cos(26.0 * t)
+    angle = np.cumsum(0.5 * (speed + np.roll(speed, 1, axis=0)), axis=0) * CYCLE
+    J, coulomb, viscous = 16.0 * MOTOR.inertia, 0.2, 0.01
+    acceleration = np.gradient(speed, CYCLE, axis=0)
+    current = J / MOTOR.torque_constant * acceleration + coulomb * np.clip(speed, -1, 1) + viscous * speed
+    late = np.roll(speed, 2, axis=0)
+    late[:2] = speed[0]
+    found = momentum_balance(angle, late, current, MOTOR)
+    np.testing.assert_allclose([found.coulomb[0], found.viscous[0]], [coulomb, viscous], rtol=0.1)
 
 
 def test_an_axis_that_did_not_move_has_its_rotors_inertia_and_no_friction_below_zero():
@@ -219,7 +232,7 @@ def test_what_dry_friction_holds_at_rest_is_no_part_of_the_motion():
     """An integrator leaves it the current that the move ended with, up to its own: taken for a load it was 1.4 J."""
     angle, speed = there_and_back()
     J, coulomb = 4.0 * MOTOR.inertia, 0.5
-    acceleration = np.diff(speed, axis=0, prepend=0.0) / CYCLE
+    acceleration = np.gradient(speed, CYCLE, axis=0)
     current = J / MOTOR.torque_constant * acceleration + coulomb * np.clip(speed, -1, 1)
     current[100:TRIAL] -= 0.3
     current[TRIAL + 100 :] += 0.25

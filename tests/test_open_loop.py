@@ -675,7 +675,7 @@ def test_a_trial_asks_for_what_its_probe_holds_of_a_torque_that_pulls_at_once(ta
     assert share == pytest.approx(min(max(free, 0.15), 0.4))
 
 
-def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identified):
+def test_what_is_balanced_is_the_torque_of_the_load_angle(identified):
     """Half a period after what the encoder says, the lag is 30 increments less the way of a period of 0.2 ms."""
     _, calls, _ = identified(([1e-6, 1e-6], [0.0, 0.0]))
     angle, speed, current, inertia, moving = calls[0]
@@ -685,9 +685,9 @@ def test_what_is_balanced_is_the_torque_of_the_load_angle_by_trapezoids(identifi
     assert inertia is None and angle.shape == (2 * TRIAL, 2)
     held = holding_torque(STEPPER_MOTOR, amplitude(STEPPER, np.array([100, 200])))
     age = 1.0 / STEPPER.velocity_rate
-    for row, sign, rates in ((40, 1, (80e3, 78e3)), (TRIAL + 40, -1, (-80e3, -78e3))):
-        torque = [held * np.sin(50 * to_rad * (sign * 30.0 - rate * np.array([1.0, 0.5]) * age)) for rate in rates]
-        np.testing.assert_allclose(current[row], 0.5 * (torque[0] + torque[1]) / STEPPER_MOTOR.torque_constant)
+    for row, sign, rate in ((40, 1, 80e3), (TRIAL + 40, -1, -80e3)):
+        torque = held * np.sin(50 * to_rad * (sign * 30.0 - rate * np.array([1.0, 0.5]) * age))
+        np.testing.assert_allclose(current[row], torque / STEPPER_MOTOR.torque_constant)
     # 2 n 10^3 increments/s exceed 1 rad/s, 8,149 of them, from n = 5 on; at rest friction holds what it likes.
     assert moving[:111, 0].all() and not moving[111 : TRIAL - 5, 0].any()
     assert moving[TRIAL - 5 : TRIAL + 111, 0].all()

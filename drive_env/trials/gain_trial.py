@@ -333,25 +333,29 @@ def momentum_balance(
 ) -> Identified:
     """Fit i = (J domega/dt) / K_t + coulomb sign(omega) + viscous omega + offset, integrated once over time.
 
-    The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own.
+    The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own. The
+    momentum is by the angle, and the impulse by trapezoids up to its samples: what lags, as a filtered speed does,
+    passes for friction on an axis that swings.
     With an inertia that is known already [kg m^2], (num_axes,), the viscous friction is the motor's, and dry friction
     alone is fitted: in a short move the two look alike. `moving`, as long as `speed`, tells the samples that count,
     all by default: at rest dry friction holds what it likes up to its own, which is no constant load.
     """
     sign = np.clip(speed / STANDSTILL, -1.0, 1.0)
+    rate = np.gradient(angle, CYCLE, axis=0)
+    sign, current = (np.concatenate([row[:1], 0.5 * (row[1:] + row[:-1])]) for row in (sign, current))
     samples, axes = speed.shape
     t = np.broadcast_to((np.arange(samples) * CYCLE)[:, None], (samples, axes))
     if moving is not None:
         sign, current = np.where(moving, sign, 0.0), np.where(moving, current, 0.0)
         t = np.cumsum(moving, axis=0) * CYCLE
     columns = np.stack(
-        [speed, np.cumsum(sign, axis=0) * CYCLE, angle, t,
+        [rate, np.cumsum(sign, axis=0) * CYCLE, angle, t,
          np.ones((samples, axes))],
         axis=-1,
     ).transpose(1, 0, 2)  # fmt: skip
     impulse = np.cumsum(current, axis=0).T * CYCLE
     if inertia is not None:
-        impulse = impulse - ((inertia * speed + motor.viscous * angle) / motor.torque_constant).T
+        impulse = impulse - ((inertia * rate + motor.viscous * angle) / motor.torque_constant).T
         columns[:, :, [0, 2]] = 0.0
     scale = np.maximum(np.sqrt(np.mean(columns**2, axis=1, keepdims=True)), 1e-12)
     X = columns / scale

@@ -389,8 +389,6 @@ class OpenLoopTrials(Trials):
         lag -= np.gradient(wrapped(demand - origin) / move.increments, axis=0) / CYCLE * encoder_age(device_of(drives))
         # The rotor's angle in the field is the torque that it takes; as a current of the motor's torque constant.
         current = held * np.sin(motor.n_p * lag) / motor.torque_constant
-        # The rotor swings a hundred times a second: the impulse is summed by trapezoids, up to the speed's own sample.
-        current[1:] = 0.5 * (current[1:] + current[:-1])
         speed = np.gradient(angle, CYCLE, axis=0)
         moving = samples_in_motion(speed, TURNING_BACK)
         found = momentum_balance(angle, speed, current, motor, moving=moving)

@@ -14,13 +14,13 @@ from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.design import design_axes
-from tuning.auto.loop_margins import MEASURED, measure, measured_axis
+from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
 from tuning.auto.moves import load, show, step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.stages import RecordedGains
+from tuning.auto.trying import between
 
 if TYPE_CHECKING:
-    from drive_env.devices import Device
     from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
@@ -37,12 +37,20 @@ LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i i
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
 
 
-def _most_velocity_p(device: Device, recorded: RecordedGains | None, k: int) -> float:
-    """Return the greatest velocity P of an axis, less than the present where it does not rest; else infinite."""
-    if recorded is None or recorded.swing[k] <= RESTLESS:
-        return np.inf
-    factor = np.clip(CALMER * np.sqrt(RESTLESS / recorded.swing[k]), LEAST_CALMER, CALMER)
-    return float(max(np.floor(factor * recorded.gains[k, cascade_columns(device)[2]]), 1.0))
+def _most_velocity_p(bench: AutoBench, best: RecordedGains | None, recorded: RecordedGains) -> Floats:
+    """Return the greatest velocity P of axes, less than the present where they do not rest, else infinite.
+
+    Halfway to gains that rest, where these are known: what shakes in the play of a gear is no noise.
+    """
+    known = bench.target.device.gains
+    present = recorded.gains[:, cascade_columns(bench.target.device)[2]]
+    with np.errstate(divide="ignore"):
+        factor = np.clip(CALMER * np.sqrt(RESTLESS / recorded.swing), LEAST_CALMER, CALMER)
+    most = np.maximum(np.floor(factor * present), 1.0)
+    if best is not None:
+        halfway = np.minimum(between(known, best.gains, recorded.gains), np.floor(CALMER * present))
+        most = np.where(best.swing <= RESTLESS, np.maximum(most, halfway), most)
+    return np.where(recorded.swing > RESTLESS, most, np.inf)
 
 
 def correct(
@@ -63,16 +71,14 @@ def correct(
     recorded, changed = tried, bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
-    column = cascade_columns(bench.target.device)[2]
-    most = np.full(bench.target.num_axes, np.inf)  # velocity P, by whatever did not rest or pass, kept or not
+    most = tried.most  # velocity P, by whatever did not rest or was stopped, kept or not
     for number in range(CORRECTIONS + 1):
         if changed.any():
             say("verifying gains on the drives", 0.72 + 0.08 * number)
             recorded = step(bench, show(bench, recorded, changed), changed)
             recorded = measure(bench, basis, recorded, changed)
             recorded = load(bench, basis, recorded, target, changed)
-            shown = [_most_velocity_p(bench.target.device, recorded, k) for k in range(len(most))]
-            most = np.where(changed, np.minimum(most, shown), most)
+            most = np.where(changed, np.minimum(most, _most_velocity_p(bench, best, recorded)), most)
             if best is not None:
                 # What is no better than what it was to correct goes.
                 no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
@@ -92,9 +98,10 @@ def correct(
         if not changed.any():
             break
         tried_before.append(gains.copy())
-        recorded, passed = _try(bench, recorded, gains, changed, why)
-        most = np.where(changed & ~passed, np.minimum(most, np.floor(CALMER * gains[:, column])), most)
-        changed = passed
+        passed_before = recorded.gains
+        recorded, changed, stopped = _try(bench, recorded, gains, changed, why)
+        halfway = between(bench.target.device.gains, passed_before, gains)
+        most = np.where(stopped, np.minimum(most, halfway), most)
     final = recorded if best is None else best
     for k in map(int, np.flatnonzero(bench.going)):
         if final.failed[k]:
@@ -106,7 +113,7 @@ def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
     """Return the cost of verified gains by J and margins, of each machine its worst axis, (num_axes,)."""
     # What was not measured is worth less than what is known to keep the dynamics.
     slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
-    slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot, 1.0) / bench.dynamics.overshoot)
+    slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot - OVERSHOOT_ERROR, 1.0) / bench.dynamics.overshoot)
     cost = robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack)
     cost = np.where(recorded.failed != "", 2.0 * TRIP + recorded.swing, cost)
     per_machine = bench.target.axes_per_machine
@@ -174,14 +181,14 @@ def _lowered(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, mo
 
 def _try(
     bench: AutoBench, recorded: RecordedGains, gains: Integers, where: Mask, why: Sequence[str]
-) -> tuple[RecordedGains, Mask]:
-    """Try corrected gains; return what is known with those that passed, and which axes have them."""
+) -> tuple[RecordedGains, Mask, Mask]:
+    """Try corrected gains; return what is known with those that passed, which axes have them, which were stopped."""
     try:
         with bench.spending(bench.target.together(where)):
             proof = bench.ground.run(gains, where)
     except SafetyError as error:
         bench.note(where, f"the envelope stopped the trial of corrected gains: {error}")
-        return recorded, np.zeros_like(where)
+        return recorded, np.zeros_like(where), where
     for k in map(int, np.flatnonzero(where & ~proof.passed)):
         bench.journals[k].note(f"corrected gains failed their trial: {proof.reason[k]}")
         bench.journals[k].correct(recorded.gains[k], gains[k], why[k], f"failed their trial: {proof.reason[k]}")
@@ -194,4 +201,4 @@ def _try(
         RecordedGains.only(gains), proof=proof.cost, verified=recorded.verified, unseen=recorded.unseen,
         loaded=recorded.loaded,
     )  # fmt: skip
-    return recorded.mixed(fresh, passed), passed
+    return recorded.mixed(fresh, passed), passed, where & proof.stopped

@@ -23,6 +23,7 @@ from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_c
 from drive_env.trials.score import robust_cost
 from tuning.auto.loop_margins import measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models
+from tuning.auto.proving import RESTLESS
 from tuning.auto.twin import WORLDS, Known, Twins, known_of, least_gains
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 # The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
 # bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.
 BANDWIDTHS = np.geomspace(0.01, 1.2, 20)
-INTEGRATIONS = (1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
+INTEGRATIONS = (0.8, 1.1, 1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
 POSITIONS = (0.08, 0.12, 0.18, 0.25, 0.33, 0.42, 0.55, 0.75, 1.0)
 TORQUES = (1.0, 0.6, 0.36)
 LEAST_TORQUE = 0.3  # below it the current loop is a low-pass of the velocity loop, which no engineer signs
@@ -48,7 +49,7 @@ CURRENT_CROSSOVER, CURRENT_LAG = 0.52, 1.5
 # promises nothing by itself, but passes on less of what an encoder's counts make of the velocity.
 EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
-STEPS = (1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
+STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
@@ -72,13 +73,13 @@ def design_axes(
         say: Called with the share done.
         recorded: The present gains, and what was measured with them; nothing by default.
         dynamics: What the loops must keep; those of the run by default.
-        most: The greatest velocity P with which an axis may rest, raw, (num_axes,); infinite by default.
+        most: The greatest velocity P that an axis may have, raw, (num_axes,); infinite by default.
     """
     target, axes = bench.target, np.flatnonzero(where).tolist()
     gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
     if not axes:
         return gains, cost, present
-    known = [_known(bench, basis, recorded, k, restless=most is not None and bool(np.isfinite(most[k]))) for k in axes]
+    known = [_known(bench, basis, recorded, k) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
     # The response of a linked axis was measured without the other one; what both say is in their model.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
@@ -97,7 +98,7 @@ def design_axes(
     return gains, cost, present
 
 
-def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int, restless: bool) -> Known:
+def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
     """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
 
     What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
@@ -110,6 +111,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
         return known_of(rigid, found, reach)
     plant, found = fitted_plant(basis.identified, recorded, k)
     known = known_of(plant, found, reach)
+    restless = recorded is not None and recorded.swing[k] > RESTLESS
     return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known
 
 
@@ -238,9 +240,11 @@ def _whole(device: Device, rows: Floats) -> Integers:
 
 
 def _promise(device: Device, gains: Integers) -> Floats:
-    """Return ln J of gains without noise and resonances, up to a constant, (n, sets): less is better."""
-    _, _, velocity_p, velocity_i, position_p = (np.log(gains[..., k]) for k in cascade_columns(device))
-    return np.asarray(-0.8 * position_p - 0.4 * (velocity_p + velocity_i))
+    """Return ln J of gains without noise and resonances, over 0.4 and up to a constant, (n, sets): less is better.
+
+    Their product is what a load step leaves, and what dry friction leaves of a move.
+    """
+    return np.asarray(-np.log(gains[..., list(cascade_columns(device)[2:])]).sum(axis=-1))
 
 
 def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:

@@ -89,7 +89,12 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         elif seen < LEAST_LINES:
             why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
             unseen[k] = "; ".join([why, *response.notes[k]])
-    response = response if recorded.response is None else recorded.response.replaced(response, going)
+    if recorded.response is not None:
+        # What was measured with earlier gains tells of these, too, where nothing could be measured with them.
+        earlier = [measured_axis(bench, basis, recorded, k) is not None for k in range(len(going))]
+        kept = going & (unseen != "") & np.array(earlier)
+        unseen[kept] = ""
+        response = recorded.response.replaced(response, going & ~kept)
     recorded = _with_slack(bench, basis, replace(recorded, response=response, unseen=unseen), going)
     bench.recover_faults(faults, "its frequency response was measured")
     return recorded

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.target import Target
 
-STEP_TIME = 0.6  # s of drive time for a step of the set-point
+STEP_TIME = 1.0  # s of drive time for a step of the set-point
 CALMING = 0.5  # s after a load step that did not end, with gains that hold
 BY_COMPARISON = "by a move, which was better than with the new ones: the gains before are kept"
 

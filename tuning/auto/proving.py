@@ -76,10 +76,14 @@ OBJECTS = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]  # r
 
 
 class Proof(NamedTuple):
-    """The results of a trial: J by measured terms, (num_axes,), and why each axis does not pass, "" if it does."""
+    """The results of a trial: J by measured terms, (num_axes,), and why each axis does not pass, "" if it does.
+
+    stopped: Axes that oscillated or went into fault, (num_axes,).
+    """
 
     cost: Floats
     reason: tuple[str, ...]
+    stopped: Mask
 
     @property
     def passed(self) -> Mask:
@@ -216,12 +220,14 @@ class ProvingGround:
             if where.sum() <= lanes:
                 return self._refused(str(error), where)
         cost, reason = np.full(len(where), TRIP), np.full(len(where), "", object)
+        stopped = np.zeros(len(where), bool)
         machines = np.arange(len(where)) // lanes
         for machine in np.unique(machines[where]):
             one = where & (machines == machine)
             proof = self.run(gains, one)
             cost, reason = np.where(one, proof.cost, cost), np.where(one, proof.reason, reason)
-        return Proof(cost, tuple(reason))
+            stopped |= proof.stopped
+        return Proof(cost, tuple(reason), stopped)
 
     def show(self, gains: Integers, where: Mask) -> Shown:
         """Record one move with gains; an axis that oscillates or goes into fault gets stable gains within 50 ms.
@@ -270,7 +276,8 @@ class ProvingGround:
         """Return how far axes go beyond a step of their set-point in csp, there and back, over the step, (num_axes,).
 
         The step is STEP_SIZE counts of an encoder of 4096, or of a coarser one of the motor: small enough for the loops
-        to stay linear, and large enough for friction and noise not to matter. Linked axes step together.
+        to stay linear, and large enough for friction and noise not to matter. A first one, there and back, does not
+        count: by it the integrator lets go of what dry friction has kept in it. Linked axes step together.
         """
         drives, where = self.target.drives, self.target.together(where)
         self._fallback.begin()
@@ -283,7 +290,7 @@ class ProvingGround:
         worst = np.zeros(self.target.num_axes)
         try:
             begin = drives.read(cia402.TARGET_POSITION)
-            for end, way in ((here + size, 1), (here, -1)):
+            for end, way in ((here + size, 0), (here, 0), (here + size, 1), (here, -1)):
                 rows = np.tile(np.where(where, wrapped(end), begin), (STEPPING, 1)).astype(np.int64)
                 seen = drives.record(OBJECTS, STEPPING * CYCLE, play={cia402.TARGET_POSITION: rows})
                 beyond = (way * wrapped(seen[cia402.POSITION_ACTUAL] - end)).max(axis=0)
@@ -395,7 +402,7 @@ class ProvingGround:
         # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
         now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / self._size
         left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
-        return Proof(costs, self._reasons(tried.aborted, tried.terms.overshoot[:2].max(axis=0), left, causes))
+        return Proof(costs, self._reasons(tried.aborted, tried.terms.overshoot[:2].max(axis=0), left, causes), stopped)
 
     def _gone(self, where: Mask) -> None:
         """Count on from where a move has ended: the next one goes the other way."""
@@ -479,7 +486,7 @@ class ProvingGround:
         self.violations[where] += 1
         self.aborts[where] += 1
         self._trials.recover(where)
-        return Proof(np.full(len(where), TRIP), (why,) * len(where))
+        return Proof(np.full(len(where), TRIP), (why,) * len(where), where)
 
     def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]) -> tuple[str, ...]:
         """Return why axes do not pass, "" where they do.

@@ -88,6 +88,7 @@ class RecordedGains:
         slack: How far the measured loops keep the dynamics, relative, (num_axes,); nan where they were not measured.
         overshoot: Of a step of the set-point in csp, over the step, (num_axes,); nan where none was made.
         kept: Axes that keep the gains before, (num_axes,).
+        most: Velocity P halfway to gains that were stopped in a trial, raw, (num_axes,); infinite where none were.
         shown: A recorded move, None if none was made.
         earlier: A recorded move with the gains before, None if none was made.
         response: The velocity loop's, None if none was measured.
@@ -106,6 +107,7 @@ class RecordedGains:
     slack: Floats
     overshoot: Floats
     kept: Mask
+    most: Floats
     shown: Shown | None = None
     earlier: Shown | None = None
     response: MeasuredLoop | None = None
@@ -119,12 +121,13 @@ class RecordedGains:
         n = len(gains)
         unknown, nothing = np.full(n, np.nan), np.full(n, "", object)
         return RecordedGains(
-            gains, unknown, nothing, unknown, nothing, np.zeros(n), nothing, unknown, unknown, np.zeros(n, bool)
-        )
+            gains, unknown, nothing, unknown, nothing, np.zeros(n), nothing, unknown, unknown, np.zeros(n, bool),
+            np.full(n, np.inf),
+        )  # fmt: skip
 
     def mixed(self, other: RecordedGains, where: Mask) -> RecordedGains:
         """Return this with all that another one has of some axes, (num_axes,)."""
-        names = ("proof", "verified", "cost", "failed", "swing", "unseen", "slack", "overshoot", "kept")
+        names = ("proof", "verified", "cost", "failed", "swing", "unseen", "slack", "overshoot", "kept", "most")
         values: dict[str, Any] = {name: np.where(where, getattr(other, name), getattr(self, name)) for name in names}
         shown, response = self.shown, self.response
         if other.shown is not None:

@@ -41,6 +41,7 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
     # Position P is the first to give way: on an axis of more inertia than was found its loop would be the faster one.
     slower = known.scaled(faster(known, gains, SLOWER), SLOWER, known.columns_of("position"))
     best, proof, last = basis.calm.copy(), np.full(n, np.nan), [""] * n
+    stopped = np.zeros(n, bool)  # with the designed gains
     attempts = (
         ("the designed gains", gains),
         (f"these lowered to {100.0 * SLOWER:.0f} %", slower),
@@ -57,6 +58,7 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
         passed = bench.whole_machines(found.passed | ~open_) & open_
         best = np.where(passed[:, None], tried, best)
         proof = np.where(passed, found.cost, proof)
+        stopped |= open_ & found.stopped & (tried is gains)
         for k in map(int, np.flatnonzero(open_)):
             journal = bench.journals[k]
             if not passed[k]:
@@ -70,7 +72,8 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
         bench.journals[k].stop(f"no gains passed the trial; the last ones: {why}")
     verified = np.where(bench.going, BY_TRIAL, "").astype(object)
     cost = np.where((best == gains).all(axis=1), cost, np.nan)
-    return replace(RecordedGains.only(best), proof=proof, verified=verified, cost=cost)
+    most = np.where(stopped, between(known, best, gains), np.inf)
+    return replace(RecordedGains.only(best), proof=proof, verified=verified, cost=cost, most=most)
 
 
 def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
@@ -85,6 +88,12 @@ def watch_following(bench: AutoBench, where: Mask) -> None:
     drives = bench.target.drives
     window = WINDOW * np.abs(bench.ground.move.distance) + drives.read(Role.POSITION_SCALE)
     drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
+
+
+def between(known: GainSet, passed: Integers, stopped: Integers) -> Floats:
+    """Return the velocity P halfway from gains that passed a trial to those that were stopped, raw, (num_axes,)."""
+    column = known.column("velocity", "P")
+    return np.asarray(np.floor(np.sqrt(passed[:, column].astype(float) * stopped[:, column])))
 
 
 def faster(known: GainSet, gains: Integers, factor: float) -> Integers:
