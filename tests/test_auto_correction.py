@@ -166,6 +166,15 @@ def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(fa
     assert bench.asked[0] == asked
 
 
+def test_of_a_machine_one_axis_of_which_failed_its_move_no_loop_was_looked_at(monkeypatch):
+    """The others' responses were not measured either: that asks for no more margin."""
+    told = iter(["it swung", ""])
+    _, bench, _ = corrected(
+        monkeypatch, [800] * 6, measured=False, fails=lambda p: True, failed=lambda p: next(told), axes=2
+    )
+    assert bench.asked == ["standard"] * CORRECTIONS
+
+
 @pytest.mark.parametrize(("restless", "share"), [(False, 1.0), (True, 0.4)])
 def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless, share, monkeypatch):
     monkeypatch.setattr(design, "fitted_plant", lambda *given: ("plant", "found"))

@@ -29,7 +29,7 @@ from tuning.identify.estimate import NAMES, refused
 from tuning.identify.experiments import current_bandwidth
 from tuning.identify.identification import identify
 from tuning.identify.moved_inertia import moved_inertia
-from tuning.identify.quick_identification import identify_briefly
+from tuning.identify.quick_identification import identify_briefly, pushed_inertia
 from tuning.identify.working_state import borrowed
 from tuning.target import Target, emulated
 
@@ -576,6 +576,19 @@ def test_the_joints_of_an_arm_are_identified_briefly_one_after_the_other():
     assert together[:, 1:] == pytest.approx(whole[:, 1:], rel=0.2)
     assert together[:, 0] == pytest.approx(whole[:, 0], rel=0.4)
     assert np.all(together[:, 1:3] > 1.5 * found[:, 1:3])
+    true = np.einsum("ad,cde,be->cab", turning, load.mass_matrix(), turning)
+    pushed = np.array([axis.pushed for axis in axes]).reshape(true.shape)
+    own = np.sqrt(np.einsum("cab,ca,cb->cab", np.ones_like(true), alone, alone))
+    # What the elbow pushes while the shoulder accelerates is a third of its own, what the base pushes then nothing.
+    assert pushed[:, 1:] / own[:, 1:] == pytest.approx(true[:, 1:] / own[:, 1:], abs=0.12)
+
+
+def test_what_axes_push_for_one_another_is_told_apart_by_the_ways_they_go():
+    true = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
+    ways = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1.0]])
+    moves = (ways @ true) * ways
+    assert pushed_inertia(ways, moves) == pytest.approx(true)
+    assert pushed_inertia(ways[:1], moves[:1]).tolist() == np.diag([4.2, 3.0, 1.2]).tolist()
 
 
 def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own_inertia():

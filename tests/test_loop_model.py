@@ -16,7 +16,9 @@ from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
 from drive_env.loops.true_plant import linear_load, true_machines, true_plant
 from drive_env.motors import find_motor
 from drive_env.trials.score import RobustScore
-from tuning.auto.loop_model import LinkedAxis, LoopModel, one_axis, two_ends
+from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_axis, one_plant, two_ends
+from tuning.auto.stages import IdentifiedAxes
+from tuning.identify.estimate import Identification
 from tuning.target import emulated
 
 DEVICE, MOTOR, STANDARD = find_device("tmcm1636"), find_motor("qbl4208"), find_dynamics("standard")
@@ -79,6 +81,32 @@ def test_the_loops_of_a_gantry_are_the_true_ones_with_both_ends_active(gantry):
     one = LinkedAxis(model, 1, gains)
     assert one.slack(STANDARD, gains[1][None]) == pytest.approx(model.slack(STANDARD, gains[None]))
     assert [*one.margins(gains[1])] == ["velocity", "position"]
+
+
+def test_axes_that_feel_each_others_acceleration_are_one_plant_whose_loops_are_the_true_ones():
+    """A robot's shoulder, elbow and pitch turn about parallel axes, roll and turn about one; the base feels none."""
+    with emulated(load="robot", num_threads=1) as target:
+        load = linear_load(target.drives.machine.drives.inside.groups[0].load)
+        turning = np.linalg.inv(load.rotors)
+        M = turning.T @ load.M[0] @ turning
+        plants = tuple(
+            Plant.from_data_sheet(DEVICE, MOTOR, 24.0, M[k, k], delay=1.0 / DEVICE.velocity_rate) for k in range(6)
+        )
+        found = tuple(Identification({}, 0.0, pushed=tuple(row)) for row in M.tolist())
+        identified = IdentifiedAxes(found, plants)
+        groups = [axes.tolist() for axes in one_plant(target, identified)]
+        models = loop_models(target, identified, None, np.ones(6, bool), STANDARD)
+        gains = np.concatenate([rule_gains(DEVICE, MOTOR, M[k, k], supply=24.0) for k in range(6)])
+        true = open_loops(
+            LoopRates.of(DEVICE), true_machines(target.drives), CascadeGains.of(DEVICE, gains[None]), F[None]
+        )
+        # Whoever has no part in a plant changes nothing of it.
+        few = [model.axes for model, _ in loop_models(target, identified, None, np.arange(6) != 2, STANDARD)]
+    assert groups == [[0], [1, 2, 4], [3, 5]] and few == [1, 2, 2]
+    for model, axes in models:
+        for loop, expected in zip(model.open_loops(gains[axes], F), true, strict=True):
+            off = np.abs(loop / expected[0, axes] - 1.0)
+            assert off[:, F > 20.0].max() < 0.02, "below, their friction tells"
 
 
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])

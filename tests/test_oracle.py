@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 
 from tuning.compare import oracle as module
 from tuning.compare.oracle import KEPT, digest, find_oracles, read_oracles, search_oracle, write_oracles
-from tuning.compare.suite import load_suite
+from tuning.compare.suite import load_suite, open_group
 from tuning.compare.yardstick import Yardstick
+from tuning.identify.moved_inertia import true_inertia
 
 MACHINES = {machine.name: machine for machine in load_suite(seed=0)}
 RIGID, ELASTIC = MACHINES["inertia-qbl4208-0"], MACHINES["two_mass-qbl4208-0"]
@@ -83,6 +85,16 @@ def test_softer_dynamics_have_a_slower_oracle_that_keeps_them():
     worst = yardstick.margins(soft.gains)
     yardstick.close()
     assert worst.phase_deg[0] > 59.0 and worst.ms[0] < 1.52
+
+
+def test_both_ends_of_a_gantry_are_judged_by_the_same_move():
+    """The payload makes one heavier than the other: moves of their own would wring the bridge."""
+    gantry = MACHINES["gantry-qbl4208-0"]
+    with closing(Yardstick([gantry], 1, repeats=1)) as yardstick, open_group([gantry], 1) as target:
+        first, second = true_inertia(target)
+        move = yardstick._score._move
+    assert abs(first / second - 1.0) > 0.02
+    assert np.ptp(move.distance) == np.ptp(move.velocity) == np.ptp(move.acceleration) == 0
 
 
 def test_every_axis_is_kept_in_the_file(tmp_path):

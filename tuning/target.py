@@ -125,6 +125,14 @@ class Target:
         lanes = self.axes_per_machine
         return np.asarray(np.repeat(where.reshape(-1, lanes).any(axis=1), lanes))
 
+    def slowest(self, inertia: Floats) -> Floats:
+        """Return the inertia [kg*m^2] by which axes move, (num_axes,): what pulls at one thing goes as its slowest end.
+
+        Ends that went different ways would strain what they pull at.
+        """
+        ends = (-1, self.axes_per_machine if self.linked else 1)
+        return np.asarray(np.repeat(inertia.reshape(ends).max(axis=1), ends[1]))
+
     def increments(self) -> Floats:
         """Return the position increments per radian of every rotor, 2058h over 2 pi, shape (num_axes,)."""
         return np.asarray(self.drives.read(Role.POSITION_SCALE), float) / (2.0 * math.pi)

@@ -131,8 +131,8 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
             if why[k]:
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
-    # Of what failed its move no loop was looked at yet; what was looked at and not seen asks for more margin.
-    looked_at = bench.going & (recorded.failed == "")
+    # Of machines that failed their move no loop was looked at yet; one looked at and not seen asks for more margin.
+    looked_at = bench.going & bench.whole_machines(recorded.failed == "")
     blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():

@@ -109,7 +109,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
         # The ends of one part move it together, each its share, and then nothing twists.
         rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
         return known_of(rigid, found, reach)
-    plant, found = fitted_plant(basis.identified, recorded, k)
+    plant, found = fitted_plant(bench.target, basis.identified, recorded, k)
     known = known_of(plant, found, reach)
     restless = recorded is not None and recorded.swing[k] > RESTLESS
     return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known

@@ -15,7 +15,7 @@ from drive_env.gains import write_gains
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models
+from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.proving import STEP_SIZE
 from tuning.auto.trying import BY_TRIAL, watch_following
@@ -282,8 +282,8 @@ def _by_model(
     """Return what margins of loops are at least by the model of the identified axis, and that in words."""
     plant, identified = basis.identified.plants[k], basis.identified.found[k]
     why = "the axis was not identified" if identified is None else why_unbounded(identified)
-    if bench.target.linked:
-        why = "the model is of this axis alone, and all axes of its machine share what it moves"
+    if any(k in axes and len(axes) > 1 for axes in one_plant(bench.target, basis.identified)):
+        why = "the model is of this axis alone, and axes of its machine share what it moves"
     if why or plant is None or identified is None:
         return {}, f"the identified model gives no bound of the margins: {why}"
     every = at_least_by_model(bench.target.device, plant, identified, gains)

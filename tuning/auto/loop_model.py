@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from tuning.identify.estimate import Identification
     from tuning.target import Target
 
+# Of the mass matrix over the axes' own inertia: a share that measures as much without being there, and the least own
+# share of a motion for which it is believed.
+FELT, LEAST_OWN = 0.15, 0.1
 AT_ONCE = 512  # machines that are computed at once
 TWIST = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of two inertias on one spring
 
@@ -230,39 +233,78 @@ class LinkedAxis:
         return self._model.slack(dynamics, self._whole(gains))
 
 
-def fitted_plant(identified: IdentifiedAxes, recorded: RecordedGains | None, k: int) -> tuple[Plant, Identification]:
-    """Return the plant of an axis and what is known of it: as identified, and as its response was fitted last."""
+def fitted_plant(
+    target: Target, identified: IdentifiedAxes, recorded: RecordedGains | None, k: int
+) -> tuple[Plant, Identification]:
+    """Return the plant of an axis and what is known of it: as identified, and as its response was fitted last.
+
+    That of an axis whose acceleration others feel is what it moves alone while they give way: its response has what
+    their loops do, too, which looks like a resonance.
+    """
     plant, found = identified.known(k)
-    if np.isfinite(found.together):
-        plant = replace(plant, inertia=found.together)  # what all axes move, each its share
     fit = None if recorded is None or recorded.response is None or recorded.unseen[k] else recorded.response.fits[k]
-    if fit is None or fit.reason or fit.misfit > GOOD_MISFIT:
-        return plant, found
-    fitted = replace(fit.plant, R=plant.R, L=plant.L, supply=plant.supply)
-    known = {name: one for name, one in fit.estimates.items() if one.is_known and name in found.estimates}
-    return fitted, replace(found, estimates={**found.estimates, **known})
+    if fit is not None and not fit.reason and fit.misfit <= GOOD_MISFIT:
+        plant = replace(fit.plant, R=plant.R, L=plant.L, supply=plant.supply)
+        known = {name: one for name, one in fit.estimates.items() if one.is_known and name in found.estimates}
+        found = replace(found, estimates={**found.estimates, **known})
+    group = next(axes for axes in one_plant(target, identified) if k in axes)
+    if len(group) > 1 and not target.linked:
+        free = 1.0 / np.diag(np.linalg.inv(mass_matrix(target, identified, group)))[group.tolist().index(k)]
+        plant = replace(plant, inertia=float(free), anti_resonance=math.inf, resonance=math.inf)
+    return plant, found
 
 
 def loop_models(
     target: Target, identified: IdentifiedAxes, recorded: RecordedGains | None, where: Mask, dynamics: Dynamics
 ) -> list[tuple[LoopModel, Integers]]:
-    """Return the models of chosen axes: of each machine of two linked ones, of every other axis alone, and its axes."""
+    """Return the models of chosen axes: of all that are one plant together, of every other axis alone, and its axes."""
     models = []
-    for axes in np.flatnonzero(where).reshape(-1, 2) if is_pair(target) else np.flatnonzero(where)[:, None]:
-        plants = [fitted_plant(identified, recorded, int(k))[0] for k in axes]
-        moved = two_ends(*(alone(identified, recorded, int(k)) for k in axes)) if is_pair(target) else None
+    for group in one_plant(target, identified):
+        axes = group[where[group]]
+        plants = [fitted_plant(target, identified, recorded, int(k))[0] for k in axes]
+        moved: Mechanism | None = None
+        if target.linked:
+            plants = [replace(plant, anti_resonance=math.inf, resonance=math.inf) for plant in plants]
+            if len(axes) == target.axes_per_machine == 2:
+                moved = two_ends(*(alone(identified, recorded, int(k)) for k in axes))
+        elif len(axes) > 1:
+            M = mass_matrix(target, identified, axes)
+            moved = Mechanism(M, np.diag([plant.viscous for plant in plants]), np.zeros_like(M), np.eye(len(axes)))
         if moved is not None:
             models.append((LoopModel(target.device, target.motor, plants, moved, dynamics.inertia_range), axes))
             continue
         for k, plant in zip(axes, plants, strict=True):
-            rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf) if target.linked else plant
-            models.append((model_of(target.device, target.motor, rigid, dynamics), np.array([k])))
+            models.append((model_of(target.device, target.motor, plant, dynamics), np.array([k])))
     return models
 
 
-def is_pair(target: Target) -> bool:
-    """Return whether a machine is the two ends of one part."""
-    return target.linked and target.axes_per_machine == 2
+def one_plant(target: Target, identified: IdentifiedAxes) -> list[Integers]:
+    """Return the axes that were identified, those together that drive one part or feel each other's acceleration."""
+    lanes, groups = target.axes_per_machine, []
+    for machine in np.arange(target.num_axes).reshape(-1, lanes):
+        axes = np.array([k for k in machine if identified.plants[k] is not None], np.int64)
+        felt = np.full((len(axes), len(axes)), target.linked)
+        if not target.linked and len(axes):
+            M = mass_matrix(target, identified, axes)
+            shares = M / np.sqrt(np.outer(np.diag(M), np.diag(M)))
+            if np.linalg.eigvalsh(shares)[0] > LEAST_OWN:
+                felt = np.abs(shares) > FELT
+        # Two that feel a third one are of one plant, too.
+        felt = np.linalg.matrix_power(felt | np.eye(len(axes), dtype=bool), lanes)
+        while len(axes):
+            groups.append(axes[felt[0]])
+            axes, felt = axes[~felt[0]], felt[np.ix_(~felt[0], ~felt[0])]
+    return groups
+
+
+def mass_matrix(target: Target, identified: IdentifiedAxes, axes: Integers) -> Floats:
+    """Return the mass matrix of axes of one machine at their rotors [kg*m^2], diagonal where it was not measured."""
+    lanes = target.axes_per_machine
+    rows = []
+    for axis in map(int, axes):
+        plant, found = identified.known(axis)
+        rows.append(found.pushed or plant.inertia * np.eye(lanes)[axis % lanes])
+    return np.array(rows)[:, axes % lanes]
 
 
 def alone(identified: IdentifiedAxes, recorded: RecordedGains | None, k: int) -> Plant:

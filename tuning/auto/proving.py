@@ -157,10 +157,9 @@ class ProvingGround:
         motor, drives = target.motor, target.drives
         self._ampere = ampere_per_count(drives)
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
-        # What pulls at one thing goes as far and as fast as its slowest end.
-        ends = (-1, target.axes_per_machine if target.linked else 1)
-        inertia = np.repeat(inertia.reshape(ends).max(axis=1), ends[1])
+        inertia = target.slowest(inertia)
         self._inertia, self._held = inertia, held
+        ends = (-1, target.axes_per_machine if target.linked else 1)
         reach = trial_reach(target, inertia, held[0], longer_way(*room)).reshape(ends)
         shortest = np.abs(reach).argmin(axis=1)
         reach = np.repeat(reach[np.arange(len(reach)), shortest], ends[1])

@@ -63,7 +63,9 @@ class Yardstick:
             self._score.set_machines(self.parameters, self.supply.reshape(count, -1)[:, 0])
             scale, reach = target.drives.read(Role.POSITION_SCALE), longer_way(target.low, target.high)
             ramp = highest_ramp(target.device)
-            self._score.set_moves(plan_move(target.motor, each(inertia), each(scale), each(reach), ramp))
+            self._score.set_moves(
+                plan_move(target.motor, each(target.slowest(inertia)), each(scale), each(reach), ramp)
+            )
             self._linear = true_machines(target.drives) if has_linear_model(target.device) else None
         self.rule_gains = np.concatenate(
             [

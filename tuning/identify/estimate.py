@@ -77,8 +77,8 @@ class Identification:
         wiring: The settings that encoder and halls need, by object, and those of the drive. With wrong ones the motor
             runs away or locks.
         fit: The linear model fitted to the frequency response, None where none was measured or it is another axis's.
-        together: Total inertia at the rotor that the axis pushes while all axes of its machine accelerate alike, as
-            "inertia" [kg*m^2]; nan where it was not measured.
+        pushed: What the axis pushes for each axis of its machine that accelerates, its row of their mass matrix at the
+            rotors, as "inertia" [kg*m^2]; () where it was not measured.
     """
 
     estimates: Mapping[str, Estimate]
@@ -86,7 +86,12 @@ class Identification:
     told: Mapping[str, Estimate] | None = None
     wiring: Settings = field(default_factory=dict)
     fit: PlantFit | None = None
-    together: float = math.nan
+    pushed: tuple[float, ...] = ()
+
+    @property
+    def together(self) -> float:
+        """Total inertia that the axis pushes while all axes of its machine accelerate alike; nan if not measured."""
+        return sum(self.pushed) if self.pushed else math.nan
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was not identified."""

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 # Half of an interval over its value, for twins alone: of what two moves tell, and of what a fit refuses to state.
 INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3
 DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
+LEAST_WAY = 1.0  # rad that all axes of a machine must have to either side for what they push for one another
 # Of the inertia of the moves: a response that says less was measured within the play of a gear. On 20 drawn axes
 # without one it says 0.93 to 1.04; on three with one 0.51, 1.05 and 1.34.
 LOOSE = 0.75
@@ -87,13 +88,13 @@ class _Brief(Experiments):
         super().__init__(target, where, progress)
         # What is told of each axis where `found` has a guess.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
-        self._together = np.full(target.num_axes, math.nan)
+        self._pushed: list[tuple[float, ...]] = [() for _ in range(target.num_axes)]
 
     def run(self) -> list[Identification]:
-        every = zip(super().run(), self._told, self._together.tolist(), strict=True)
+        every = zip(super().run(), self._told, self._pushed, strict=True)
         return [
-            replace(one, told={name: told.get(name, one.estimates[name]) for name in NAMES}, together=together)
-            for one, told, together in every
+            replace(one, told={name: told.get(name, one.estimates[name]) for name in NAMES}, pushed=pushed)
+            for one, told, pushed in every
         ]
 
     def turn(self, working: Working) -> None:
@@ -129,7 +130,7 @@ class _Brief(Experiments):
         self.respond(working, inertia)
 
     def _move_together(self, working: Working, trials: Trials, holding: NDArray[np.float64]) -> Working:
-        """Find what axes of one machine push while all of them move; return those that did not oscillate."""
+        """Find what axes of one machine push for one another while all of them move; return what did not oscillate."""
         target, lanes = working.target, working.target.axes_per_machine
         whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
         if lanes == 1 or target.linked or not whole.any():  # which have moved together as it is
@@ -137,9 +138,22 @@ class _Brief(Experiments):
         # With the slow gains no axis follows a move that the others shake.
         write_gains(target.drives, method_of(target.device, target.motor).first(target.supply), whole)
         down, up = working.room()
-        reach = trial_reach(target, GUESS * target.motor.inertia, holding, longer_way(down, up))
-        found, _ = trials.identify(reach, whole)
-        self._together[whole] = found.inertia[whole]
+        # All axes the same way, and then each the other way than the others, as far: of axes that stand still, dry
+        # friction holds some of what the others push.
+        either = np.repeat(np.minimum(-down, up).reshape(-1, lanes).min(axis=1), lanes)
+        able = whole & (either >= LEAST_WAY)
+        far = np.where(able, either, longer_way(down, up))
+        reach = trial_reach(target, GUESS * target.motor.inertia, holding, far).reshape(-1, lanes)
+        ways = np.concatenate([np.ones((1, lanes)), 1.0 - 2.0 * np.eye(lanes)])
+        moved = [
+            trials.identify((signs * reach).reshape(-1), where)[0].inertia.reshape(-1, lanes)
+            for signs, where in zip(ways, [whole, *[able] * lanes], strict=True)
+            if where.any()
+        ]
+        for machine in map(int, np.flatnonzero(whole[::lanes])):
+            told = len(ways) if able[machine * lanes] else 1
+            rows = pushed_inertia(ways[:told], np.array([one[machine] for one in moved[:told]]))
+            self._pushed[machine * lanes : (machine + 1) * lanes] = map(tuple, rows.tolist())
         return self.calm(working)
 
     def _take_moved(self, found: Identified, where: NDArray[np.bool_]) -> None:
@@ -196,6 +210,25 @@ class _Brief(Experiments):
             "two moves of a quarter of a second give it too roughly, and the frequency response does not give it: "
             f"{reason}"
         ))  # fmt: skip
+
+
+def pushed_inertia(ways: NDArray[np.float64], inertia: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), by what they pushed while all moved.
+
+    Args:
+        ways: Which way each axis went, 1 or -1, (moves, axes): all alike first.
+        inertia: What each pushed over its own acceleration [kg*m^2], likewise.
+
+    Returns:
+        A symmetric one; of one move a diagonal one, in which each axis has all that it pushes.
+    """
+    if len(ways) == 1:
+        return np.diag(inertia[0])
+    rows = [
+        np.linalg.lstsq(ways * own[:, None], pushed, rcond=None)[0]
+        for own, pushed in zip(ways.T, inertia.T, strict=True)
+    ]
+    return np.asarray(0.5 * (np.array(rows) + np.transpose(rows)))
 
 
 def loose(ratio: float) -> str:
