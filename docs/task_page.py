@@ -102,12 +102,13 @@ def _section(name: str, task: SuiteTask) -> str:
     )
     first = str(inspect.getdoc(SUITE_TASKS[name]["expert"])).partition("\n")[0].rstrip(".")
     expert, curves = first.removeprefix("Return the "), CURVES.format(short_name(name))
+    picture = f"assets/tasks/{short_name(name)}.webp"
     return "\n".join(
         [
             f"## {name.partition('/')[2]}\n",
             f"{task.about[0].upper()}{task.about[1:]}. An episode has {task.steps} steps. The expert:",
             f"{expert[0].lower()}{expert[1:]}.\n",
-            f"![The machine and its expert at work](assets/tasks/{short_name(name)}.webp)\n",
+            *([f"![The machine and its expert at work]({picture})\n"] if (HERE / picture).is_file() else []),
             f"```toml\n{options}\n{tables}\n```\n",
             *([f"![Learning curves]({curves})\n"] if (HERE / curves).is_file() else []),
         ]
