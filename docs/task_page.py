@@ -149,7 +149,7 @@ def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:
     rows = [row for row in json.loads((folder / "results.json").read_text(encoding="utf-8")) if row["task"] in TASKS]
     for name in dict.fromkeys(row["task"] for row in rows):
         unlearnt = {policy: round(score, 4) for policy, score in unlearnt_scores(name, MACHINES).items()}
-        scores[name] = {"unlearnt": unlearnt, "baselines": {}, "trained": {}}
+        scores[name] = {"trained": {}, **scores.get(name, {}), "unlearnt": unlearnt, "baselines": {}}
         curves = folder / name.partition("/")[2] / "learning_curves.png"
         if curves.is_file():
             with Image.open(curves) as picture:
