@@ -57,7 +57,7 @@ FROZEN = {
     "ServoDrive/KnownPayload-v1": "d64930769400297a",
     "ServoDrive/ServoTuning-v1": "0a61b10e4c9c9160",
     "ServoDrive/AmplifierTuning-v1": "d43013d4a4f8536a",
-    "ServoDrive/StepperTuning-v1": "7cf5101313ccfe0e",
+    "ServoDrive/StepperTuning-v1": "e0c0edfabfbd03d1",
 }
 
 

@@ -138,7 +138,7 @@ TASKS: dict[str, SuiteTask] = {
     "ServoDrive/StepperTuning-v1": _tuning(
         "the PID that closes a stepper's position loop, on any disc from a tenth to forty times the usual one",
         0.80, "inertia", ANY_DISC, ("pid_v0_p", "pid_v0_i", "pid_v0_d"), device="tmcm3313", motor="qsh4218_51",
-        step=5.0, half=1.0,
+        step=5.0, half=1.1,
     ),
 }  # fmt: skip
 
