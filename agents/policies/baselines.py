@@ -22,7 +22,6 @@ from agents.policies.experts import (
     Pendulum,
     SwingUp,
     TorqueCascade,
-    TrialsOnModel,
 )
 from agents.training.tasks import environment_name
 
@@ -156,7 +155,6 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/KnownPayload-v1": {"cascade": nothing, "expert": PayloadSchedule},
     "ServoDrive/ServoTuning-v1": {"cascade": nothing, "expert": MarginDesign},
     "ServoDrive/AmplifierTuning-v1": {"cascade": nothing, "expert": MarginDesign},
-    "ServoDrive/StepperTuning-v1": {"cascade": nothing, "expert": TrialsOnModel},
 }
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -296,43 +295,3 @@ class MarginDesign(Expert):
                 sets = (sets[None] + around[:, None, None]).reshape(-1, count, 3)
                 sets = sets[worth(sets, nominal=False).argmax(axis=0), np.arange(count)][None]
         return np.asarray(sets[0])
-
-
-class TrialsOnModel(Expert):
-    """The best by robust cost of a table of gains, each tried on an emulated model of the machine.
-
-    As `drive-tune auto` tries designs on twins. The table was chosen among 260 sets of random gains, on 64 machines, so
-    that its best is good on as many as possible.
-    """
-
-    TABLE = np.array([
-        (0.0, -3.5, -1.1), (1.0, -2.2, -4.7), (-0.6, -3.6, -2.2), (0.9, -1.2, -3.3), (0.4, -3.0, -4.1),
-        (1.3, -1.4, -0.4), (-0.1, -4.5, -4.1), (0.4, -2.6, -3.0), (-0.4, -3.6, -0.8), (0.2, -3.8, -4.0),
-        (1.3, -0.9, -0.1), (-0.2, -3.0, -0.6), (1.4, -1.9, -3.3), (1.1, -2.7, -3.3), (0.5, -1.6, -1.0),
-        (-0.3, -3.2, 0.6),
-    ])  # fmt: skip
-    """ln over the values that the drive is commissioned with, of P, I and D of the position loop."""
-
-    def __init__(self, configuration: Any) -> None:
-        super().__init__(configuration)
-        self._chosen: Floats | None = None
-
-    def reset(self, mask: Any = None) -> None:
-        """Forget what was chosen."""
-        self._chosen = None
-
-    def actions(self, rows: Floats) -> Floats:
-        """Return the gains over the rule's, in steps, the same in each trial."""
-        if self._chosen is None:
-            self._chosen = self.TABLE[self._costs(len(rows)).argmin(axis=0)]
-        return np.asarray(self._chosen / self.configuration.step)
-
-    def _costs(self, count: int) -> Floats:
-        """Return the robust costs of the table on the machines, (sets, environments)."""
-        from drive_env.envs.gain_tuning import GainTuning
-
-        one = replace(self.configuration, trials=len(self.TABLE), num_threads=1)
-        with closing(GainTuning(count, config=vars(one))) as model:
-            model.reset(seed=0, options={"machine": self._machine})
-            changes = np.repeat((self.TABLE / one.step)[:, None], count, axis=1)
-            return np.array([model.step(change)[4]["trial_robust_cost"] for change in changes])

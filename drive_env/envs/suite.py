@@ -77,18 +77,6 @@ LARGE_JOINT = {
         "stage.idle_current": False, "stage.supply_sinks": False,
     },
 }  # fmt: skip
-# From hardly any disc to a large one: over a narrower range one set of values suits all. Steppers lack the others.
-ANY_DISC = {
-    "include": ["inertia", "stepper"],
-    "parameters": {
-        "load.inertia": _log(0.1, 40.0),
-        **dict.fromkeys((
-            "motor.L_d", "motor.L_q", "motor.cogging_torque", "motor.cogging_phase", "motor.commutation_offset",
-            "stage.adc_noise", "stage.adc_offset_a", "stage.adc_offset_b", "stage.adc_gain_error_a",
-            "stage.adc_gain_error_b", "stage.dead_time", "stage.dead_time_current", "stage.chopper_resistance",
-        ), False),
-    },
-}  # fmt: skip
 
 
 TASKS: dict[str, SuiteTask] = {
@@ -134,11 +122,6 @@ TASKS: dict[str, SuiteTask] = {
     "ServoDrive/AmplifierTuning-v1": _tuning(
         "gains of a servo amplifier on mains for a geared joint with play, from a new gear to a worn one",
         0.80, "geared_joint", LARGE_JOINT, CASCADE, device="tgz_d", motor="am3033_e", step=3.0, half=3.0,
-    ),
-    "ServoDrive/StepperTuning-v1": _tuning(
-        "the PID that closes a stepper's position loop, on any disc from a tenth to forty times the usual one",
-        0.80, "inertia", ANY_DISC, ("pid_v0_p", "pid_v0_i", "pid_v0_d"), device="tmcm3313", motor="qsh4218_51",
-        step=5.0, half=1.1,
     ),
 }  # fmt: skip
 
