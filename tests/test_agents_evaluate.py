@@ -33,7 +33,7 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.envs.gain_observation import IDENTIFIED
-from drive_env.envs.gain_tuning import GainTuning
+from drive_env.envs.gain_tuning import GainTuning, GainTuningConfig
 
 SHORT = {"load": "two_mass", "mode": "csp", "action": "offset", "duration": 0.05}
 SCORE = "RMS following error [rev]"
@@ -172,7 +172,7 @@ class Bold(Gentle):
 
     def answer(self, observation):
         last, best = (slice(len(IDENTIFIED) + k * 3, len(IDENTIFIED) + (k + 1) * 3) for k in range(2))
-        return [*self.seen, observation][self.trial][:, last] - observation[:, best]
+        return ([*self.seen, observation][self.trial][:, last] - observation[:, best]) / GainTuningConfig().step
 
 
 @pytest.mark.parametrize("trial", [0, 1, 3])
@@ -457,8 +457,8 @@ def test_recorded_episodes_are_repeated(tmp_path):
     assert json.loads(told.output) == {"largest": 0.0, "rms": 0.0, "steps": 100}
     told = run("evaluate", "gain_tuning", "--replay", path)
     assert told.exit_code == 2 and "was recorded in ServoDrive/Tracking-v0, and gain_tuning acts in" in told.output
-    told = run("evaluate", "gantry_beam", "--replay", path)  # two axes
-    assert told.exit_code == 1 and "the policy takes 16 entries" in told.output
+    told = run("evaluate", "tracking_inverted_pendulum", "--replay", path)  # sees a pole besides
+    assert told.exit_code == 1 and "the policy takes 10 entries" in told.output
 
 
 def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
@@ -502,7 +502,7 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
         (("nothing", "-e", "tracking", "--stall", "-1"), "--stall -1 must be a time [s], 0 for no limit"),
         (("nothing", "-e", "tracking", "--seed", "-3"), "--seed -3 is too small"),
         (("gain_tuning", "-e", "tracking"), "acts in ServoDrive/GainTuning-v0, not in ServoDrive/Tracking-v0"),
-        (("nobody",), "give an agent that ships (gain_tuning, tracking_"),
+        (("nobody",), "give an agent that ships (arm_path, gain_tuning, "),
         (("test_agents_evaluate:gentle", "--card"), "has no card"),
     ],
 )

@@ -351,7 +351,7 @@ def test_a_shipped_agent_is_small_and_has_a_card(name):
 def test_agents_are_found_by_name_or_file(tmp_path):
     assert find_agent("gain_tuning") == shipped("gain_tuning")
     assert find_agent(str(tmp_path / "mine.npz")) == tmp_path / "mine.npz"
-    with pytest.raises(ValueError, match="no agent named 'nobody' ships; there are gain_tuning, tracking_"):
+    with pytest.raises(ValueError, match="no agent named 'nobody' ships; there are arm_path, gain_tuning, "):
         find_agent("nobody")
 
 

@@ -374,7 +374,7 @@ def test_a_file_with_pickles_needs_trust(tmp_path):
         (("--submit", "gone.npz", "--task", TASK), "gone.npz"),
         (("--check", "gone.json"), "gone.json cannot be read: No such file or directory"),
         (("--check", "gone.json", "--task", TASK), "--check takes no --task; leave it out"),
-        (("--workers", 2, "--cluster", "tcp://localhost:1"), "exclude each other"),
+        (("--task", TASK, "--workers", 2, "--cluster", "tcp://localhost:1"), "exclude each other"),
     ],
 )
 def test_a_mistake_is_told_in_a_line(given, says, tmp_path):

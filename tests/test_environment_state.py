@@ -21,6 +21,7 @@ from drive_env.envs.suite import TASKS
 from drive_env.envs.tracking import Tracking
 from drive_env.envs.vector_environment import SingleEnvironment
 
+OF_TASKS = {f"ServoDrive/{kind.__name__}-v0": kind for kind in (Tracking, GainScheduling, GainTuning)}
 STEPS = {Tracking: 50, GainScheduling: 50, GainTuning: 2}
 FAULTS = {
     "include": ["two_mass"],
@@ -45,7 +46,7 @@ CASES = {
     "short": (GainScheduling, {"device": "tgz_d", "load": "inertia", **SHORT}),
     "servo": (GainTuning, {"trials": 3}),
     "servo of steppers": (GainTuning, {"device": "tmcm6212", "load": "inertia", "trials": 3}),
-    **{name: (Tracking, dict(task.options)) for name, task in TASKS.items()},
+    **{name: (OF_TASKS[task.environment], dict(task.options)) for name, task in TASKS.items()},
 }
 EVERY_CASE = pytest.mark.parametrize(("kind", "options"), CASES.values(), ids=CASES)
 FEW = ("two masses", "stepper", "belt", "servo")

@@ -135,13 +135,12 @@ def within(
         found = measure_sensitivity(policy_of(agent), bundle.environment, bundle.configuration, told=tell)
         try:
             check_kept(found, dynamics)
+            break
         except NotKeptError as error:
             if share == SHARES[-1]:
                 raise NotKeptError(f"even with {share:g} of its answer to errors: {error}") from None
-            continue
-        margins = {"dynamics": dynamics.name, "answer to errors": share, "machines": len(found.ms), **figures(found)}
-        return replace(agent, card={**bundle.card, "margins": margins}), found
-    raise AssertionError("SHARES is empty")
+    margins = {"dynamics": dynamics.name, "answer to errors": share, "machines": len(found.ms), **figures(found)}
+    return replace(agent, card={**bundle.card, "margins": margins}), found
 
 
 def figures(found: Sensitivity) -> dict[str, float]:
