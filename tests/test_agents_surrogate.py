@@ -190,7 +190,7 @@ def test_it_finds_what_only_trials_tell(policy):
     for _ in range(6):
         distance.append(np.abs(tried - best).sum(axis=1))
         shown = tried - best if np.any(tried) else 0.0  # the rule's trial shows nothing
-        tried = policy.act(after(tried, shown=shown)).astype(float)  # the rule stays the incumbent
+        tried = training.STEP * policy.act(after(tried, shown=shown))  # the rule stays the incumbent
     assert np.mean(distance[3]) < 0.6 * np.mean(distance[1])
     assert np.mean(np.min(distance[1:], axis=0)) < 0.4 * np.mean(distance[0])
 
