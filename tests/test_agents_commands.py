@@ -96,7 +96,10 @@ def test_a_search_on_processes_is_the_same_search(tmp_path, shrunk):
         (("train", "tracking", "--resume", "nowhere"), "with its own options; leave environment out"),
         (("train", "tracking", "--seed", "-1"), "the seed must be 0 or more, not -1"),
         (("search", "tracking", "--trials", "0"), "--trials 0 must be 1 or more"),
-        (("export", "agent.txt"), "must be an agent (.npz), a checkpoint (.zip), or one that ships: gain_tuning"),
+        (
+            ("export", "agent.txt"),
+            "must be an agent (.npz), a checkpoint (.zip), or one that ships: arm_path, gain_tuning",
+        ),
         (("export", "gain_tuning"), "an agent of kind 'surrogate' cannot be written as ONNX"),
         (("export", "no.npz"), "there is no file no.npz"),
     ],

@@ -144,7 +144,7 @@ def test_json_for_programs(tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["nobody"], "no agent named 'nobody' ships; there are gain_tuning"),
+    (["nobody"], "no agent named 'nobody' ships; there are arm_path, gain_tuning"),
     (["nothing.npz"], "there is no file nothing.npz"),
     (["gantry_beam"], "acts in ServoDrive/GantryBeam-v1; a tuner acts in ServoDrive/GainTuning-v0"),
     (["--channel", "can0", "--travel", "-1:1"], "channel 'can0' needs an interface"),

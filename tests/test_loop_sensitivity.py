@@ -80,3 +80,10 @@ def test_what_cannot_be_measured_is_told(tmp_path, monkeypatch, arguments, messa
     monkeypatch.chdir(tmp_path)
     found = CliRunner().invoke(app, ["margins", *arguments])
     assert found.exit_code == 2 and message in found.output.replace("\n", " ") and not list(tmp_path.iterdir())
+
+
+def test_a_file_that_is_there_stays(tmp_path):
+    path = linear("inertia", ERROR, 1.0).save(tmp_path / "agent.npz")
+    before = path.read_bytes()
+    found = CliRunner().invoke(app, ["margins", str(path), "--dynamics", "stiff", "--out", str(path)])
+    assert found.exit_code == 2 and "is there already" in found.output and path.read_bytes() == before

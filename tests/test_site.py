@@ -107,7 +107,7 @@ def test_every_agent_that_ships_has_its_figures():
     text = agent_pages.pages()["reference/agents.md"]
     for name in shipped_names():
         assert f"## {name}\n" in text
-    assert "keep `standard` dynamics: Ms" in text
+    assert "have an Ms within `standard`:" in text
 
 
 def test_every_command_has_its_options():

@@ -29,7 +29,7 @@ def margins(
     dynamics: Annotated[
         str | None,
         typer.Option(
-            "--dynamics", help="What the loops must keep: soft, standard or stiff; exit code 1 if they do not."
+            "--dynamics", help="Whose Ms the loops must keep: soft, standard or stiff; exit code 1 if they do not."
         ),
     ] = None,
     out: Annotated[
@@ -56,6 +56,8 @@ def margins(
 
         if out is not None and (dynamics is None or out.suffix != ".npz"):
             raise ValueError("--out writes an agent, a new .npz, that keeps --dynamics; give both")
+        if out is not None and out.exists():
+            raise ValueError(f"--out {out} is there already; give a new file")
         asked = None if dynamics is None else find_dynamics(dynamics)
         loaded, configuration = opened_for(policy, environment, trust=trust)
         bundle: AgentFile | None = getattr(loaded.policy, "bundle", None)
@@ -85,7 +87,9 @@ def margins(
             fail(error, REFUSED)
         if not json:
             if asked is not None:
-                print(f"the loops keep {asked.name}: Ms at most {asked.ms:g}")
+                print(
+                    f"Ms is within {asked.name} ({asked.ms:g}); phase and gain margins by themselves are not measured"
+                )
             if out is not None:
                 print(f"written to {out}: answers following errors by {agent.card['margins']['answer to errors']:g} "
                       "of what it did")  # fmt: skip

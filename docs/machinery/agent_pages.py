@@ -47,7 +47,7 @@ def section(name: str) -> str:
         rows.append(
             (
                 f"loops on {margins['machines']} machines",
-                f"keep `{margins['dynamics']}` dynamics: Ms {margins['Ms median']:.2f} in the median, "
+                f"have an Ms within `{margins['dynamics']}`: {margins['Ms median']:.2f} in the median, "
                 f"{margins['Ms greatest']:.2f} at most",
             )
         )
