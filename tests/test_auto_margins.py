@@ -17,6 +17,7 @@ from drive_env.loops.margins import Margins, margins
 from drive_env.loops.true_plant import true_plant
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
+from tuning.identify.estimate import Identification
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated, timed
@@ -46,6 +47,23 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
         bench.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])))
         auto_margins.measure(bench, basis(gains), recorded(gains), np.ones(1, bool))
     assert asked == [pytest.approx(left, abs=5e-3)]
+
+
+@pytest.mark.parametrize(("share", "seen"), [(0.59, False), (0.61, True)])
+def test_a_response_of_less_inertia_than_moves_showed_is_that_of_the_play_of_a_gear(share, seen, monkeypatch):
+    with emulated(load="inertia", num_threads=1) as target, timed(target) as (watched, clock):
+        true = true_plant(target.drives)
+        write_gains(target.drives, GAINS[None])
+        response = frequency_response.measure(target)
+        bench = AutoBench(watched, clock, 60.0, find_dynamics("standard"))
+        bench.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])), begin_here=lambda where: None)
+        monkeypatch.setattr(frequency_response, "measure", lambda *given, **options: response)
+        moved = replace(true, inertia=response.fits[0].plant.inertia / share)
+        found = basis(GAINS[None], plant=moved, found=Identification({}, 0.0))
+        after = auto_margins.measure(bench, found, recorded(GAINS[None]), np.ones(1, bool))
+    why = "the response shows 59 % of the inertia that moves showed, and 60 % are needed"
+    assert (after.unseen[0] == "") == seen == np.isfinite(after.slack[0])
+    assert seen or after.unseen[0].startswith(why)
 
 
 # --- both loops, by a measured velocity loop --------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from drive_env.loops.linear_model import OPEN_LOOPS, velocity_open_loop
 from drive_env.loops.margins import margins
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, window
 from drive_env.motors import find_motor
+from tuning.auto.loop_model import LoopModel, one_axis
 from tuning.auto.measured_margins import AT_ONCE, MeasuredAxis
 
 DEVICE, MOTOR, STANDARD = find_device("tmcm1636"), find_motor("qbl4208"), find_dynamics("standard")
@@ -98,7 +99,12 @@ def test_slack_is_that_of_the_dynamics_and_of_less_and_more_velocity_p(axis):
         min(float(STANDARD.clearance(OPEN_LOOPS[loop](DEVICE, plant, row, F))) for loop in BOTH) for row in rows
     ]
     least = min(clearances[0] - 1.0, min(clearances[1:]) / 0.4 - 1.0)
-    assert measured(plant, raw(inertia, *SOFT)).slack(STANDARD, gains[None]) == pytest.approx([least], abs=0.01)
+    seen = measured(plant, raw(inertia, *SOFT))
+    assert seen.slack(STANDARD, gains[None]) == pytest.approx([least], abs=0.01)
+    kept = seen.kept(STANDARD, gains)
+    assert [kept["velocity P x 0.67"], kept["velocity P x 1.5"]] == pytest.approx(clearances[1:], abs=0.01)
+    model = LoopModel(DEVICE, MOTOR, [plant], one_axis(plant), measured=True)
+    assert not kept.keys() & model.kept(STANDARD, gains[None]).keys(), "what was measured needs no model"
 
 
 def test_many_sets_at_once_are_each_by_itself():
@@ -113,7 +119,7 @@ def test_lines_that_are_not_coherent_count_only_where_a_model_fits():
     """Below 400 Hz they are: there no phase of -180 degrees is seen, and no gain margin told."""
     _, inertia, plant = machine_of("inertia")
     gains, below = raw(inertia, *SOFT), F < 100.0
-    for fit in (None, SimpleNamespace(reason="", misfit=1.0, plant=plant)):
+    for fit in (None, SimpleNamespace(reason="", is_good=True, plant=plant)):
         found = measured(plant, gains, trusted=below, fit=fit)
         assert np.isnan(found.margins(gains)["velocity"].gain_db)
         assert len(found._f) == (below.sum() if fit is None else len(F))

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from drive_env.devices import find_device
-from drive_env.loops.linear_model import Plant
+from drive_env.loops.linear_model import Plant, velocity_open_loop
 from drive_env.motors import find_motor
 from tuning.identify.estimate import Estimate, refused
-from tuning.response.plant_fit import PlantFit
+from tuning.response.held_samples import seen_by_bus
+from tuning.response.plant_fit import PlantFit, fit_plant
 
 MOTOR = find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(find_device("tmcm1636"), MOTOR, 24.0, 3.0 * MOTOR.inertia)
@@ -42,3 +43,32 @@ def test_a_rigid_plant_is_drawn_every_time():
     drawn = list(PlantFit(RIGID, estimates, 1.0).drawn(np.random.default_rng(0), 50))
     assert len(drawn) == 50
     assert np.std([fit.plant.inertia for fit in drawn]) == pytest.approx(0.1 * RIGID.inertia / 1.96, rel=0.3)
+
+
+# --- what is found ----------------------------------------------------------------------------------------------------
+SERVO = find_device("tgz_d")
+SERVO_GAINS = np.array([3324, 955, 562, 412, 118])
+AM3041 = find_motor("am3041_e")
+
+
+@pytest.mark.parametrize("anti_resonance", [28.5, 47.5, 77.8, 93.6])
+@pytest.mark.parametrize(("ratio", "damping"), [(1.18, 0.005), (1.35, 0.005), (2.6, 0.02)])
+def test_one_spring_is_found_wherever_it_lies_between_the_lines(anti_resonance, ratio, damping):
+    """Lines are 5 Hz apart, and a resonance is a tenth of that wide."""
+    start = Plant.from_data_sheet(SERVO, AM3041, 540.0, 3.0 * AM3041.inertia)
+    true = replace(
+        start, inertia=1.17e-4, anti_resonance=anti_resonance, resonance=ratio * anti_resonance, damping=damping,
+        velocity_filter=155.0,
+    )  # fmt: skip
+    f = np.arange(5.0, 401.0, 5.0)
+
+    def closed(at):
+        L = velocity_open_loop(SERVO, true, SERVO_GAINS, at)
+        return L / (1.0 + L)
+
+    noise = np.random.default_rng(1).normal(size=(2, len(f))) / np.sqrt(2.0)
+    seen = seen_by_bus(SERVO, f, closed) * (1.0 + 0.03 * (noise[0] + 1j * noise[1]))
+    found = fit_plant(SERVO, SERVO_GAINS, f, seen, np.full(len(f), 0.03), start)
+    assert found.is_good and found.plant.resonance == pytest.approx(true.resonance, rel=0.01)
+    assert found.plant.anti_resonance == pytest.approx(true.anti_resonance, rel=0.02)
+    assert found.plant.inertia == pytest.approx(true.inertia, rel=0.05)

@@ -82,6 +82,10 @@ def correct(
             if best is not None:
                 # What is no better than what it was to correct goes.
                 no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
+                # Nothing is known of the loops of either: those designed for more margin stay.
+                no_better &= ~bench.whole_machines(
+                    (recorded.failed == "") & np.isnan(best.slack) & np.isnan(recorded.slack)
+                )
                 recorded = recorded.mixed(best, changed & no_better)
             best = recorded
         if number == CORRECTIONS:
@@ -144,7 +148,9 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
         why[k] = _short(bench, recorded, k) or (UNSEEN if blind[k] else "")
         if not why[k] and cost[k] < WORTH * present[k]:
             why[k] = f"its twins, as measured, have a robust cost of {cost[k]:.2f} for {present[k]:.2f}"
-        if not recorded.failed[k] and not recorded.slack[k] < 0.0 and recorded.overshoot[k] > bench.dynamics.overshoot:
+        shoots_over = recorded.overshoot[k] > bench.dynamics.overshoot
+        unlike = blind[k] and not np.array_equal(designed[k], recorded.gains[k])
+        if shoots_over and not (recorded.failed[k] or recorded.slack[k] < 0.0 or unlike):
             # Nothing but the step tells of what makes it overshoot: position P gives way first.
             share = np.clip(CALMER * bench.dynamics.overshoot / recorded.overshoot[k], LEAST_CALMER, CALMER)
             gains[k] = known.scaled(gains[k], float(share), [cascade_columns(bench.target.device)[4]])

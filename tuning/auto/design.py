@@ -22,7 +22,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_constants
 from drive_env.trials.score import robust_cost
 from tuning.auto.loop_margins import measured_axis
-from tuning.auto.loop_model import fitted_plant, loop_models
+from tuning.auto.loop_model import fitted_plant, loop_models, model_of
 from tuning.auto.proving import RESTLESS
 from tuning.auto.twin import WORLDS, Known, Twins, known_of, least_gains
 
@@ -87,6 +87,12 @@ def design_axes(
         (model, np.searchsorted(axes, of))
         for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
     ]
+    if recorded is not None and not target.linked:
+        # What could not be measured may be rigid: the play of a gear looks like a soft spring.
+        for n, one in enumerate(measured):
+            if one is None and known[n].plant.is_elastic:
+                rigid = replace(known[n].plant, anti_resonance=math.inf, resonance=math.inf)
+                models.append((model_of(target.device, target.motor, rigid, bench.dynamics), np.array([n])))
 
     twins = partial(Twins, target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics)
     with closing(twins(worlds=WORLDS[:1])) as one_world, closing(twins(repeats=RUNS)) as all_worlds:

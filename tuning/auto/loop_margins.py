@@ -15,11 +15,11 @@ from drive_env.gains import write_gains
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_plant
+from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.proving import STEP_SIZE
 from tuning.auto.trying import BY_TRIAL, watch_following
-from tuning.response.measured_loop import GOOD_MISFIT, merged
+from tuning.response.measured_loop import merged
 from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
+    from tuning.target import Target
 
 MEASURED = 0.08  # relative: what a measured slack may be off
 # What a measured margin may be off, one standard deviation of repeated measurements at most.
@@ -41,6 +42,7 @@ BOTH = (
     "with the other one off"
 )
 NO_PART = "no part with one spring fits the frequency responses of both ends"
+IN_PLAY = 0.6  # of the inertia that moves showed: a response that shows less is that of the rotor in the play of a gear
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
@@ -89,6 +91,8 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         elif seen < LEAST_LINES:
             why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
             unseen[k] = "; ".join([why, *response.notes[k]])
+        else:
+            unseen[k] = _in_play(bench.target, basis, response, k)
     if recorded.response is not None:
         # What was measured with earlier gains tells of these, too, where nothing could be measured with them.
         earlier = [measured_axis(bench, basis, recorded, k) is not None for k in range(len(going))]
@@ -115,18 +119,17 @@ def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: in
     Those of linked axes are known by the responses that identified them, each with the other one off: with gains that
     are fit for both, one alone may swing.
     """
-    response, target = recorded.response, bench.target
+    target = bench.target
     if target.linked:
         whole = np.arange(target.num_axes) // target.axes_per_machine == k // target.axes_per_machine
         axes = np.flatnonzero(whole)
         fits = [None if (found := basis.identified.found[j]) is None else found.fit for j in axes]
-        if any(fit is None or fit.reason or fit.misfit > GOOD_MISFIT for fit in fits):
+        if not all(fit is not None and fit.is_good for fit in fits):
             return None
         models = loop_models(target, basis.identified, recorded, whole, bench.dynamics)
         return LinkedAxis(models[0][0], k - int(axes[0]), recorded.gains[axes]) if len(models) == 1 else None
-    if response is None or recorded.unseen[k] or not np.isfinite(response.open_loop[:, k]).any():
-        return None
-    return MeasuredAxis(response, k, basis.identified.known(k)[0])
+    response = measured_response(target, recorded, k)
+    return None if response is None else MeasuredAxis(response, k, basis.identified.known(k)[0])
 
 
 def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: MeasuredLoop, going: Mask) -> Mask:
@@ -139,6 +142,18 @@ def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: 
             measured = MeasuredAxis(response, k, basis.identified.known(k)[0])
             unclear[k] = not math.isfinite(measured.margins(recorded.gains[k])["velocity"].phase_deg)
     return unclear
+
+
+def _in_play(target: Target, basis: Basis, response: MeasuredLoop, k: int) -> str:
+    """Return that a response is not that of the whole axis, "" if it may be."""
+    fit, plant = response.fits[k], basis.identified.known(k)[0]
+    alone = any(k in axes and len(axes) == 1 for axes in one_plant(target, basis.identified))
+    if fit is None or fit.reason or not alone or fit.plant.inertia >= IN_PLAY * plant.inertia:
+        return ""
+    return (
+        f"the response shows {100.0 * fit.plant.inertia / plant.inertia:.0f} % of the inertia that moves showed, and "
+        f"{100.0 * IN_PLAY:.0f} % are needed: the excitation stays within the play of a gear"
+    )
 
 
 def _seen(response: MeasuredLoop, k: int) -> int:
@@ -155,8 +170,8 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGa
     """Return what the final gains are worth, too: their margins as measured, or a lower bound."""
     for model, axes in loop_models(bench.target, basis.identified, recorded, bench.going, bench.dynamics):
         for k in map(int, axes):
-            known = measured_axis(bench, basis, recorded, k) is not None
-            _tell_variants(bench, bench.journals[k], model, recorded.gains[axes], known)
+            measured = measured_axis(bench, basis, recorded, k)
+            _tell_variants(bench, bench.journals[k], model, recorded.gains[axes], measured, recorded.gains[k])
     margins: dict[int, Mapping[str, Margins]] = {}
     at_least: dict[int, Mapping[str, AtLeast]] = {}
     verified = recorded.verified.copy()
@@ -191,13 +206,23 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGa
     return replace(recorded, margins=margins, at_least=at_least, verified=verified)
 
 
-def _tell_variants(bench: AutoBench, journal: Journal, model: LoopModel, gains: Integers, was_measured: bool) -> None:
-    """Add a reservation where a machine as it may become keeps too little; reject it beyond stiff dynamics if known."""
+def _tell_variants(
+    bench: AutoBench,
+    journal: Journal,
+    model: LoopModel,
+    gains: Integers,
+    measured: MeasuredAxis | LinkedAxis | None,
+    own: Integers,
+) -> None:
+    """Add a reservation where a machine as it may become keeps too little; beyond stiff, reject it if measured."""
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
-        name, kept = min(model.kept(dynamics, gains).items(), key=lambda one: one[1])
-        if kept < OFF_NOMINAL * (1.0 - MEASURED) and (was_measured or dynamics is bench.dynamics):
+        every = model.kept(dynamics, gains)
+        if isinstance(measured, MeasuredAxis):
+            every |= measured.kept(dynamics, own)
+        name, kept = min(every.items(), key=lambda one: one[1])
+        if kept < OFF_NOMINAL * (1.0 - MEASURED) and (measured is not None or dynamics is bench.dynamics):
             tell(
-                f"with {name} its model keeps {100.0 * kept:.0f} % of the margins of {dynamics.name} dynamics; "
+                f"with {name} it keeps {100.0 * kept:.0f} % of the margins of {dynamics.name} dynamics; "
                 f"{100.0 * OFF_NOMINAL:.0f} % are asked for"
             )
 

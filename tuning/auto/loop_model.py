@@ -18,7 +18,6 @@ from drive_env.loops.margins import margins
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, Windings, linear_machines, open_loops
 from drive_env.loops.worst_margins import HIGHEST, LOWEST, POINTS
 from drive_env.trials.score import servo_variants
-from tuning.response.measured_loop import GOOD_MISFIT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.identify.estimate import Identification
+    from tuning.response.measured_loop import MeasuredLoop
     from tuning.target import Target
 
 # Of the mass matrix over the axes' own inertia: a share that measures as much without being there, and the least own
@@ -108,6 +108,7 @@ class LoopModel:
         plants: Its axes; what their windings, filters and delays are.
         moved: What they move.
         inertia_range: What the load's inertia may become, over what it is.
+        measured: Whether the axis's response was measured: it says what another velocity P does, and no model need.
     """
 
     def __init__(
@@ -117,8 +118,11 @@ class LoopModel:
         plants: Sequence[Plant],
         moved: Mechanism,
         inertia_range: tuple[float, float] = INERTIA_RANGE,
+        *,
+        measured: bool = False,
     ) -> None:
-        self.device, self.axes, self._variants = device, len(plants), servo_variants(inertia_range)
+        self.device, self.axes = device, len(plants)
+        self._variants = [one for one in servo_variants(inertia_range) if not measured or one.velocity_p == 1.0]
         self._velocity_p = np.array([variant.velocity_p for variant in self._variants])
         parts = [moved.varied(motor.inertia, variant.inertia, variant.stiffness) for variant in self._variants]
 
@@ -202,9 +206,16 @@ def corner(device: Device, plant: Plant) -> float:
     return lag / max(lag / plant.velocity_filter + more, 1e-6)
 
 
-def model_of(device: Device, motor: Motor, plant: Plant, dynamics: Dynamics) -> LoopModel:
-    """Return the model of an axis that is alone, with the load that dynamics ask for."""
-    return LoopModel(device, motor, [plant], one_axis(plant), dynamics.inertia_range)
+def model_of(device: Device, motor: Motor, plant: Plant, dynamics: Dynamics, *, measured: bool = False) -> LoopModel:
+    """Return the model of an axis that is alone, with the load that dynamics ask for; `measured` as of `LoopModel`."""
+    return LoopModel(device, motor, [plant], one_axis(plant), dynamics.inertia_range, measured=measured)
+
+
+def measured_response(target: Target, recorded: RecordedGains | None, k: int) -> MeasuredLoop | None:
+    """Return the response that was measured of an axis, None if there is none, or of linked axes."""
+    if target.linked or recorded is None or recorded.response is None or recorded.unseen[k]:
+        return None
+    return recorded.response if np.isfinite(recorded.response.open_loop[:, k]).any() else None
 
 
 class LinkedAxis:
@@ -242,8 +253,9 @@ def fitted_plant(
     their loops do, too, which looks like a resonance.
     """
     plant, found = identified.known(k)
-    fit = None if recorded is None or recorded.response is None or recorded.unseen[k] else recorded.response.fits[k]
-    if fit is not None and not fit.reason and fit.misfit <= GOOD_MISFIT:
+    response = measured_response(target, recorded, k)
+    fit = None if response is None else response.fits[k]
+    if fit is not None and fit.is_good:
         plant = replace(fit.plant, R=plant.R, L=plant.L, supply=plant.supply)
         known = {name: one for name, one in fit.estimates.items() if one.is_known and name in found.estimates}
         found = replace(found, estimates={**found.estimates, **known})
@@ -274,7 +286,8 @@ def loop_models(
             models.append((LoopModel(target.device, target.motor, plants, moved, dynamics.inertia_range), axes))
             continue
         for k, plant in zip(axes, plants, strict=True):
-            models.append((model_of(target.device, target.motor, plant, dynamics), np.array([k])))
+            measured = measured_response(target, recorded, int(k)) is not None
+            models.append((model_of(target.device, target.motor, plant, dynamics, measured=measured), np.array([k])))
     return models
 
 
@@ -313,5 +326,5 @@ def alone(identified: IdentifiedAxes, recorded: RecordedGains | None, k: int) ->
     fits = [found.fit]
     if recorded is not None and recorded.response is not None and not recorded.unseen[k]:
         fits.append(recorded.response.fits[k])
-    good = [fit for fit in fits if fit is not None and not fit.reason and fit.misfit <= GOOD_MISFIT]
+    good = [fit for fit in fits if fit is not None and fit.is_good]
     return good[-1].plant if good else replace(plant, inertia=2.0 * plant.inertia)

@@ -11,7 +11,6 @@ from drive_env.loops.dynamics import OFF_NOMINAL
 from drive_env.loops.linear_model import controllers, velocity_filter_response, velocity_plant
 from drive_env.loops.margins import Margins, margins
 from drive_env.trials.score import VARIANTS
-from tuning.response.measured_loop import GOOD_MISFIT
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
@@ -21,7 +20,9 @@ if TYPE_CHECKING:
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once
 LOOPS = "velocity", "position"  # that are judged
-FACTORS = tuple(sorted({variant.velocity_p for variant in VARIANTS} - {1.0}))  # of velocity P, that loops must bear
+FACTORS = {
+    variant.velocity_p: variant.name for variant in VARIANTS if variant.velocity_p != 1.0
+}  # that loops must bear
 
 
 class MeasuredAxis:
@@ -39,7 +40,7 @@ class MeasuredAxis:
         self._plant = plant if fit is None or fit.reason else fit.plant
         f, L, trusted = response.refined(axis)
         # Between lines and beyond those that are coherent the fitted model stands, where it fits.
-        seen = np.isfinite(L) & (trusted | (fit is not None and not fit.reason and fit.misfit <= GOOD_MISFIT))
+        seen = np.isfinite(L) & (trusted | (fit is not None and fit.is_good))
         self._f, self._measured, self._trusted = f[seen], L[seen], trusted[seen]
         self._gains = response.gains[axis]
         self._z = np.exp(2j * math.pi * self._f / self._device.velocity_rate)
@@ -76,6 +77,19 @@ class MeasuredAxis:
         """
         parts = [gains[first : first + AT_ONCE] for first in range(0, len(gains), AT_ONCE)]
         return np.concatenate([self._slack(dynamics, part) for part in parts])
+
+    def kept(self, dynamics: Dynamics, gains: Integers) -> dict[str, float]:
+        """Return how much of the dynamics the loops keep with another velocity P, by the name of what is different.
+
+        Args:
+            dynamics: What is 1.
+            gains: Raw, (count,).
+        """
+        other = self._device.gains.with_velocity_p(np.tile(gains, (len(FACTORS), 1)), np.array(list(FACTORS)))
+        return {
+            name: max(float(kept), 0.0)
+            for name, kept in zip(FACTORS.values(), self._clearance(dynamics, other), strict=True)
+        }
 
     def _slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
         known = self._device.gains

@@ -29,7 +29,7 @@ from tuning.oscillation_watch import OscillationError, shaken, watch_of
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.response.held_samples import split, unhold
-from tuning.response.measured_loop import COHERENT, GOOD_MISFIT, MeasuredLoop, merged
+from tuning.response.measured_loop import COHERENT, MeasuredLoop, merged
 from tuning.response.plant_fit import PlantFit, Seen, fit_plant
 from tuning.response.transfer import directions, transfer
 from tuning.rules.lags import velocity_noise
@@ -431,7 +431,7 @@ class _Measurement:
             dead_time_resistance(device, target.motor, supply, current),
             None if weaker is None else _fitted(f, weaker)[0],
         )  # fmt: skip
-        if not fit.reason and fit.misfit > GOOD_MISFIT:
+        if not (fit.reason or fit.is_good):
             self._notes[axis].append(
                 f"the linear model does not fit (error {fit.misfit:.1f} times the noise); margins are read from the "
                 "measured frequencies alone"

@@ -26,7 +26,6 @@ Mask = NDArray[np.bool_]
 
 COHERENT = 0.95  # from which on a line is trusted
 FINE = 10  # points between two lines, where margins are looked for
-GOOD_MISFIT = 2.0  # of a fit that is good enough to read margins between lines by
 SMOOTHING = 1.5  # lines, standard deviation
 DRAWS, DRAWN_SEED, SURE = 100, 20, 2.5  # plants within a fit's intervals, and the percentile that is "at least"
 MODEL_POINTS, MODEL_LOW, NYQUIST = 400, 2.0, 0.49  # frequencies of a model: how many, from [Hz], up to of its rate
@@ -106,7 +105,7 @@ class MeasuredLoop:
         of a line's noise. Without a fit the lines stand as they are.
         """
         fit, L, good = self.fits[axis], self.open_loop[:, axis], self.trusted[:, axis]
-        if fit is None or fit.reason or fit.misfit > GOOD_MISFIT or good.sum() < 2:
+        if fit is None or not fit.is_good or good.sum() < 2:
             return self.f, L, good
         lines = np.arange(len(self.f))
         at = np.interp(np.arange(FINE * (len(self.f) - 1) + 1) / FINE, lines, self.f)
@@ -162,8 +161,8 @@ class MeasuredLoop:
             axis: Number of the axis.
         """
         fit = self.fits[axis]
-        if fit is None or fit.reason or fit.misfit > GOOD_MISFIT:
-            return AtLeast(math.nan, math.nan)
+        if fit is None or not fit.is_good or (fit.plant.is_elastic and not fit.estimates["resonance"].is_known):
+            return AtLeast(math.nan, math.nan)  # what was refused as a resonance may be the play of a gear
         f = np.geomspace(MODEL_LOW, NYQUIST * self.device.velocity_rate, MODEL_POINTS)
         found = []
         for drawn in fit.drawn(np.random.default_rng(DRAWN_SEED), DRAWS):

@@ -12,7 +12,7 @@ import numpy as np
 
 from drive_env.loops.linear_model import outer_loop, velocity_open_loop
 from drive_env.loops.margins import margins
-from tuning.response.measured_loop import GOOD_MISFIT, MODEL_LOW, MODEL_POINTS, NYQUIST, AtLeast
+from tuning.response.measured_loop import MODEL_LOW, MODEL_POINTS, NYQUIST, AtLeast
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -35,7 +35,7 @@ def why_unbounded(identified: Identification) -> str:
     fit = identified.fit
     if fit is None or fit.reason:
         return f"its frequency response was not identified: {identified.estimates['resonance'].reason}"
-    if fit.misfit > GOOD_MISFIT:
+    if not fit.is_good:
         return f"the linear model does not fit the axis: the error is {fit.misfit:.1f} times the noise"
     pair = [fit.estimates[name] for name in ("anti_resonance", "resonance")]
     # Twins make do with a guess.

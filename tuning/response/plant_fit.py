@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -57,6 +58,10 @@ DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of
 ABOUT = 1.1  # of a pair: how far the lines go that tell it when it lies close together
 SECONDS, SPACING = 6, 0.25  # beginnings that are tried for a second pair, and their distance, a logarithm
 RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where the search begins
+# Where the search for a pair begins: the cheapest of those about the deepest swing, between the lines to either side of
+# its ends, and of a grid over all frequencies. A lightly damped pair is found from nearby alone.
+BETWEEN, DAMPINGS, LOWS, BEGINNINGS = 7, (0.005, 0.02, 0.08), 16, 5
+GOOD_MISFIT = 2.0  # of a fit by which margins may be read between lines
 RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
 NAMES = ("inertia", "velocity_filter", "loop_delay", "anti_resonance", "resonance", "damping")
 _UNITS = dict(zip(NAMES, ("kg*m^2", "Hz", "s", "Hz", "Hz", "1"), strict=True))
@@ -90,6 +95,11 @@ class PlantFit(NamedTuple):
     reason: str = ""
     second: Pair | None = None
     lost: float = 0.0  # what dead time adds to the resistance of a winding that is shaken [ohm]
+
+    @property
+    def is_good(self) -> bool:
+        """Whether there is a fit that is good enough to read margins between lines by."""
+        return not self.reason and self.misfit <= GOOD_MISFIT
 
     def open_loop(self, device: Device, gains: NDArray[np.int64], f: Floats) -> Complex:
         """Return the velocity loop's open loop at frequencies [Hz], shape (n,)."""
@@ -294,7 +304,7 @@ def _solve(loop: _Loop, start: _Model) -> _Solution:
         np.clip(p, low + 1e-6, high - 1e-6),
         bounds=(low, high),
         loss="soft_l1",
-        max_nfev=30 if len(p) < FIRST + 6 else 60,
+        max_nfev=60,
         x_scale=np.array([0.1, 0.1, 0.1, 0.3, 0.02, 0.05, 0.3, 0.02, 0.05, 0.3])[: len(p)],
     )
     found, jacobian = _unpack(result.x, start), np.asarray(result.jac)
@@ -375,26 +385,30 @@ def _with_inertia(plant: Plant, device: Device, gains: NDArray[np.int64], f: Flo
 
 
 def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
-    """Return plants with a pair to begin with: the deepest swing of the response, and the best of a coarse grid."""
+    """Return plants with a pair to begin with: about the deepest swing of the response, and of a coarse grid."""
     device, gains, f = loop.device, loop.gains, loop.f
     level = 20.0 * np.log10(np.abs(rough / velocity_plant(device, rigid, gains, f)))
     pairs = []
     for valley in range(len(f) - 1):
         peak = valley + int(np.argmax(level[valley:]))
         pairs.append((level[peak] - level[valley], f[valley], f[peak]))
-    _, low, high = max(pairs)
-    plants = [replace(rigid, anti_resonance=float(low), resonance=float(high), damping=0.03)] if high > low else []
+    _, valley_hz, peak_hz = max(pairs)
 
-    def scaled(plant: Plant) -> Plant:
+    def scaled(low: float, high: float, damping: float) -> Plant:
+        plant = replace(rigid, anti_resonance=float(low), resonance=float(high), damping=damping)
         ratio = float(np.median(np.abs(velocity_plant(device, plant, gains, f) / rough)))
         return replace(plant, inertia=plant.inertia * ratio)
 
-    grid = [
-        scaled(replace(rigid, anti_resonance=float(low), resonance=float(low * ratio), damping=0.03))
-        for low in np.geomspace(f[0], f[-1] * 0.8, 16)
-        for ratio in RATIOS
+    between = np.linspace(-1.0, 1.0, BETWEEN) * float(np.median(np.diff(f)))
+    near = [
+        scaled(valley_hz + a, peak_hz + b, damping)
+        for a, b, damping in product(between, between, DAMPINGS)
+        if f[0] <= valley_hz + a < peak_hz + b
     ]
-    return plants + sorted(grid, key=lambda plant: _cost(loop, _Model(plant)))[:3]
+    grid = [scaled(low, low * ratio, 0.03) for low in np.geomspace(f[0], f[-1] * 0.8, LOWS) for ratio in RATIOS]
+    return [
+        one for some in (near, grid) for one in sorted(some, key=lambda plant: _cost(loop, _Model(plant)))[:BEGINNINGS]
+    ]
 
 
 def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
