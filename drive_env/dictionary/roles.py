@@ -1,7 +1,7 @@
 """Roles: the parts that objects play on a drive, whatever their index; a device's `roles.toml` says which object does.
 
-A role is a name for an object wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. A role that a device does
-not have is an answer: `has_role`, or an error that says so.
+A role is a name for an object wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. `device.roles` has those
+of a device; to read or write another one is an error that names the role.
 """
 
 from __future__ import annotations
