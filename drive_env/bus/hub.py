@@ -223,7 +223,7 @@ class Hub:
     def _accept(self, now: float) -> None:
         try:
             connection, address = self._listener.accept()
-        except OSError as error:  # gone again already, or no file number left: somebody gives up his
+        except OSError as error:  # gone again already, or no file number left: a client gives up its own
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 self._make_room(now)
             return
@@ -273,7 +273,7 @@ class Hub:
         """
         others = [c for c in self._clients if not (c is newcomer or c.channel.locked or c.dropped)]
         for client in others:
-            if client.frames and client.has_left():  # as long as it has frames nobody reads it
+            if client.frames and client.has_left():  # its frames are not read before they are gone
                 client.end()
         gone = [c for c in others if c.ended]
         unopened = [c for c in others if not c.was_open]

@@ -23,7 +23,7 @@ VERSION = b"V1013\r"  # hardware 1.0, software 1.3
 SERIAL_NUMBER = b"NDE01\r"
 CLOCK = 8_000_000  # Hz, of the SJA1000's bit timing registers
 TOKEN_WANTED = b"K\r"
-TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and at a guess a second nobody finds eight characters
+TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and at a guess a second eight characters are not found
 
 _STANDARD = re.compile(rb"[tr]([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _EXTENDED = re.compile(rb"[TR]([01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)")

@@ -146,7 +146,7 @@ class Wire:
         return max(self._free_at, min(c.queue[0].ready for c in self._senders.values() if c.queue))
 
     def take(self, until: float) -> Transmission | None:
-        """Return the next transmission that ends at `until` [s] or before, None if there is none.
+        """Return the next transmission that ends at `until` [s] or before, None if no transmission does.
 
         Who wins arbitration is settled only when the bus is free: call it with times that have come.
         """
@@ -180,7 +180,7 @@ class Wire:
             queue.append(waiting)
 
     def _disturbing(self, frame: Frame) -> Sequence[Faults]:
-        """Return what disturbs a frame."""
+        """Return the faults that apply to a frame."""
         if not self.faults and not self.injected:
             return ()
         return [one for one in (self.faults, *self.injected) if one and (not one.only or frame.can_id in one.only)]
@@ -261,7 +261,7 @@ class Wire:
 
 
 def _arbitration_field(waiting: _Waiting) -> tuple[int, bool, int, bool]:
-    """Return what the bus compares: base identifier, extended or not, extension, remote or not; dominant is lower.
+    """Return the bits of arbitration: base identifier, extended or not, extension, remote or not; dominant is lower.
 
     In a standard frame the remote bit lies where an extended one has its substitute, which is recessive: a standard
     frame of either kind wins, its identifier extension bit being dominant.

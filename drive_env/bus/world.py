@@ -77,7 +77,7 @@ class World:
         machines: Those of `drives` that have a load, in the order in which they were added.
         listeners: Called with each frame that everybody received, also its own sender.
         before_cycle: Called as a communication cycle begins; they may send by the wire.
-        beside: Another fieldbus of these drives, that lives by this world's time; None: there is none.
+        beside: Another fieldbus of these drives, that lives by this world's time; None without one.
         time: Time since the world began [s].
         cycles: Communication cycles that have passed.
 
@@ -350,7 +350,7 @@ class World:
 
 
 def without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
-    """Return as many axes of the same device as nobody has commissioned and no motor is connected to."""
+    """Return axes of the same device with factory values and open phases, as those without a motor have."""
     open_phases = {"motor.open_a": 1.0, "motor.open_b": 1.0}
     return EmulatedDrives(
         drives.device.name, "inertia", drives.motor, number, commissioned=False, parameters=open_phases, num_threads=1

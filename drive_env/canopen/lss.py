@@ -1,6 +1,6 @@
 """The slave of the layer setting services: node-ID and bit rate over the bus, without a node-ID (CiA 305).
 
-A request goes in, the response comes out: eight bytes, or None where there is none. The slave waits until the master
+A request goes in, the response comes out: eight bytes, or None without a response. The slave waits until the master
 switches it into configuration, all slaves at once or the one with an identity. What is configured is pending: a node-ID
 takes effect with the next reset, a bit rate when all activate it at once.
 """

@@ -322,7 +322,7 @@ class Node:
         self._store.loses_power = value
 
     def leds(self, error_counter: int = 0) -> Leds:
-        """Return what its lamps show; `error_counter` is its controller's."""
+        """Return its lamps; `error_counter` is its controller's."""
         boots = self.state is NmtState.INITIALISING
         is_lss = self.node_id == UNCONFIGURED or (self._lss is not None and self._lss.is_configuring)
         return leds_of(self.state, not self._is_online and not boots, self._errors.conditions, error_counter, is_lss)
@@ -425,7 +425,7 @@ class Node:
         """
         self.state = NmtState.INITIALISING
         if self._take_pending_node_id():
-            # Whoever commanded it, and watched it, knows it no more by its new number.
+            # The master that commanded and watched it does not know it by its new number.
             self._axes.trip()
         self._leaves_for_bootloader = False
         self._received.clear()
@@ -620,7 +620,7 @@ class Node:
             self._clock.set(*time, self._came)
 
     def _on_sync(self, data: bytes, now: float) -> None:
-        # CiA 301: without or with a counter. Whoever has no 1019h takes both.
+        # CiA 301: without or with a counter. A node without 1019h takes both.
         if len(data) > 1 or not nmt.SERVICES[self.state].pdo:
             return
         if self._module.has(communication.SYNC_OVERFLOW):
@@ -704,7 +704,7 @@ class Node:
         module.commands[communication.TIME_STAMP, 0] = lambda raw: self._clock.set_microseconds(raw, self._came)
 
     def _eds_text(self) -> str:
-        """Return what 1021h holds, each byte a character: the EDS as it is, which 1022h says is not compressed."""
+        """Return the content of 1021h, each byte a character: the EDS as it is, which 1022h says is not compressed."""
         return eds_text(self._device.eds).encode().decode("latin-1")
 
     def _leave_for_bootloader(self) -> None:
@@ -761,7 +761,7 @@ class Node:
         """Stop the axes and fall silent; have the pending bit rate after `delay` [s], and speak after as long again."""
         if self._pending_bit_rate is None:
             return
-        self._axes.trip()  # nobody can stop them over a bus whose nodes change their bit rate
+        self._axes.trip()  # no master can stop them over a bus whose nodes change their bit rate
         self._is_online = False
         self._received.clear()
         self._close_sdo()

@@ -82,8 +82,8 @@ class TransmitPdo(Pdo):
     """A PDO that the drive sends.
 
     Event-driven ones (254, 255) are sent when a mapped value has changed since the last look, once per communication
-    cycle, and when their event timer ends; so is one when the node becomes operational, since then nobody knows its
-    values. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last;
+    cycle, and when their event timer ends; so is one when the node becomes operational, since its values are unknown
+    then. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last;
     event timer and inhibit time are not theirs (CiA 301, 1800h).
     """
 

@@ -25,7 +25,7 @@ OF_OTHERS = 1
 
 
 def show_compiling() -> CompileBar:
-    """Let a program show what is compiled from now on, and return what shows it."""
+    """Show kernels as they compile from now on, and return the bar that shows them."""
     kernels = logging.getLogger(KERNELS)
     for handler in [one for one in kernels.handlers if isinstance(one, CompileBar)]:
         kernels.removeHandler(handler)

@@ -146,7 +146,7 @@ def replay(
 
 
 def _check_frames(file: Path, frames: list[Any], speed: float) -> None:
-    """Raise ValueError for frames that classic CAN does not have, and stamps between which nobody can wait.
+    """Raise ValueError for frames that classic CAN does not have, and for waits between stamps that are too long.
 
     A log goes a little back where two buses were.
     """

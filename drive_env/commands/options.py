@@ -78,7 +78,7 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmat
 _INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
 
 
-# Whoever types one of these means drives on a bus.
+# Each of these options means drives on a bus.
 OF_A_BUS = ("interface", "channel", "node", "nodes", "bitrate", "lockstep")
 
 
@@ -195,7 +195,7 @@ def ending_by(
         fail(error, REFUSED)
     except OSError as error:
         if isinstance(error, BrokenPipeError) and output_is_closed():
-            raise typer.Exit(CLOSED) from None  # `| head -1` has seen enough: no mistake, and nobody to tell
+            raise typer.Exit(CLOSED) from None  # `| head -1` has read enough: no error, and no reader for a message
         fail(f"{error.filename}: {error.strerror}" if error.filename else error, USER_ERROR)
     except MemoryError as error:
         fail(f"there is not enough memory{f' ({error})' if str(error) else ''}; ask for less at a time", USER_ERROR)
@@ -270,7 +270,7 @@ def ask(question: str, yes: bool) -> None:
 
 
 def scales_of(drives: BusDrives) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it."""
+    """Read the scales of every axis, as far as the drives have them."""
     from drive_env.master import quantities
 
     return quantities.scales_of(drives)
@@ -323,13 +323,13 @@ def axes_of_nodes(drives: BusDrives, axis: int | None) -> list[int]:
 
 
 def axis_name(drives: BusDrives, axis: int) -> str:
-    """Return what a line calls an axis: its node and, of a node with several, its number in the node."""
+    """Return an axis' name for a line: its node and, of a node with several, its number in the node."""
     node, part = divmod(axis, drives.description.num_axes)
     return f"node {drives.nodes[node]}" + (f" axis {part}" if drives.description.num_axes > 1 else "")
 
 
 def axis_place(drives: BusDrives, axis: int) -> dict[str, Any]:
-    """Return what JSON calls an axis, as `axis_name` does a line."""
+    """Return an axis' place for JSON, as `axis_name` does for a line."""
     node, part = divmod(axis, drives.description.num_axes)
     return {"node": drives.nodes[node]} | ({"axis": part} if drives.description.num_axes > 1 else {})
 

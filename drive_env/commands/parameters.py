@@ -372,7 +372,7 @@ def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int
 
 
 def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
-    """Return the parameters of a file; ValueError for what is none."""
+    """Return the parameters of a file; ValueError if it has none or is damaged."""
     from drive_env.dictionary.access import check_in_range, check_writable
 
     rows = _read_toml(path).get("parameters")
@@ -395,7 +395,7 @@ def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Return what a file holds; ValueError if it is no TOML."""
+    """Return the content of a TOML file; ValueError if it is missing or not TOML."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
     try:

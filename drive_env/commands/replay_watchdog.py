@@ -151,7 +151,7 @@ class ReplayWatchdog:
 
 
 def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], dict[int, str]]:
-    """Return the nodes whose watch over a master frames set themselves, and of which there is none, why (0: all)."""
+    """Return the nodes whose watch over a master the frames set, and those left without one, why (0: all)."""
     own: set[int] = set()
     left: dict[int, str] = {}
     for frame in frames:

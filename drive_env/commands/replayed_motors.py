@@ -74,7 +74,7 @@ class ReplayedMotors:
         self._no_drives: set[int] = set()  # they answer, and have no statusword
 
     def check_none_is_live(self) -> None:
-        """Raise BusError for a node that somebody else runs."""
+        """Raise BusError for a node that another master has enabled."""
         status = self._statuswords(self._nodes)
         live = [f"{name(axis)} ({word:04X}h)" for axis, word in status.items() if cia402.is_live(word)]
         if live:
@@ -100,7 +100,7 @@ class ReplayedMotors:
         """
         stopped: list[Stopped] = []
         unproven: list[str] = []
-        # Who is known to be there answers at once; nobody's motor runs on while others are waited for.
+        # Nodes that are known to be there answer at once; no motor may run on while others are waited for.
         for nodes in (sorted(self._there), [node for node in self._nodes if node not in self._there]):
             known = bool(self._there.intersection(nodes))
             try:
@@ -148,7 +148,7 @@ class ReplayedMotors:
         return found
 
     def _ask(self, nodes: Iterable[int], index: int) -> dict[int, int | None]:
-        """Return what nodes answer to the read of an object; None of one that has no such object."""
+        """Read an object of nodes; return the answers, None of a node without that object."""
         answers: dict[int, int | None] = {}
 
         def take(node: int, data: bytes) -> None:
@@ -304,7 +304,7 @@ def nodes_spoken_to(frames: Iterable[Any]) -> tuple[int, ...]:
 
 
 def name(axis: Axis) -> str:
-    """Return what a line calls an axis."""
+    """Return an axis' name for a line."""
     node, part = axis
     return f"node {node}" + (f" axis {part}" if part else "")
 

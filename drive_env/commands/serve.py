@@ -16,7 +16,7 @@ import typer
 
 from drive_env.commands.options import REFUSED, USER_ERROR, fail
 
-# The compiler and MuJoCo take long to import: whoever asks for --help should not pay it.
+# The compiler and MuJoCo take long to import: --help should not wait for them.
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
     from drive_env.bus.server import Server
@@ -29,7 +29,7 @@ PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 AUTO = "auto"  # as --token
 NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of what is not named as its option
-NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
+NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then receives nothing
 ETHERCAT = ("ethercat", "ethercat-udp")
 TOKEN_BYTES = 12  # of chance: 16 characters
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
@@ -241,7 +241,7 @@ def _server(
 
 
 def _beside(server: Server, bus: Bus, real_time: bool) -> list[BesideCan]:
-    """Return what answers the EtherCAT master of a bus that has drives on both."""
+    """Return the EtherCAT side of a bus that has drives on both; [] without one."""
     from drive_env.commands.serve_ethercat import open_beside
 
     if not bus.has_both:
@@ -349,7 +349,7 @@ def _booted(server: Server, given: int) -> str:
 
 
 def _statistics(server: Server) -> str:
-    """Return what --stats prints."""
+    """Return the lines of --stats."""
     world, late = server.world, server.lateness
     counts = world.wire.statistics
     lost = counts.lost + getattr(server.transport, "lost", 0)
@@ -370,7 +370,7 @@ def _statistics(server: Server) -> str:
 
 
 def _ender(server: list[Server | EtherCatServer]) -> Any:
-    """Return a signal handler that ends the server, or the process where there is none yet."""
+    """Return a signal handler that ends the server, or the process if the server does not exist yet."""
 
     def end(*_: object) -> None:
         if server:

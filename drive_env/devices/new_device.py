@@ -127,7 +127,7 @@ class NewDevice(NamedTuple):
 def new_device(
     eds: Path, folder: Path, motor: Motor, *, velocity_unit: str = "", acceleration_unit: str = ""
 ) -> NewDevice:
-    """Write the folder of a device that its EDS describes; return what a person must know of it.
+    """Write the folder of a device that its EDS describes; return the notes that a person must read.
 
     Args:
         eds: The vendor's file.

@@ -123,7 +123,7 @@ class UnitCode(NamedTuple):
 
 
 def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
-    """Return what an object says; None where there is none, or it is 0."""
+    """Return the unit code of an object; None if the object is missing, or 0."""
     variable = types.get((index, 0))
     if variable is None or not isinstance(variable.default, int) or variable.default & 0xFFFFFFFF == 0:
         return None
@@ -190,9 +190,9 @@ def _shown(types: Mapping[Key, ODVariable], index: int) -> str:
 
 
 def written_angle(text: str) -> tuple[float, int]:
-    """Return what angle a second, or second squared, an EDS writes beside an object, in revolutions, and which it is.
+    """Parse the angle a second, or second squared, that an EDS writes beside an object, in revolutions, with the power.
 
-    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) of what is none.
+    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) for other texts.
     """
     found = _ANGLE.match(re.sub(r"[\s\[\]]", "", text.lower()))
     if found is None:

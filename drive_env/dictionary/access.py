@@ -84,7 +84,7 @@ def check_in_range(entry: Entry, raw: NDArray[Any]) -> None:
 
 
 def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]) -> None:
-    """Raise 06090030h for a value that is none of the few that the object knows."""
+    """Raise 06090030h for a value that is not among the few that the object allows."""
     wrong = raw[~np.isin(raw, allowed)]
     if wrong.size:
         raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; allowed are {_listed(allowed)}")

@@ -122,7 +122,7 @@ SPECIALS = 2  # of a unit at most
 
 
 def compiled_rows(codes: Sequence[Code], *, decoded: bool) -> Floats:
-    """Return rows as numbers, shape (n, 7): limits, period, special integers and their values, nan where there is none.
+    """Return rows as numbers, shape (n, 7): limits, period, special integers and their values; nan for a missing one.
 
     The limits are those of integers that are decoded, or of what is encoded by the factor.
     """

@@ -124,7 +124,7 @@ def _section_of(line: str) -> tuple[str, bool] | None:
 
 @lru_cache(maxsize=16)
 def parse_eds(text: str, node_id: int = 1) -> EdsFile:
-    """Return what an EDS says, put right.
+    """Read an EDS and correct its mistakes.
 
     Args:
         text: Of the file.

@@ -30,7 +30,7 @@ class PositionScale(NamedTuple):
 
 
 def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return what a drive with these roles counts positions in; None of one that does not say."""
+    """Return the scale of positions of a drive with these roles; None if it has none of the roles."""
     if Role.POSITION_SCALE in roles:
         return PositionScale((roles[Role.POSITION_SCALE],), lambda values: values[0])
     inside = (Role.TURN_INSIDE, Role.POSITION_NUMERATOR, Role.POSITION_DIVISOR)

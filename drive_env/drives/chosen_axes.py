@@ -147,7 +147,7 @@ class ChosenAxes:
         return whole
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the chosen axes have said by themselves since the last call, by their place among these."""
+        """Return the emergencies of the chosen axes since the last call, by their place among these."""
         place = {int(axis): k for k, axis in enumerate(self._axes)}
         told = self._drives.emergencies()
         return [message._replace(axis=place[message.axis]) for message in told if message.axis in place]

@@ -46,7 +46,7 @@ class BasicDrives(Protocol):
 class Drives(BasicDrives, Protocol):
     """Everything that callers may ask of drives.
 
-    What a kind of drives does not have is None: a bus has no `machine`, emulated drives have no `bus` and no `safety`.
+    An attribute that a kind of drives lacks is None: a bus has no `machine`, emulated drives no `bus` and no `safety`.
     """
 
     @property
@@ -87,7 +87,7 @@ class Drives(BasicDrives, Protocol):
         """Let time pass [s] while objects are recorded, and others, the keys of `play`, are written row by row."""
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies of the drives since the last call."""
 
     def reset_node(self, where: Mask | None = None) -> None:
         """Restart nodes, as after power-on."""
@@ -103,7 +103,7 @@ class Drives(BasicDrives, Protocol):
 
 
 def axis_number(drives: BasicDrives, axis: int) -> int:
-    """Return what an axis is called in messages and results."""
+    """Return an axis' number in messages and results."""
     numbers: Sequence[int] | None = getattr(drives, "axis_numbers", None)  # BasicDrives need not have them
     return axis if numbers is None else int(numbers[axis])
 
@@ -123,7 +123,7 @@ def bus_of(drives: Drives) -> BusDrives:
 
 
 def device_of(drives: Drives) -> Device:
-    """Return what drives are; ValueError where their EDS alone is known."""
+    """Return the device that drives are; ValueError where their EDS alone is known."""
     if drives.device is None:
         raise ValueError("only the EDS of these drives is known; give the device by name")
     return drives.device

@@ -211,7 +211,7 @@ def _not_in_mode(drives: BasicDrives, mode: str, axes: Mask) -> Mask:
 
 
 def _shown_modes(drives: BasicDrives) -> Integers | None:
-    """Return what 6061h shows, None of drives that have none."""
+    """Return the mode in 6061h, None for drives without 6061h."""
     try:
         return drives.read(cia402.MODE_DISPLAY)
     except ObjectAccessError:
@@ -298,7 +298,7 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         try:
             wait_for(drives, state, timeout, name, not_enabled)
         except TimeoutError:
-            # A drive that waits for its brake would enable later, when nobody expects it any more.
+            # A drive that waits for its brake would enable later, unexpectedly.
             late = not_enabled & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
             drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=late)
             raise
@@ -327,7 +327,7 @@ def _command_stop(drives: BasicDrives, word: int, where: Mask | None) -> None:
     drives.write(cia402.CONTROLWORD, word, where=where)
     if not _own_modes(drives):
         return
-    drives.advance(STEP)  # a statusword may be of before somebody changed the drive's own mode
+    drives.advance(STEP)  # a statusword may be older than a change of the drive's own mode by another program
     ignored = ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
     ignored = ignored if where is None else ignored & where
     if ignored.any():
@@ -476,7 +476,7 @@ def _stands_at(drives: BasicDrives, goal: Integers, axes: Mask) -> Mask:
 
 
 def _window(drives: BasicDrives) -> int:
-    """Return the widest position window of the axes [inc]; 0 where there is none, or it is switched off."""
+    """Return the widest position window of the axes [inc]; 0 without a window, or if it is switched off."""
     try:
         window = int(drives.read(cia402.POSITION_WINDOW).max())
     except ObjectAccessError:

@@ -93,7 +93,7 @@ class ObservedDrives:
 
     @property
     def machine(self) -> Machines | None:
-        """The emulated machines' side, unless somebody hides it."""
+        """The emulated machines' side, unless an observer hides it."""
         return None if any(observer.hides_machine for observer in self._observers) else self._drives.machine
 
     @property
@@ -167,7 +167,7 @@ class ObservedDrives:
         return parts[0] if len(parts) == 1 else Trace.joined(parts, period)
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies of the drives since the last call."""
         return self._drives.emergencies()
 
     def reset_node(self, where: Mask | None = None) -> None:

@@ -44,7 +44,7 @@ class CyclicControl:
 
     Attributes:
         play: What is played.
-        played: Integers to play, shape (objects, cycles, num_axes); whoever runs, or `before`, fills them in.
+        played: Integers to play, shape (objects, cycles, num_axes); filled in by the caller, or by `before`.
         sampled: Integers of each cycle, written, shape (objects, cycles, num_axes).
     """
 

@@ -171,7 +171,7 @@ class LiveDictionary:
         return self._values[entry.index, entry.sub]
 
     def stored(self, axis: int) -> dict[tuple[int, int], int]:
-        """Return what a restart restores on one axis."""
+        """Return the values that a restart restores on one axis."""
         return {key: int(raw[axis if len(raw) > 1 else 0]) for key, raw in self._stored.items()}
 
     def store(self, axis: int, values: Mapping[tuple[int, int], int]) -> None:
@@ -211,7 +211,7 @@ class LiveDictionary:
         return self._scale_changes
 
     def prepared_record(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> PreparedRecord | None:
-        """Return what a call of `record` needs when it repeats, None if an object needs the long way.
+        """Return the prepared form of a repeated call of `record`, None if an object needs the long way.
 
         The call was made before, so that everything was found that could be refused but values.
         """
@@ -252,7 +252,7 @@ class LiveDictionary:
         return self.codes.get(key)
 
     def recorded(self, entry: Entry, code: Code, values: Floats) -> Integers:
-        """Return what an object was, of SI values of where `recordable` has it, axes last."""
+        """Return an object's integers of recorded SI values, from the place that `recordable` has for it; axes last."""
         raw = self.to_od(code, values)
         if self._is_error_code(entry):
             return self._error_codes(raw)
@@ -334,7 +334,7 @@ class LiveDictionary:
     def _stored_snapshot(self) -> RecordSnapshot:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
 
-        What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
+        Fields that the firmware computes are left out; a parameter that cannot be written is fixed.
         An object that only shows what another sets has no say.
         """
         length = max(map(len, self._stored.values()))
@@ -373,7 +373,7 @@ class LiveDictionary:
         return (entry.index, entry.sub) in self.codes
 
     def context(self) -> units.Context:
-        """Return what the factors of units depend on now, one value per axis."""
+        """Return the values that the factors of units depend on now, one per axis."""
         scales = units.Context(
             position_scaler=self._scale_field(SCALE_FIELD),
             current_lsb=self.device.current_full_scale / 32768.0,

@@ -129,7 +129,7 @@ class Machines:
             period: After which the table begins anew; without one the first and last values hold outside.
 
         Raises:
-            ValueError: For a table that is none; nothing is changed then.
+            ValueError: For an invalid table; nothing is changed then.
         """
         drives = self._drives
         if of not in ("time", "position"):
@@ -344,7 +344,7 @@ class Machines:
     def error_bits(self) -> NDArray[np.int64]:
         """Errors that are there whatever machine and drive do, shape (num_axes,); bit k is error k of the table.
 
-        Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is none of
+        Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is not of
         its errors, and on drives whose errors have no numbers.
         """
         self._check_has_errors()
@@ -471,7 +471,8 @@ class Machines:
             Its number, for `clear_fault`.
 
         Raises:
-            ValueError: For a fault, parameter, time or condition that is none, or one that this load cannot have.
+            ValueError: For an unknown fault or parameter, an invalid time or condition, or a fault that this load
+            cannot have.
         """
         order = Order(name, at, when, duration, axis=axis, parameters=parameters)
         return self._drives._faults.add(order, self._mask(where))
@@ -493,7 +494,7 @@ class Machines:
         return found
 
     def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
-        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        """End a fault or call it off, None all of them; ValueError for an unknown number."""
         self._drives._faults.clear(number, self._mask(where))
 
     def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:

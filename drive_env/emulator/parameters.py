@@ -112,7 +112,7 @@ def draw_parameters(
         wired_as_known: Draw no wiring unless it is named itself: for drives that were commissioned for the motor's.
 
     Raises:
-        ValueError: If a name is none of a group or parameter.
+        ValueError: For an unknown group or parameter.
     """
     chosen = _chosen(table, randomise)
     if wired_as_known:

@@ -240,7 +240,7 @@ class GainScheduling(VectorEnvironment):
         options: Fields of the configuration that replace its own.
 
     Raises:
-        ValueError: For a value that is none, naming those that are.
+        ValueError: For an invalid value, naming the valid ones.
     """
 
     STATE = (

@@ -301,7 +301,7 @@ class Tracking(VectorEnvironment):
         options: Fields of the configuration that replace its own.
 
     Raises:
-        ValueError: For a value that is none, naming those that are.
+        ValueError: For an invalid value, naming the valid ones.
     """
 
     OPTIONS = (*VectorEnvironment.OPTIONS, "trajectory")
@@ -650,7 +650,7 @@ class Tracking(VectorEnvironment):
                     raise
 
     def _faults(self, lanes: Mask) -> NDArray[np.object_]:
-        """Return what ended each lane: emergencies by name, "diverged", "fell", "not enabled"; "" where nothing did."""
+        """Return the cause of each environment's end: emergencies by name, "diverged", "fell", "not enabled", or ""."""
         self._take_emergencies()
         machine = self.drives.machine
         diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)

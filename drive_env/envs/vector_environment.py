@@ -58,8 +58,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
             episodes end, (num_envs,) each; returns the rewards, (num_envs,), in place of the environment's.
 
     Raises:
-        ValueError: For a mode that is none, or less than one environment; in a step for a reward of another shape, or
-            one that is not a number.
+        ValueError: For an unknown mode, or less than one environment; in a step for a reward of another shape, or one
+        that is not a number.
     """
 
     OPTIONS: tuple[str, ...] = ("reset_mask", "state", "machine")  # of reset
@@ -114,7 +114,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         raise NotImplementedError
 
     def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
-        """Act in the only environment; return what `gymnasium.Env.step` returns."""
+        """Act in the only environment; return the tuple of `gymnasium.Env.step`."""
         observation, reward, terminated, truncated, info = self._step_rewarded(_batch_of_one(action))
         return one_of(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), one_of(info)
 
@@ -151,7 +151,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     def stage(self) -> float:
         """Stage of the curriculum, 0...1, of machines that are drawn from now on; the configuration's until it is set.
 
-        Whoever trains sets it, with `curriculum.stage_at(environment steps so far)`.
+        A training sets it, with `curriculum.stage_at(environment steps so far)`.
         """
         return float(self.config.stage if self._stage is None else self._stage)
 
@@ -207,7 +207,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return machine.drives
 
     def _description(self) -> State:
-        """Return what must be equal in two vectors of environments so that one can restore the state of the other."""
+        """Return the properties that must be equal in two vectors of environments to restore the other's state."""
         table = {one.name: _text(getattr(self.config, one.name)) for one in fields(self.config)}
         table.pop("num_threads", None)
         return {"environment": type(self).__name__, "version": version("drive-env"), "num_envs": self.num_envs, **table}

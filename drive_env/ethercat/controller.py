@@ -239,7 +239,7 @@ class SlaveController:
 
     # --- memory -------------------------------------------------------------------------------------------------------
     def read(self, address: int, length: int, now: int) -> bytes | None:
-        """Return what a master reads at world time `now` [ns]; None: nothing there could be read."""
+        """Return the bytes that a master reads at world time `now` [ns]; None if the range cannot be read."""
         end = address + length
         if length == 0 or end > registers.RAM_END:
             return None
@@ -286,7 +286,7 @@ class SlaveController:
         return done
 
     def _peek(self, address: int, length: int) -> bytes:
-        """Return what the master wrote last, to write some of its bits anew."""
+        """Return the bytes that the master wrote last, to write some of their bits anew."""
         return bytes(self.memory[address : address + length]).ljust(length, b"\0")
 
     def _refresh(self, address: int, end: int, now: int) -> None:

@@ -121,7 +121,7 @@ class DistributedClock:
                 self._memory[registers.SYNC_STATUS] = NOT_IN_NEAR_FUTURE
 
     def next_pulse(self) -> int | None:
-        """Return the world time [ns] of the next pulse, None where there is none."""
+        """Return the world time [ns] of the next pulse, None without pulses."""
         if self._next_pulse is None:
             return None
         (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)

@@ -54,7 +54,7 @@ class FileServer:
         self._packet = 0
 
     def request(self, message: bytes, full: int, room: int, *, is_bootstrap: bool) -> bytes | None:
-        """Return the answer to a message without its mailbox header; None: there is none.
+        """Return the answer to a message without its mailbox header; None without an answer.
 
         Args:
             message: The message.

@@ -41,7 +41,7 @@ class SiiInterface:
 
     Attributes:
         content: The EEPROM's.
-        is_changed: The master has written to it, since somebody last looked.
+        is_changed: The master has written to it since this was last reset.
     """
 
     def __init__(self, memory: bytearray, takes_time: bool) -> None:

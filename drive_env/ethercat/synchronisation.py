@@ -80,7 +80,7 @@ class Synchronisation:
     def begin(self, clock: ClockSetting) -> AlStatusCode:
         """Take the clocks as they are set before Safe-Op; return why that cannot be, or NO_ERROR.
 
-        A cycle of SYNC0 that the device cannot keep up with is refused; 0, a single pulse, is none.
+        A cycle of SYNC0 that the device cannot keep up with is refused; 0 means a single pulse and is taken.
         """
         if clock.has_sync0 and clock.sync0_cycle < self._shortest:
             return AlStatusCode.DC_CYCLE_TIME

@@ -113,7 +113,7 @@ def of_drives(name: str, changes: tuple[Change, ...], fields: Collection[str], d
 
 
 def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes: int) -> tuple[Change, ...]:
-    """Return what a fault changes on a machine.
+    """Return the changes that a fault makes to a machine.
 
     Args:
         name: The fault.

@@ -100,7 +100,7 @@ def axes_that_fulfil(condition: Condition, drives: EmulatedDrives) -> Mask:
 
 
 class MachineFaults:
-    """All faults of a set of emulated machines. Nothing is looked at while there are none.
+    """All faults of a set of emulated machines. Without faults nothing is checked.
 
     A fault's change is on top of the machine as it was built: `base` keeps what a quantity is without any, and several
     faults of one quantity act in the order in which they were given.
@@ -152,7 +152,7 @@ class MachineFaults:
         """Return the row of a fault and what it changes.
 
         Raises:
-            ValueError: For a fault that these machines cannot have, or an order that is none.
+            ValueError: For a fault that these machines cannot have, or an invalid order.
         """
         name, axis = order.name, order.axis
         row = find_fault(name)
@@ -176,7 +176,7 @@ class MachineFaults:
         ]  # fmt: skip
 
     def clear(self, number: int | None, machines: Mask) -> None:
-        """End a fault, or all, on some machines; ValueError if there is none of that number."""
+        """End a fault, or all, on some machines; ValueError for an unknown number."""
         known = [fault.number for fault in self._faults]
         if number is not None and number not in known:
             raise ValueError(f"there is no fault {number}; there are {', '.join(map(str, known)) or 'none'}")

@@ -30,10 +30,10 @@ class Condition:
 
     @classmethod
     def parse(cls, text: str) -> Condition:
-        """Return what `when` says: "enabled", or as "speed > 100" or "position < -3.5".
+        """Parse `when`: "enabled", or a comparison such as "speed > 100" or "position < -3.5".
 
         Raises:
-            ValueError: If it says neither.
+            ValueError: For any other text.
         """
         if text.strip() in (NO_CONDITION, ENABLED):
             return cls(text.strip())
@@ -81,7 +81,7 @@ def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tu
 
 
 def parse_order(text: str) -> Order:
-    """Return what one line asks for: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
+    """Parse one line as an order: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
 
     Raises:
         ValueError: For a line that cannot be understood; the values are checked by whoever takes the order.

@@ -44,7 +44,7 @@ class AskedRows:
                 # What comes belongs to the row that is next when it is there.
                 values = [self._read(entry) for entry in self._entries]
                 self._told.append((self._passed(), values))
-        except BaseException as error:  # told by whoever waits for the rows
+        except BaseException as error:  # raised where the rows are waited for
             self._error = error
 
     def rows(self, count: int) -> dict[Key, Integers]:

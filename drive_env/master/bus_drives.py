@@ -125,7 +125,7 @@ class BusDrives:
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
             SafetyError: If a limit does not; NoAnswerError if a node is silent.
-            ValueError: For a quantity that the object is none of.
+            ValueError: For a quantity of another kind than the object's.
         """
         self._enter()
         entry = self._description.dictionary.find(name)
@@ -345,7 +345,7 @@ class BusDrives:
         self._cycle_runner.prepare(envelope)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every SYNC."""
+        """Return the objects that are sampled with every SYNC."""
         return self._cycle_runner.mapped()
 
     def poll(self, envelope: Envelope) -> bool | None:
@@ -354,7 +354,7 @@ class BusDrives:
 
     @property
     def is_dry(self) -> bool:
-        """Whether what would be sent is printed, and nobody is there."""
+        """Whether this is a dry run: frames are printed, and no drive is connected."""
         return self._link.is_dry
 
     def start(self) -> None:
@@ -424,7 +424,7 @@ class BusDrives:
             self._link.welcome(k)
 
     def _who_it_is(self, kind: int, axis: int) -> str:
-        """Return what to open a node as that is another device."""
+        """Return the advice for a message: as which device, or with which EDS, this node should be opened."""
         vendor, product = (self.read_axis(self._description.dictionary.find(key), axis) for key in list(_IDENTITY)[:2])
         other = device_of(kind, vendor, product)
         if other is None:
@@ -479,7 +479,7 @@ class BusDrives:
 
 def checked_limits(safety: Limits | bool) -> Limits | None:
     """Return the limits that hold, None for none at all; TypeError for what is neither."""
-    if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that nobody watches
+    if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that there is no envelope
         raise TypeError(f"safety = {safety!r} must be Limits, True for those of the drives, or False for an emulator")
     return (Limits() if safety is True else safety) or None
 

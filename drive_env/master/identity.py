@@ -49,7 +49,7 @@ class Identity(NamedTuple):
 
 
 def read_identity(drives: BusDrives, node: int = 0) -> Identity:
-    """Return what a node says of itself.
+    """Read a node's identity.
 
     Args:
         drives: Drives on a bus.
@@ -111,7 +111,7 @@ def check_same_drive(file: object, written: Identity | None, found: Identity, *,
     """
     if other_drive or written is None:
         return
-    by_node = written.serial is None and found.serial is None  # its node-ID is all that tells it from its neighbours
+    by_node = written.serial is None and found.serial is None  # only the node-ID distinguishes it from its neighbours
     pairs = [
         ("device", written.device, found.device),
         ("vendor", _hex(written.vendor), _hex(found.vendor)),

@@ -49,7 +49,7 @@ class Wording(NamedTuple):
 
 
 class ObjectClient(Protocol):
-    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
+    """Reads and writes objects of a node, as bytes, for any thread; one transfer at a time."""
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
         """Return the bytes of an object.
@@ -133,7 +133,7 @@ class ProcessData(Protocol):
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
     ) -> tuple[Entry, ...]:
-        """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+        """Return the objects to sample: the wanted ones, then as many of the welcome ones, in their order, as fit.
 
         Args:
             wanted: To be sampled.
@@ -155,13 +155,13 @@ class ProcessData(Protocol):
         """
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every cycle."""
+        """Return the objects that come with every cycle."""
 
     def outputs(self, played: Mapping[Entry, Integers]) -> Outputs | None:
         """Return rows to send, of integers of shape (cycles, num_axes) for all that is mapped; None of nothing."""
 
     def samples(self) -> Samples | None:
-        """Begin to collect what is mapped out of the drives; None where nothing is, or nobody is there."""
+        """Begin to collect what is mapped out of the drives. None if nothing is mapped, or in a dry run."""
 
     def forget(self, nodes: Sequence[int]) -> None:
         """Forget what nodes were configured to: they have restarted, and nothing counts as mapped."""
@@ -190,19 +190,19 @@ class MasterWatch(Protocol):
         """
 
     def keep(self) -> None:
-        """Be heard, if it is due; called every few milliseconds whatever the program does, by the supervisor's thread.
+        """Send a sign of life if it is due. The supervisor's thread calls this every few milliseconds.
 
-        What comes back is no sample of a run that is under way.
+        Images that come back here are not samples of a run.
         """
 
     def cease(self) -> None:
-        """Be heard a last time, from which every node watches, and never again, so that the drives stop by themselves.
+        """Send a last heartbeat and stop, so that each node's watchdog expires and the drives stop by themselves.
 
         Called again after nodes were started that had missed this process.
         """
 
     def end(self) -> None:
-        """Be heard no more, since the watchdogs are given up or were not wanted."""
+        """Stop the signs of life, since the watchdogs are given up or were not wanted."""
 
     def is_set(self, node: int) -> bool:
         """Return whether a node's watchdog was set and not put back."""
@@ -215,10 +215,10 @@ class MasterWatch(Protocol):
         """
 
     def holds(self, key: Key) -> bool:
-        """Return whether the watchdogs that are set depend on an object, which nobody else may change meanwhile."""
+        """Return whether the watchdogs in force depend on an object, so that the program must not change it."""
 
     def restore(self, node: int) -> None:
-        """Put a node's watchdog back as it was found. Whoever calls has proved that its axes are off.
+        """Put a node's watchdog back as it was found. The caller has proved that its axes are off.
 
         Raises:
             BusError: If the node did not take all of it.
@@ -251,7 +251,7 @@ class Link(Protocol):
 
     @property
     def is_dry(self) -> bool:
-        """Whether what would be sent is printed, and nobody is there."""
+        """Whether this is a dry run: frames are printed, and no drive is connected."""
 
     @property
     def wording(self) -> Wording:
@@ -266,11 +266,11 @@ class Link(Protocol):
         """The nodes' watch over this master."""
 
     def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
-        """Take whom to tell.
+        """Set the callbacks.
 
         Args:
             alive: Called again and again while an answer is waited for.
-            restarted: Called with a node that has booted though nobody here has reset it.
+            restarted: Called with a node that booted unasked.
         """
 
     # --- objects and states -----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from drive_env.drives.arguments import whole_cycles
 
 MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
 CATCH_UP = 0.02  # of a cycle, by which a SYNC is moved to suit the drives' clocks
-LONGEST_CYCLE = 0.1  # s: slower, nobody watches
+LONGEST_CYCLE = 0.1  # s: a slower cycle would leave the drives without monitoring
 Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
 
 

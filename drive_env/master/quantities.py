@@ -101,7 +101,7 @@ def follows_scale(name: str) -> bool:
 
 
 def scales_of(drives: BusDrives) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it.
+    """Return the scales of every axis, as far as the drive has them.
 
     Args:
         drives: On a bus.

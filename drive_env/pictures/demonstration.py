@@ -104,7 +104,7 @@ def load_demonstration(config: str | Path | None = None, **overrides: Any) -> De
 
 
 def perform(demonstration: Demonstration, progress: Callable[[float], None] | None = None) -> Recording:
-    """Run one emulated machine through the demonstration and return what passed.
+    """Run one emulated machine through the demonstration and return the recording.
 
     A drive that ends in fault, or that does not reach a set-point, is no error: the recording shows it.
 

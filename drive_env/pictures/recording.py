@@ -133,7 +133,7 @@ class Recorder:
         self._events.append((self.now, text))
 
     def recording(self, title: str = "") -> Recording:
-        """Return what has passed so far.
+        """Return the recording so far.
 
         Raises:
             ValueError: If no time has passed.

@@ -46,7 +46,7 @@ class Panel(NamedTuple):
 
 
 def panels(recording: Recording) -> list[Panel]:
-    """Return what the scope shows; positions as the load's axes have them."""
+    """Return the scope's panels; positions as the load's axes have them."""
     if all(recording.linear):
         factor, unit = 1e3 / recording.gears, "mm"
     elif not any(recording.linear):

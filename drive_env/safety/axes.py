@@ -37,12 +37,12 @@ class Axes:
         drives: The drives.
 
     Attributes:
-        lock: Held by whoever changes what is known, or begins or steps a stop.
+        lock: Held while what is known changes, and while a stop begins or takes a step.
         epoch: Grows with every controlword: samples from before tell nothing of what it did.
         is_armed: Whether everything is ready for motion: watchdogs on, limits lent, every axis seen.
         live: Whether an axis may turn, by its statusword, or by a frame that could have enabled it.
         assumed: Live, until a sample of this epoch shows otherwise.
-        in_flight: An enabling frame is out, and nobody has said that it came.
+        in_flight: An enabling frame was sent, and nothing confirms yet that the drive received it.
         lost: Axes that could not be proved off.
         outside: How far outside its limits an axis was when it became live, or since [inc]; -1: not seen yet.
         aim: Axis to the target of pp before, from which relative moves go on [inc].

@@ -96,7 +96,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class RotorLimits:
-    """The user's limits as the rotor's own, which no scale moves, shape (num_axes,) each; nan where there are none.
+    """The user's limits in revolutions of the rotor, which no scale moves, shape (num_axes,) each; nan without a limit.
 
     Attributes:
         low: Lowest place [rev].
@@ -112,7 +112,7 @@ class RotorLimits:
 
 
 def rotor_limits(limits: Limits, drives: BusDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
-    """Return what the user's limits are of the rotors now.
+    """Convert the user's limits to places and speeds of the rotors.
 
     Args:
         limits: The user's.
@@ -236,7 +236,7 @@ REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filt
 
 
 def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
-    """Return 607Dh, corrected by the home offset (CiA 402); what is no range is none."""
+    """Return 607Dh, corrected by the home offset (CiA 402); +-NO_LIMIT for an empty range or the ends of the type."""
     low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
     # The ends of the type, which are the factory's, are no limits; neither is an empty range.
     empty = low >= high

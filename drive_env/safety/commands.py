@@ -163,7 +163,7 @@ class Commands:
         return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
-        """Forget a set-point, by default all: a node was reset, or nobody knows whether it took the last one."""
+        """Forget a set-point, all by default, after a node reset or where the last write may not have arrived."""
         if key is None:
             self._set_points.clear()
         else:
@@ -466,7 +466,7 @@ class Commands:
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
 
     def check_turning(self, axes: Mask) -> None:
-        """Raise SafetyError for axes that turn, though nobody drives them, faster than they may be once enabled.
+        """Raise SafetyError for axes that turn while switched off, faster than they may once they are enabled.
 
         What coasts or is pulled has a speed that no set-point tells, and a quick stop's ramp may be too slow for it.
         """

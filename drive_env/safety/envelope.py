@@ -215,7 +215,7 @@ class Envelope:
             self._axes.mode_written = np.where(where, self._axes.now(), self._axes.mode_written)
 
     def write_lent(self, entry: Entry, axis: int, value: int) -> bool:
-        """Take a value for an object that has another one meanwhile; False if it has not."""
+        """Store the user's value of an object that the envelope has overridden. False if it is not overridden."""
         key = (entry.index, entry.sub)
         if not self._lending.is_lent(key, axis):
             return False
@@ -230,7 +230,7 @@ class Envelope:
         return True
 
     def own(self, entry: Entry, axis: int, found: int) -> int:
-        """Return what the program sees of an object that has `found`: its own value where another is lent."""
+        """Return the program's own value of an object that reads `found`: the one before where another is lent."""
         return self._lending.own((entry.index, entry.sub), axis, found)
 
     def before_play(self, played: Mapping[Entry, Integers]) -> None:
@@ -359,7 +359,7 @@ class Envelope:
             self._limits.place()
 
     def restarted(self, node: int) -> None:
-        """Take note that a node, by position, has booted though nobody here has reset it."""
+        """Note that a node (by position) has booted without a reset of ours."""
         if self._is_ours():
             self._watch.note_restart(node)
 
@@ -379,7 +379,7 @@ class Envelope:
         return bool(self._axes.lost & set(np.flatnonzero(self._axes.of_nodes([node])).tolist()))
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        """Return the objects to sample at every SYNC, most important first; the same list until the limits change."""
         return self._watch.looks.watched()
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
@@ -413,8 +413,8 @@ class Envelope:
     def stop(self, reason: str) -> None:
         """Bring what is live to rest by grades and switch it off; what fails is logged.
 
-        Axes that nobody has armed were neither enabled nor commanded by this program, and are left alone. Neither
-        Ctrl-C nor SIGTERM cuts the stop short.
+        Axes that this program has not armed are left alone: it neither enabled nor commanded them. Neither Ctrl-C nor
+        SIGTERM cuts the stop short.
         """
         if not self._is_ours():
             return
@@ -526,7 +526,7 @@ class Envelope:
             self._arm()
 
     def _finds_live(self, where: Mask) -> bool:
-        """Return whether an axis that is about to be changed is live: somebody else has enabled it."""
+        """Return whether an axis that is about to be changed is live, enabled by another program or master."""
         status = self._known.find(STATUSWORD)
         return any(cia402.is_live(self._drives.read_raw(status, int(axis))) for axis in np.flatnonzero(where))
 
@@ -578,7 +578,7 @@ class Envelope:
         rest = self._limits.bounds().rest
         turning = axes & self._axes.live & (np.maximum(np.abs(self._axes.speed), np.abs(self._axes.velocity)) > rest)
         if turning.any():
-            self._arm()  # also what somebody else has enabled, once it is ours to stop
+            self._arm()  # also axes that another program has enabled, once they are ours to stop
             with self._axes.lock:
                 self._stops.begin(turning, holds=False)
             self._watch.await_stop()

@@ -35,7 +35,7 @@ class Lending:
         drives: The drives.
 
     Attributes:
-        left_alone: Axes that nobody moves here: they keep what they have.
+        left_alone: Axes that are not moved here: they keep their values.
     """
 
     def __init__(self, drives: BusDrives) -> None:
@@ -76,12 +76,12 @@ class Lending:
         return False
 
     def own(self, key: Key, axis: int, found: int) -> int:
-        """Return what the program sees of an object that has `found`."""
+        """Return the program's own value of an object that reads `found`: where another is lent, the one before."""
         loan = self._loans.get((key, axis))
         return loan.own if loan is not None and found in loan.lent else found
 
     def owned(self, key: Key, axis: int) -> int:
-        """Return what an object had that has another value meanwhile."""
+        """Return the own value of an object that has a lent one; KeyError if none is lent."""
         return self._loans[key, axis].own
 
     def is_lent(self, key: Key, axis: int) -> bool:

@@ -76,7 +76,7 @@ class Limits:
 
 
 def given(value: PerAxis | None, num_axes: int) -> NDArray[np.float64]:
-    """Return what the user gave for each axis, nan where the drive's own limit counts, shape (num_axes,)."""
+    """Return the user's limit of each axis, shape (num_axes,); nan where only the drive's own limit holds."""
     return np.broadcast_to(_values(value, math.nan), (num_axes,)).astype(float)
 
 

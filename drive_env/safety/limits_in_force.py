@@ -90,7 +90,7 @@ class LimitsInForce:
             self._axes.keep_place()
 
     def place_again(self) -> None:
-        """Have the rotors placed before a limit is used again: nobody knows which scale a drive has."""
+        """Have the rotors placed again before a limit is used: the scale of a drive may have changed."""
         self._must_place = True
         self.forget()
 
@@ -175,7 +175,7 @@ class LimitsInForce:
             self._lending.lend(key, axis, own)
 
     def _has_no_range(self, axis: int) -> bool:
-        """Return whether an axis' own range is empty, which is none: any travel is tighter."""
+        """Return whether the range of an axis is empty, so that any travel is tighter."""
         known = self._drives.description.dictionary
         if not all(self._drives.description.has(key) for key in (POSITION_LOW, POSITION_HIGH)):
             return False
@@ -191,5 +191,5 @@ class LimitsInForce:
         return read_own(self._drives, HOME_OFFSET, 0)
 
     def origin(self, value: object, name: str, own: str) -> str:
-        """Return what sets a limit, for a message: the user's `value` by `name`, or the object of the drive."""
+        """Return the source of a limit, for a message: the user's `value` by `name`, or the object of the drive."""
         return f"Limits({name}=...)" if value is not None else f"the drive's own limit, {own}"

@@ -58,7 +58,7 @@ class Looks:
         self._watched: tuple[Bounds, list[Entry]] | None = None
         self._unsampled: list[Entry] = []
         self._unsampled_at = 0.0
-        self._silent: dict[int, float] = {}  # node, by position -> until when nobody asks it again
+        self._silent: dict[int, float] = {}  # node, by position -> time [s] before which it is not asked again
 
     @property
     def is_short(self) -> bool:
@@ -73,7 +73,7 @@ class Looks:
             self.ask(self._unsampled)
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        """Return the objects to sample at every SYNC, most important first; the same list until the limits change."""
         bounds = self._limits.bounds()
         if self._watched is not None and self._watched[0] is bounds:
             return self._watched[1]
@@ -108,7 +108,7 @@ class Looks:
     def ask(self, entries: Sequence[Entry]) -> bool:
         """Read objects of every axis; return whether all came. Beyond a limit the drives are stopped.
 
-        Nodes that have not answered come last, one of them at a time: nobody else waits for them.
+        Nodes that have not answered come last, one of them at a time, so that the others do not wait for them.
         """
         now = self._axes.now()
         due = [node for node, until in self._silent.items() if until <= now][:1]
@@ -138,7 +138,7 @@ class Looks:
         return True
 
     def _ask_axis(self, node: int, axis: int, entries: Sequence[Entry], timeout: float) -> dict[Key, Integers]:
-        """Return what came of objects of an axis, up to the first that did not."""
+        """Read objects of an axis until one does not answer; return the values that came."""
         rows: dict[Key, Integers] = {}
         for entry in entries:
             index, sub = self._drives.description.key(entry, axis % self._drives.description.num_axes)

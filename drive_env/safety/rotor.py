@@ -30,7 +30,7 @@ def wrapped(difference: Integers) -> Integers:
 class RotorAngle:
     """The way between increments of 6064h and revolutions of the rotors.
 
-    Positions are those of a moment (`place`) and the increments since; whoever moves scale or zero takes another.
+    Positions are those of a moment (`place`) and the increments since; place rotors anew after scale or zero changed.
 
     Args:
         num_axes: How many.

@@ -143,7 +143,7 @@ class StopEnds:
         return own, np.where(axes.mode == CSV, asked, own)
 
     def _held(self, bounds: Bounds) -> Floats:
-        """Return what the current that the integral of the velocity loop holds adds to the way [inc]."""
+        """Return the extra way [inc] that comes from the current held in the velocity loop's integral."""
         axes, way = self._axes, np.sign(self.speed)
         torque = np.isin(axes.mode, TORQUE_MODES)
         asked = np.where(torque, axes.asked_current, 0.0)

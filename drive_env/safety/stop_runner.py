@@ -67,7 +67,7 @@ class StopRunner:
 
     Args:
         drives: The drives.
-        axes: What is known of them; its lock is held by whoever begins or steps a stop.
+        axes: What is known of them; hold its lock to begin or step a stop.
         limits: Those that hold.
         lending: Lends the drives another quick stop option.
         cease: Ends the heartbeats, so that what is lost stops by itself.
@@ -114,7 +114,7 @@ class StopRunner:
                 logger.warning("axis %d: %s = 0 lets it coast", axis, self._known.find(key).label)
 
     def keep_ramps(self, key: Key, raw: Integers, where: Mask) -> None:
-        """Lend axes a stop's ramp where an option code that is none is about to be written, as theirs for afterwards.
+        """Lend axes a stop's ramp in place of an option without one that is about to be written; it is theirs later.
 
         Raises:
             SafetyError: If a drive does not take the ramp.
@@ -130,7 +130,7 @@ class StopRunner:
                 )
 
     def lends_ramps(self) -> bool:
-        """Return whether a drive whose own option lets an axis coast has another one meanwhile."""
+        """Return whether an axis would coast by the drive's own option, and has a ramp lent instead."""
         return any(
             self._lending.is_lent(key, axis) and self._lending.owned(key, axis) == COASTS
             for key in RAMPS
@@ -372,7 +372,7 @@ class StopRunner:
         judged[list(self._axes.lost)] = False
         if self.current is not None:
             for axis, stop in self.current.axes.items():
-                # What somebody else has enabled since is no longer ours to hold.
+                # An axis that another program has enabled since is no longer ours to hold.
                 is_enabled = stop.is_over and cia402.matches(int(self._axes.status[axis]), cia402.OPERATION_ENABLED)
                 judged[axis] &= is_enabled
         return judged

@@ -17,7 +17,7 @@ ANSWER = 0.1  # s within which a drive must have begun its ramp
 GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
 SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
 LONGEST_FOLLOWING = 0.5  # s until the ramp of an axis begins that ends by itself
-LONGEST = 1.0  # s; whoever would stand by then at the present deceleration is slowing down well, too
+LONGEST = 1.0  # s; an axis that would be at rest by then at the present deceleration slows down well enough, too
 # Measurements of the deceleration, one after the other, that must be too low before one was enough: a loop that was at
 # its limit of current goes on as before until the ramp has come down to the speed that there is.
 MEASUREMENTS = 2
@@ -117,7 +117,7 @@ class AxisStop:
         return now - self._since if self.phase is Phase.REST else 0.0
 
     def is_unseen(self, now: float) -> bool:
-        """Return whether the voltage should go, and nobody answers."""
+        """Return whether the voltage should be cut, and the drive does not answer."""
         return self.phase is Phase.CUT and now - self._seen > ANSWER
 
     def release(self) -> None:

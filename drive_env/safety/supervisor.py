@@ -48,7 +48,7 @@ class Supervisor:
         self._wake.set()
 
     def is_this_thread(self) -> bool:
-        """Return whether whoever asks is the thread itself."""
+        """Return whether the caller runs in this thread."""
         return threading.get_ident() == self._thread.ident
 
     def close(self) -> None:

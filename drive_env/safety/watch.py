@@ -40,7 +40,7 @@ STALE, STALE_OFF = 0.008, 0.015  # s after which drives that are live, or off, a
 BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, until it is stopped
 MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no samples: it is not operational
 MOST_STOP_CYCLES = 5000  # in lockstep
-SILENT_CYCLE = 0.1  # s of lockstep that count as passed where nobody answers
+SILENT_CYCLE = 0.1  # s of lockstep that count as passed where no node answers
 LONGEST_STOP = LONGEST_FOLLOWING + RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
 AT_ONCE = 0.1  # s after a signal within which another one means the same
 
@@ -107,7 +107,7 @@ class Watch:
             self._supervisor.start()
 
     def end(self) -> None:
-        """End the thread, and whatever was under way: nobody watches any more."""
+        """End the thread and any stop under way: the drives are not watched any more."""
         if self._supervisor is not None:
             self._supervisor.close()
             self._supervisor = None
@@ -124,7 +124,7 @@ class Watch:
             raise pending
 
     def note_restart(self, node: int) -> None:
-        """Take note that a node, by position, has booted though nobody here has reset it."""
+        """Note that a node (by position) has booted without a reset of ours."""
         self.booted.add(node)
         self._told_of.discard(node)
 
@@ -251,7 +251,7 @@ class Watch:
         entries = (
             self._known.find(key) for key in (STATUSWORD, POSITION, VELOCITY) if self._drives.description.has(key)
         )
-        with contextlib.suppress(SafetyError):  # whoever asks is about to stop; beyond a limit that has begun
+        with contextlib.suppress(SafetyError):  # the caller is about to stop; beyond a limit the stop has begun
             self.looks.ask(list(entries))
         return bool(self._axes.may_turn.any())
 

@@ -186,7 +186,7 @@ class Watchdogs:
                 self._axes.take_for_off(self._axes.of_nodes([k]))
                 continue
             self._axes.lost.update(axes)
-            self.cease()  # again, if need be: for the proof the node was started, and would wait for nobody
+            self.cease()  # again, if need be: for the proof the node was started, and would wait for no heartbeat
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,

@@ -37,7 +37,7 @@ NO_FAULT = ("fault_reset", "error_reset")
 
 @dataclass(frozen=True)
 class ShownQuantity:
-    """A value of an object as people read it: label, number, unit; the number is None where it is not known."""
+    """An object's value for display: label, number, unit; the number is None if it is not known."""
 
     label: str
     value: float | None
@@ -138,7 +138,7 @@ class AxisStates:
         )
 
     def refresh(self, drives: Drives, recorder: ScopeRecorder) -> list[str]:
-        """Look at the newest samples, and read what is due besides; return what there is to tell."""
+        """Process the newest samples, and read other values that are due; return the messages to show."""
         now = time.monotonic()
         if now - self._slow_at > SLOW:
             self._slow_at = now
@@ -189,7 +189,7 @@ class AxisStates:
         return self._note_limits(newest)
 
     def _note_limits(self, newest: Mapping[Key, Any]) -> list[str]:
-        """Take note of axes whose current is at its limit though they do not turn; return what is new of that."""
+        """Note axes at their current limit that do not turn; return messages about new ones."""
         current, speed = newest.get((cia402.TORQUE_ACTUAL, 0)), newest.get((cia402.VELOCITY_ACTUAL, 0))
         if self._limit is None or current is None or speed is None:
             return []
@@ -242,7 +242,7 @@ def quantity_of(entry: Entry, raw: int, scale: Scale) -> ShownQuantity:
 
 
 def axis_label(drives: Drives, description: Description, axis: int) -> str:
-    """Return what people call an axis: its node and its number there, or its number alone."""
+    """Return the axis' name for display: node and axis there, or the axis' number alone."""
     if drives.bus is None:
         return f"axis {axis}"
     node, part = divmod(axis, description.num_axes)
@@ -250,7 +250,7 @@ def axis_label(drives: Drives, description: Description, axis: int) -> str:
 
 
 def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
-    """Return what an emulated machine tells besides the drive, nothing of a real one."""
+    """Return an emulated machine's temperatures and supply; () for a real one."""
     if drives.machine is None:
         return ()
     winding, stage = drives.machine.temperatures

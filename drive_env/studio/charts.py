@@ -49,7 +49,7 @@ class ChartPanel:
 def options(
     panels: Sequence[ChartPanel], x_title: str, lines: Sequence[ChartLine], *, logarithmic: bool = False
 ) -> dict[str, Any]:
-    """Return what ECharts takes; panels share their x axis."""
+    """Return the option object of ECharts; panels share their x axis."""
     count = max(1, len(panels))
     x_axis, y_axis, grid = [], [], []
     top, room = 10.0, 100.0 - 10.0 - 5.0

@@ -111,7 +111,7 @@ def shown(entry: Entry, raw: int | str, scale: Scale) -> str:
 
 
 def checked(entry: Entry, text: str, scale: Scale) -> Checked:
-    """Return what a text means for an object, before anything is sent.
+    """Convert a text to an object's value, checked before anything is sent.
 
     Raises:
         ValueError: For a text that is not a number, or a unit that does not fit.
@@ -177,7 +177,7 @@ def backup(known: Description, axis: int) -> Callable[[Drives], str]:
 
 
 def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
-    """Return the parameters of a file that was handed in; ValueError for what is none."""
+    """Return the parameters of an uploaded file; ValueError if it has none or is damaged."""
     with _as_file(content, name) as path:
         return load_parameters(path, known.dictionary)
 

@@ -8,4 +8,4 @@ class JobStoppedError(KeyboardInterrupt):
 
 
 class JobEndedError(RuntimeError):
-    """What whoever waits for a job gets that was stopped."""
+    """A job was stopped; raised where its result is waited for."""

@@ -1,8 +1,8 @@
 """Who may use the studio: the host that is asked for, where a page comes from, and the token of other addresses.
 
-A page of another site must not command drives by the browser of whoever visits it: its requests carry its own Origin,
-and a name that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show a page of ours in a
-frame, where a click meant for it would be one of ours. Where the studio is open to the network a token is asked for
+A page of another site must not command drives by a visitor's browser: its requests carry its own Origin, and a name
+that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show a page of ours in a frame,
+where a click meant for it would be one of ours. Where the studio is open to the network a token is asked for
 once, by the address that is printed, and kept in a cookie.
 """
 

@@ -80,7 +80,7 @@ async def _until_closed(line: WebSocket) -> None:
 
 
 def know(machine: Machines) -> KnownMachine:
-    """Return what is read of a machine once."""
+    """Read the properties of a machine that do not change."""
     from drive_env.pictures.demonstration import rated_load_torque
 
     made = machine.drives

@@ -158,7 +158,7 @@ def end_turn(axis: int) -> MotionJob:
 
 
 def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
-    """Return the integer that a text means for an object of an axis, within its range; ValueError for what is none."""
+    """Parse a text as an object's integer of an axis; ValueError for a text that is not one, or beyond its range."""
     known: Description = session.description
     entry = known.dictionary.find(name)
     raw = quantities.parse(text, entry, session.scales[axis])

@@ -45,7 +45,7 @@ class PagesThread:
             await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(there, self.loop))
 
     def close(self) -> None:
-        """End the thread once it is through with what it does; nobody waits for it."""
+        """End the thread after its current work, without waiting for it."""
         self.loop.call_soon_threadsafe(self.loop.stop)
 
 

@@ -63,7 +63,7 @@ class Presence:
                     motion.beat = now
 
     def leave(self, page: str) -> None:
-        """Take note that a page is gone: what it has set in motion is overdue at once."""
+        """Expire the page's motions immediately."""
         with self._lock:
             self._beats.pop(page, None)
             for motion in self._motions.values():

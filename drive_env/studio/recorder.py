@@ -85,7 +85,7 @@ class SampleRing:
 
 
 class ScopeRecorder:
-    """Keeps what is sampled, whoever lets time pass; read by any thread.
+    """Keeps the samples of every call that lets time pass; read by any thread.
 
     Args:
         num_axes: Of the drives.

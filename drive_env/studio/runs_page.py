@@ -157,7 +157,7 @@ class RunsPanel:
 
 
 def _what(run: Run) -> str:
-    """Return what a run has, in a few words."""
+    """Summarise a run's files in a few words."""
     found = [
         f"{len(run.of(kind))} {kind}{'s' * (len(run.of(kind)) > 1)}"
         for kind in ("report", "picture", "film")

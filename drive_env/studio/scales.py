@@ -21,5 +21,5 @@ class _Described:
 
 
 def axis_scales(drives: Drives, description: Description) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it; it is asked."""
+    """Read the scales of every axis from the drives, as far as they have them."""
     return scales_of(cast(Any, _Described(drives, description)))

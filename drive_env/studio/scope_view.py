@@ -120,13 +120,13 @@ class ScopeView:
         self._fired_at = self._recorder.now
 
     def keep_as_reference(self) -> bool:
-        """Lay what is shown under what comes; return whether there was something."""
+        """Keep the current traces as dashed reference; return whether there were any."""
         shown = self.shown()
         self.reference = shown if len(shown.t) else None
         return self.reference is not None
 
     def shown(self) -> ScopeRecording:
-        """Return what is shown, at every sample."""
+        """Return the recording on display, at every sample."""
         return self.kept if self.kept is not None else self._rolling()
 
     @property
@@ -228,7 +228,7 @@ class ScopeView:
         return struct.pack("<I", len(text)) + text + b"".join([*blobs, *more])
 
     def _traces(self, recording: ScopeRecording, first: int) -> tuple[list[dict[str, Any]], list[bytes]]:
-        """Return what the header says of each channel's trace, and its integers."""
+        """Return each channel's trace as entries of the header and as integers."""
         traces, blobs = [], []
         stride = stride_of(len(recording.t), self.columns)
         for channel, values in recording.values:

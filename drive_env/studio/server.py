@@ -143,7 +143,7 @@ class StudioServer(uvicorn.Server):
         self._stop = stop
 
     def handle_exit(self, sig: int, frame: FrameType | None = None) -> None:
-        """Stop the drives, then end; a second Ctrl-C waits for nobody.
+        """Stop the drives, then end; a second Ctrl-C ends without waiting.
 
         Uvicorn would raise the signal once more at its end: the process would die before the drives are closed.
         """
@@ -168,7 +168,7 @@ def web_app(studio: Studio, host: str, port: int, token: str | None) -> StudioGa
 
 
 def _stops(studio: Studio) -> FastAPI:
-    """Return what waits for no page: the quick stop, and the life lines."""
+    """Return the web application that does not wait for pages: quick stop and life lines."""
     web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @web.post(QUICK_STOP)
@@ -229,7 +229,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def address(host: str, port: int, token: str | None) -> str:
-    """Return what a browser opens."""
+    """Return the address to open in a browser."""
     shown = f"[{host}]" if ":" in host else host
     if not is_loopback(host) and host in ("0.0.0.0", "::"):
         shown = socket.gethostname()

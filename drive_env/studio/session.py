@@ -90,7 +90,7 @@ class Job:
     is_told: bool = False  # whether it has been stopped by an exception: what it puts back then must get through
 
     def refuse(self, error: BaseException) -> None:
-        """End it before it begins; whoever asked for it may have given it up."""
+        """End it before it begins; the page that asked for it may have given it up."""
         if self.future.set_running_or_notify_cancel():
             self.future.set_exception(error)
 
@@ -174,7 +174,7 @@ class Session:
         """Have a function of the drives run in their thread, after those that were asked for before.
 
         Args:
-            function: What to do; it may let time pass, and is ended by an exception when somebody stops it.
+            function: What to do; it may let time pass, and is ended by an exception when the job is stopped.
             title: What it does, in a few words: "Move axis 0".
             page: Who wants it; what moves by it stops when that page is gone. "" for no page.
             paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
@@ -212,7 +212,7 @@ class Session:
         """Quick-stop every axis at once, and end the job that is under way and those that wait.
 
         It does not wait for the job, nor long for anything else: those of a bus are commanded by the supervisor of
-        their envelope; emulated axes here, or by whoever lets their time pass, before the next piece of it.
+        their envelope; emulated axes here, or by the thread that lets their time pass, before the next piece of it.
         """
         with self._waiting:
             self._stop_asked = reason
@@ -250,7 +250,7 @@ class Session:
         self._look()
 
     def glimpse(self, function: Callable[[Machines], T], patience: float = 1.0) -> T | None:
-        """Return what a function reads of emulated machines between two pieces of time; None if there is no moment.
+        """Return the result of a function of emulated machines between two pieces of time; None if there is no moment.
 
         Any thread may call it. It only looks: what changes a machine is a job.
 
@@ -513,7 +513,7 @@ class Session:
         self._stop(np.ones(self.num_axes, bool))
 
     def _leave_alone(self, job: Job | None) -> None:
-        """Stop and disable everything, since nobody looks at an axis that is enabled."""
+        """Stop and disable everything, since no page shows an axis that is enabled."""
         if not self._is_left:
             self._is_left = True
             self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")

@@ -73,7 +73,7 @@ class SharedDrives:
         drives: The drives, emulated or on a bus.
         recorder: Keeps what is sampled.
         look: Called between two pieces of time, by the thread whose calls these are; it may raise, which ends them.
-        hear: Called with emergencies, whoever asked for them.
+        hear: Called with all emergencies that were read.
         moves: Returns whether a page moves an axis by a button that it holds, or as long as it is there.
         stopped: Returns why the job under way was stopped, "" if it was not. It hears of that once, by `look`, so that
             it can put back what it changed. Until it has ended it has no axis operate any more, and the envelope's own
@@ -201,7 +201,7 @@ class SharedDrives:
         return self._in_pieces(asked, duration, play, period, duration if play else BUS_PIECE)
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies of the drives since the last call."""
         with self.lock:
             found = self._drives.emergencies()
         if found:
@@ -227,7 +227,7 @@ class SharedDrives:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _calling(self, call: Callable[[], T]) -> T:
-        """Return what a call of the drives returns; it is made again if the envelope tells what a job knows already."""
+        """Call a function of the drives and return its result; again if the envelope reports what the job knows."""
         try:
             return call()
         except SafetyError:

@@ -51,7 +51,7 @@ class SingleAxes:
         self._drives.write((entry.index, entry.sub), value, where=np.arange(self.num_axes) == axis)
 
     def sdo(self, node: int) -> _Objects:
-        """Return what reads the objects of a node as bytes."""
+        """Return the reader of a node's objects as bytes."""
         return _Objects(self, node)
 
     def as_bus(self) -> BusDrives:

@@ -49,7 +49,7 @@ class Visitor:
     async def do(
         self, function: Callable[[Drives], T], title: str, *, paced: bool = True, quiet: bool = False
     ) -> T | None:
-        """Have a job run and return what it returns; None where it failed, which the page shows then."""
+        """Run a job and return its result; None if it failed, which the page then shows."""
         future = self.session.do(function, title, page=self.id, paced=paced, quiet=quiet)
         try:
             return await asyncio.wrap_future(future)

@@ -91,7 +91,7 @@ class Trial(NamedTuple):
 
 
 def softness(known: GainSet, gains: Integers) -> Floats:
-    """Return what the integral of the error after a load step is proportional to, (num_axes,).
+    """Return a number proportional to the integral of the error after a load step, (num_axes,).
 
     No load step exists on a bus; but the integrators of a P-PI cascade leave it no choice: for a current i that the
     load takes, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
@@ -131,7 +131,7 @@ class Trials(Saved):
         self._t_0 = t_0
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the gains that are; return what that says, and where the axes began [inc].
+        """Move there and back with the present gains; return what was identified, and where the axes began [inc].
 
         Args:
             reach: How far the rotors may turn from here, with the sign [rad], shape (num_axes,).

@@ -1,7 +1,7 @@
 """One trial of StallGuard threshold and CoolStep: moves at a working speed, without CoolStep, with it, and a probe.
 
 What is wanted of them is no false stall of the axis' own load, a stall that is seen before steps are lost, and less
-current. Nobody need push at the axis for it: the load reading is all but linear in cos d - sin d of the load angle d
+current. The axis need not be pushed for it: the load reading is all but linear in cos d - sin d of the load angle d
 (`load_reading.py`), so that a move tells the angle at which it would fall to 0; and the torque being the same, the
 current that CoolStep leaves is to the other as the sines of their load angles. Stop on stall is off meanwhile.
 

@@ -103,7 +103,7 @@ class Cascade(NamedTuple):
         return gains
 
     def trials(self, drives: Drives, axes: int) -> Trials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         return Trials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
@@ -188,7 +188,7 @@ class OpenLoop(NamedTuple):
         return kept
 
     def trials(self, drives: Drives, axes: int) -> OpenLoopTrials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         return OpenLoopTrials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
@@ -247,7 +247,7 @@ class ClosedStepper(NamedTuple):
         return plan_overload(self.device, self.motor, found, scaler, reach)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return what the device is commissioned with: no rule knows such a loop."""
+        """Return the commissioned gains: no rule knows such a loop."""
         return self.first(supply)
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
@@ -266,7 +266,7 @@ class ClosedStepper(NamedTuple):
         return kept
 
     def trials(self, drives: Drives, axes: int) -> ClosedLoopTrials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         kind = PidTrials if self.loop.is_pid else ClosedLoopTrials
         return kind(drives, self.motor, axes, self.t_0(), self.loop)
 
@@ -341,7 +341,7 @@ class LoadSettings(NamedTuple):
         return kept
 
     def trials(self, drives: Drives, axes: int) -> LoadDetectionTrials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         return LoadDetectionTrials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
@@ -353,7 +353,7 @@ class LoadSettings(NamedTuple):
         return np.asarray(open_loop_cost(terms))
 
     def current(self, terms: Any) -> Floats:
-        """Return what CoolStep leaves of the rated current."""
+        """Return the share of the rated current that CoolStep leaves."""
         return np.asarray(np.sqrt(terms.effort))
 
     @property
@@ -413,7 +413,7 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
 def new_score(
     device: str, load: Any, motor: Any, num_machines: int, *, gains: tuple[str, ...] = (), **options: Any
 ) -> RobustScore:
-    """Return what scores gains of a device on emulated machines; arguments as `RobustScore` has.
+    """Return the score of a device's gains on emulated machines; arguments as `RobustScore` has.
 
     With `gains`, names, that act in a closed loop alone it is closed.
     """

@@ -215,8 +215,8 @@ class CurrentSwings(NamedTuple):
 class RobustScore(Saved):
     """Scores gains on emulated machines: every variant of every machine is a machine of one set, run side by side.
 
-    The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
-    is none on this load (a stiffness where nothing is elastic) is left out.
+    The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant
+    without effect on this load (a stiffness where nothing is elastic) is left out.
 
     With one run of each variant, what is scored is partly the noise and the place: an axis that stands between two
     counts of its encoder may hunt where it rests in the middle of one. `repeats` runs of each, every one with a noise

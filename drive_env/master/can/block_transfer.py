@@ -1,6 +1,6 @@
 """Block transfers as a client: many bytes with an answer for every 127 segments, and not for each (CiA 301).
 
-What is lost is sent again: whoever receives names the last segment that came in order, and the next sub-block begins
+What is lost is sent again: the receiver names the last segment that came in order, and the next sub-block begins
 behind it.
 """
 

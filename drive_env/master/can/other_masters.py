@@ -1,6 +1,6 @@
 """Whether another master commands the nodes: frames that only a master sends, and that are not ours.
 
-A bus hands a program everybody's frames but its own, so what comes with such an identifier is somebody else's.
+A program receives every frame of the bus but its own, so a frame with such an identifier is from another master.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class OtherMastersError(BusError):
 
 
 class OtherMasters:
-    """Listens for other masters whenever somebody receives from the port.
+    """Listens for other masters whenever frames are received from the port.
 
     Args:
         port: The bus.

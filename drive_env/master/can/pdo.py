@@ -140,8 +140,8 @@ class PdoConfiguration:
         """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
 
         PDOs of this direction that carried a mapping of ours and are not needed any more are put back. Other TPDOs that
-        go with SYNC, as the factory's may, are silent meanwhile: the SYNCs are ours, and a frame that nobody asked for
-        holds up the next one for 0.1 ms.
+        go with SYNC, as the factory's may, are silent meanwhile: the SYNCs are ours, and each frame that was not asked
+        for holds up the next one for 0.1 ms.
 
         Raises:
             ObjectAccessError: If the drive refuses; BusError if it gives the PDO no identifier.
@@ -291,7 +291,7 @@ class PdoConfiguration:
         put(communication, 1, cob_id, 4)
 
     def _is_fixed(self, direction: Direction, number: int) -> bool:
-        """Return whether nobody can write when an RPDO takes effect: then it does as it comes, just before SYNC."""
+        """Return whether the type of an RPDO cannot be written: then it acts as it comes, just before SYNC."""
         kind = (direction.communication + number, 2)
         known = self._description
         return direction is INTO_DRIVE and known.has(kind) and known.dictionary.find(kind).access in ("ro", "const")

@@ -30,7 +30,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         token: What a hub that is open to the network asks for. One that asks for none is joined all the same.
 
     Raises:
-        OpenError: For an address, a bit rate or a token that is none, the wrong token, or nobody there; in receiving,
+        OpenError: For an invalid address, bit rate or token, the wrong token, or no hub at the address; in receiving,
             if the hub asks for a token and none was given.
     """
 
@@ -161,7 +161,7 @@ def _present(token: str, connection: socket.socket, channel: str) -> None:
 
 
 def _parse(line: bytes, now: float) -> can.Message | None:
-    """Return the frame of a line; answers to commands are none."""
+    """Return the frame of a line; None for other lines, as answers to commands are."""
     if line[:1] not in (b"t", b"T", b"r", b"R"):
         return None
     extended, remote = line[:1] in (b"T", b"R"), line[:1] in (b"r", b"R")

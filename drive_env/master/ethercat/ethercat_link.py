@@ -105,7 +105,7 @@ class EtherCatLink:
         return ProcessWatchdog(self._master, self.nodes, self._clients, self.process, self._description)
 
     def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
-        """Take whom to tell of waiting for an answer, and of a node that has booted though nobody here has reset it."""
+        """Set callbacks: `alive` while an answer is waited for, `restarted` for a node that booted unasked."""
         self._alive, self._restarted = alive, restarted
 
     # --- objects and states -----------------------------------------------------------------------------------------

@@ -76,7 +76,7 @@ class EtherCatMaster(Protocol):
         """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends. Returns how many.
 
         Raises:
-            BusError: If there is none, or one does not come to Pre-Op.
+            BusError: If there is no slave, or one does not come to Pre-Op.
         """
 
     def recover(self, position: int) -> bool:
@@ -87,7 +87,7 @@ class EtherCatMaster(Protocol):
         """
 
     def identity(self, position: int) -> SlaveIdentity:
-        """Return what a slave's EEPROM says."""
+        """Return the identity in a slave's EEPROM."""
 
     def status(self, position: int) -> SlaveStatus:
         """Return a slave's state, asked now."""

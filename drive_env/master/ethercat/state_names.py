@@ -26,7 +26,7 @@ def state_name(state: int) -> str:
 
 
 def refusal(position: int, wanted: AlState, status: SlaveStatus) -> str:
-    """Return what to tell of a slave that does not come to a state."""
+    """Return a message about a slave that does not come to a state."""
     if not status.state:
         return f"position {position} does not answer; check cable and power"
     code = status.code

@@ -124,7 +124,7 @@ def _enter(drive: Drive, nmt: NmtState) -> Drive:
 
 
 def write_consumer(drive: Drive, node: int) -> Drive:
-    """Return the drive after a write of 1016h: whoever is watched must be heard anew."""
+    """Return the drive after a write of 1016h: the node that it watches must be heard anew."""
     return drive._replace(consumer=node, heard=False)
 
 

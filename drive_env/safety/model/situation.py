@@ -156,5 +156,5 @@ def begun(s: Situation, rules: Rules) -> Situation:
 
 
 def joined(what: str, more: str) -> str:
-    """Return what is done, and what becomes of it if there is more to say."""
+    """Join an action and its consequence; without a consequence the action alone."""
     return f"{what}; {more}" if more else what
