@@ -20,7 +20,7 @@ def check_own(*names: str, root: Path = ROOT) -> None:
         root: The folder in which our packages lie.
 
     Raises:
-        ForeignPackageError: For a package that is missing or is somebody else's, with its place and the remedy.
+        ForeignPackageError: For a package that is missing or a foreign one, with its place and the remedy.
     """
     for name in names:
         spec = importlib.util.find_spec(name)

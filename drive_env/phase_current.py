@@ -30,7 +30,7 @@ def amplitude(device: Device, setting: ArrayLike) -> Floats:
 
 
 def setting_of(device: Device, current: ArrayLike) -> Integers:
-    """Return the least setting with an amplitude of so much [A] or more; the highest where there is none."""
+    """Return the least setting with an amplitude of so much [A] or more; the highest if no setting has that much."""
     highest, steps = _levels(device)
     level = np.ceil(np.asarray(current, float) / device.current_full_scale * steps - 1e-9) - 1.0
     return np.clip(np.ceil(level * (highest + 1) / steps), 1, highest).astype(np.int64)

@@ -227,7 +227,7 @@ def _check_choice(identity: str | None, node: int | None, dry_run: bool) -> None
     if identity is not None:
         parse_identity(identity)
     elif dry_run:
-        raise ValueError("--dry-run asks nobody which node is there; name it with --identity")
+        raise ValueError("--dry-run cannot find out which node is there; name it with --identity")
 
 
 def _choose(port: Port, master: LssMaster, identity: str | None, node: int | None, timeout: float) -> LssIdentity:

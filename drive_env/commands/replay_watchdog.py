@@ -158,9 +158,9 @@ def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], dict[int, str]]:
         can_id, data = frame.arbitration_id, bytes(frame.data)
         if can_id == NMT and len(data) == 2:
             if data[0] in RESETS:
-                left[data[1]] = "the frames reset it, after which it watches nobody"
+                left[data[1]] = "the frames reset it, after which it watches no master"
             elif data[0] != START:
-                left.setdefault(data[1], "the frames take it out of NMT operational, where it may watch nobody")
+                left.setdefault(data[1], "the frames take it out of NMT operational, where it may watch no master")
             elif "operational" in left.get(data[1], ""):
                 del left[data[1]]
             continue

@@ -325,8 +325,8 @@ def _announce(
     if isinstance(hub, Hub):
         if hub.is_public:
             print(
-                f"drive-env: {hub.host}:{hub.port} is open to the network: whoever can reach it and has the token may "
-                "read and move these drives. Token and frames travel as plain text; where others listen, serve on "
+                f"drive-env: {hub.host}:{hub.port} is open to the network: any program that can reach it and has "
+                "the token may read and move these drives. Token and frames travel as plain text; where others listen, serve on "
                 f"{LOOPBACK} and use an SSH tunnel."
             )
         print("import can")

@@ -72,7 +72,7 @@ class EmergencyCode(NamedTuple):
         return AXIS in self.extra
 
     def axis_told(self, extra: tuple[int, ...], num_axes: int) -> int | None:
-        """Decode the axis number from the emergency's bytes; 0 if they carry none, None if they are another emergency's."""
+        """Decode the axis number from the emergency's bytes; 0 if they carry none, None if they are of another one."""
         told = {sent for byte, sent in zip(self.extra, extra, strict=True) if byte == AXIS} or {0}
         axis = min(told)
         return axis if axis < num_axes and self.of_axis(axis).extra == extra else None
@@ -135,8 +135,8 @@ class MasterHints(NamedTuple):
         timeouts: Index -> longest wait, of objects that take longer.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
         commands: Index -> what it is, of the device's own objects that can be written but are no parameters.
-        addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be another
-        one after its next reset, or mute.
+        addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be
+            another one after its next reset, or mute.
     """
 
     rpdo_type: int

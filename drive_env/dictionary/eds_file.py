@@ -293,7 +293,7 @@ class _Repairer:
             return VAR
         kind = OBJECT_TYPES.get(text.upper(), number_of(text))
         if kind is None or kind not in OBJECT_TYPES.values():
-            self._tell(f"[{name}]", f"ObjectType={text} is none of CiA 306")
+            self._tell(f"[{name}]", f"ObjectType={text} is not one of CiA 306")
             kind = VAR
         row["ObjectType"] = f"0x{kind:X}"
         return kind

@@ -92,7 +92,9 @@ def _why_not_heard(drives: BasicDrives, status: int) -> str:
     """Return, for a message, that a drive takes no commands; empty where its own mode is not why."""
     if not _own_modes(drives) or cia402.matches(status, cia402.REMOTE):
         return ""
-    return "; it takes no commands (bit 9 is 0), since somebody has changed its own mode or its mode of operation"
+    return (
+        "; it takes no commands (bit 9 is 0), since another program has changed its own mode or its mode of operation"
+    )
 
 
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:

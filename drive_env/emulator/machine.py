@@ -472,7 +472,7 @@ class Machines:
 
         Raises:
             ValueError: For an unknown fault or parameter, an invalid time or condition, or a fault that this load
-            cannot have.
+                cannot have.
         """
         order = Order(name, at, when, duration, axis=axis, parameters=parameters)
         return self._drives._faults.add(order, self._mask(where))

@@ -59,7 +59,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
     Raises:
         ValueError: For an unknown mode, or less than one environment; in a step for a reward of another shape, or one
-        that is not a number.
+            that is not a number.
     """
 
     OPTIONS: tuple[str, ...] = ("reset_mask", "state", "machine")  # of reset

@@ -221,7 +221,7 @@ class CoeNode:
                 return []
         if service == CoeService.INFORMATION:
             return self._information.request(content)
-        raise ValueError(f"service {service} of CoE is none that this device has")
+        raise ValueError(f"service {service} of CoE is not one of this device")
 
     def pending_coe(self, now: float) -> list[bytes]:
         """Return and forget the emergencies that wait."""

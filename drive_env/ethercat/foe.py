@@ -79,7 +79,7 @@ class FileServer:
         self.close()
         if operation in (FoeOperation.ERROR, FoeOperation.BUSY):
             return None
-        return _error(FoeError.ILLEGAL, f"operation {operation} is none of FoE")
+        return _error(FoeError.ILLEGAL, f"operation {operation} is not one of FoE")
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _take(self, number: int, content: bytes, full: int) -> bytes:

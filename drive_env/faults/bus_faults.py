@@ -91,7 +91,7 @@ class BusFaults:
 
         Raises:
             ValueError: For an unknown fault, parameter, node or axis, an invalid time or condition, or a fault that
-            this machine cannot have.
+                this machine cannot have.
         """
         row = find_fault(order.name)
         given = checked_parameters(row, order.parameters)

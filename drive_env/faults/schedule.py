@@ -84,7 +84,7 @@ def parse_order(text: str) -> Order:
     """Parse one line as an order: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
 
     Raises:
-        ValueError: For a line that cannot be understood; the values are checked by whoever takes the order.
+        ValueError: For a line that cannot be understood; the values are checked where the order is taken.
     """
     try:
         words = shlex.split(text)

@@ -33,7 +33,7 @@ class FaultParameter:
 
 @dataclass(frozen=True)
 class FaultRow:
-    """A fault; table.toml says what each entry holds. `emergency` is None where nothing in the drive sees it."""
+    """A fault; table.toml explains each field. `emergency` is None where the drive does not detect it."""
 
     name: str
     group: str
@@ -66,7 +66,7 @@ def find_fault(name: str) -> FaultRow:
     """Return the row of a fault.
 
     Raises:
-        ValueError: If there is none of that name, with those that are.
+        ValueError: For an unknown name, with the known ones.
     """
     if name not in FAULTS:
         raise ValueError(f"no fault is named {name!r}; there are {', '.join(FAULTS)}{did_you_mean(name, FAULTS)}")

@@ -73,7 +73,7 @@ class Plant:
         emf_constant: Voltage per speed [V*s/rad]; nan for that of a PMSM, torque_constant / 1.5.
 
     Raises:
-        ValueError: If a value is none that an axis can have.
+        ValueError: If a value is impossible for an axis.
     """
 
     R: float
@@ -181,7 +181,7 @@ def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
 
 
 def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
-    """Return what the velocity loop regulates: filtered velocity [rad/s] per demanded current [A].
+    """Return the plant of the velocity loop: filtered velocity [rad/s] per demanded current [A].
 
     Of the gains, those of the current loop matter.
     """

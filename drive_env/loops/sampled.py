@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
-RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
+RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is rigid motion
 _TERMS = 14  # of Taylor's series of exp(X), |X| <= 1/2: 2e-17 are left
 
 

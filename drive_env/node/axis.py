@@ -152,7 +152,7 @@ class Axis:
         return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event, fit=fit)
 
     def _fit(self, entry: Entry) -> Callable[[int], int] | None:
-        """Return what makes a value of process data one of the object's range, None where the device has no rule."""
+        """Return the function that fits process data into the object's range, None without a rule of the device."""
         rule, highest = self._device.beyond_range.get((entry.index, entry.sub)), entry.high
         if rule is None or highest is None:
             return None
@@ -234,7 +234,7 @@ class Axis:
         return float(code.factor(context))
 
     def _factor_now(self, code: Code) -> Callable[[], float]:
-        """Return what gives a code's factor as the scales are now, which seldom change."""
+        """Return a function of a code's present factor, which depends on scales that seldom change."""
         if not code.follows_scale:
             fixed = self._factor(code)
             return lambda: fixed

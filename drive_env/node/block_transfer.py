@@ -1,6 +1,6 @@
 """Block transfers of the SDO server: a sub-block of up to 127 segments goes before the other side answers (CiA 301).
 
-A lost segment costs its sub-block's rest: whoever receives says the last segment that came in order, and the next
+A lost segment costs its sub-block's rest: the receiver says the last segment that came in order, and the next
 sub-block begins after it. A CRC over all data closes the transfer, where both sides have one.
 """
 

@@ -57,7 +57,7 @@ class ErrorHistory:
         self._errors: deque[int] = deque(maxlen=depth)
 
     def add(self, code: int, axis: int = 0, number: int = 0) -> None:
-        """Note an error; code 0000h is none. `number` is the device's own of the error."""
+        """Note an error; code 0000h is ignored. `number` is the device's own of the error."""
         if code:
             self._errors.appendleft(code | axis << 16 | (number & 0x3F) << 24)
 

@@ -137,7 +137,7 @@ class NodeErrors:
             for emergency in take():
                 self._tell_of(axis, emergency, now)
         if self._sink.told and not self.register():
-            # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
+            # CiA 301: masters that were sent an error are sent 0000h when no error is left, however it ended.
             reset = self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name]
             self._sink.push(reset.of_axis(self._told_last), 0)
 

@@ -105,7 +105,7 @@ class ImageObjects:
         return image.write(data)
 
     def read_inputs(self) -> bytes:
-        """Return what the drive answers, as it is now."""
+        """Return the present input image, which the drive sends."""
         return self._images[INPUTS].pack()
 
     def restart(self) -> None:
@@ -157,7 +157,7 @@ class ImageObjects:
         return index in ASSIGNMENTS or index in self._mappings
 
     def mapped(self, direction: int) -> list[tuple[int, list[int]]]:
-        """Return what `OUTPUTS` or `INPUTS` carry: mapping objects, and the entries of each as they are written.
+        """Return the mapping objects of `OUTPUTS` or `INPUTS`, with the entries of each as integers.
 
         A ready-made image has no mapping object, and so no entries.
         """

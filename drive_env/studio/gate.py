@@ -49,8 +49,8 @@ def checked_token(token: str) -> str:
     """Return a token; ValueError for one that is too short, or that an address cannot carry."""
     if len(token) < LEAST_TOKEN or not all(letter.isalnum() or letter in "-_" for letter in token):
         raise ValueError(
-            f"a token of {len(token)} characters is none: it takes {LEAST_TOKEN} or more letters, digits, - and _; "
-            "leave --token out, and one is made"
+            f"a token of {len(token)} characters is not valid: it takes {LEAST_TOKEN} or more letters, digits, - and "
+            "_; leave --token out, and one is made"
         )
     return token
 

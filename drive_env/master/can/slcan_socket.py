@@ -128,7 +128,7 @@ def _connect(channel: str) -> socket.socket:
         return socket.create_connection((host, int(port)), CONNECT_TIMEOUT)
     except (OSError, OverflowError) as error:
         raise OpenError(
-            f"nobody answers at {channel}: {error}; start `drive-env serve`, or correct --channel"
+            f"no hub answers at {channel}: {error}; start `drive-env serve`, or correct --channel"
         ) from error
 
 

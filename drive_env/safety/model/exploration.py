@@ -24,7 +24,7 @@ from drive_env.safety.model.situation import (
 )
 from drive_env.safety.model.steps import attended, left_alone, steps
 
-RUNS_ON = "runs on: nobody watches, and no watchdog ends it"
+RUNS_ON = "runs on: nothing monitors it, and no watchdog ends it"
 GIVEN_UP = "the watchdog is given up while the axis is live"
 UNWATCHED = "the axis is live under our hand, and neither a watchdog nor the envelope was made ready"
 TAKEN_FOR_OFF = "the envelope takes a live axis for off"
