@@ -135,7 +135,7 @@ def emulator_cascade() -> str:
 
 
 def emulator_millisecond() -> str:
-    """Return what happens in one millisecond."""
+    """Draw one millisecond of the emulator."""
     drawing = Drawing("One millisecond of the TMCM-1636", 236)
     drawing.box(10, 12, 340, 40, "supervision, once\nstate machine, protection, mode, profile", GREY)
     for window in range(5):
@@ -182,7 +182,7 @@ def certificate_steps() -> str:
 
 
 def score_parts() -> str:
-    """Return what J is made of."""
+    """Draw the parts of J and of the robust cost."""
     drawing = Drawing("What J, the constraints and the robust cost are made of", 452)
     parts = (
         ("settling time", "after the move", BLUE),

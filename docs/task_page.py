@@ -117,7 +117,7 @@ def _section(name: str, task: SuiteTask) -> str:
 
 
 def _spaces() -> str:
-    """Return what the docstrings of the environments say of actions, observations and rewards."""
+    """Return the actions, observations and rewards of the environments, from their docstrings."""
     parts = []
     for kind in (Tracking, GainScheduling, GainTuning):
         tasks = [name.partition("/")[2] for name, task in TASKS.items() if kind.__name__ in task.environment]

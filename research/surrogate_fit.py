@@ -113,7 +113,7 @@ def fit(
         fitted.append(_fit_one(data, normal, seed + k, partial(_part, progress, k, networks)))
     torch.set_num_threads(threads)
     for name in fitted[0]:
-        # A thousandth of ln J is nobody's business, and the file is half as large.
+        # A thousandth of ln J does not matter, and the file is half as large.
         arrays[name] = np.stack([one[name] for one in fitted]).astype(np.float16)
     return arrays
 

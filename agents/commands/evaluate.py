@@ -265,7 +265,7 @@ def opened_for(
     otherwise: str | None = None,
     trust: bool = False,
 ) -> tuple[Any, dict[str, Any]]:
-    """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
+    """Return the policy, its environment filled in (`otherwise` if it names none), and the environment's options."""
     import tomllib
 
     from agents.policies.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
@@ -548,5 +548,5 @@ def _lines(table: Mapping[str, Any], indent: str = "") -> Iterator[str]:
 
 
 def _printable(text: str) -> str:
-    """Return a text of somebody's file without what would act on the terminal."""
+    """Return a text of a foreign file without characters that act on the terminal."""
     return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from agents.training.training_run import Progress, Report
 
 EPISODES = 64  # for the card
-LINES = 10  # of progress where nobody watches a terminal
+LINES = 10  # of progress, where the output is not a terminal
 
 
 def train(

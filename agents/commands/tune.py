@@ -304,7 +304,7 @@ def _print(done: TunerRun, refused: list[str]) -> None:
 
 
 def _answer(done: TunerRun) -> str:
-    """Return which trial the agent chooses, and why where another one measured better; "" if it is none of them."""
+    """Return which trial the agent chooses, and why if another one measured better; "" if it chooses no trial."""
     from agents.tuner.tune_target import best_good
 
     after = tuple(done.result.axes[0].after)

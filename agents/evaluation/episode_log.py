@@ -67,7 +67,7 @@ def load(path: Path) -> EpisodeRecording:
     """Read what `save` wrote.
 
     Raises:
-        ValueError: If the file is none.
+        ValueError: If the file is not a recording.
     """
     try:
         stored = read_arrays(path)
@@ -100,7 +100,7 @@ def repeat(policy: Any, recording: EpisodeRecording, told: Callable[[float], Non
     Raises:
         PolicyStoppedError: If the policy fails on what was recorded, or gives another number of actions.
     """
-    unused = np.zeros(recording.actions[0].shape[1])  # nobody looks at it: what sticks does so in the recording, too
+    unused = np.zeros(recording.actions[0].shape[1])  # never used: a policy that sticks does so in the recording, too
     watched = GuardedPolicy(policy, unused, unused, 0.0, PATIENT)
     largest, squares, count = 0.0, 0.0, 0
     try:

@@ -97,7 +97,7 @@ class Evaluation:
         """Read a report.
 
         Raises:
-            ValueError: If the file is none.
+            ValueError: If the file is not a report.
         """
         try:
             table = read_json(path)
@@ -167,7 +167,7 @@ def evaluate(
 
     Raises:
         PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
-        ValueError: For a configuration that is none.
+        ValueError: For an invalid configuration.
     """
     environment = environment_name(environment)
     options = dict(configuration or {})
@@ -389,7 +389,7 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
 
 
 def _seen(observation: Any) -> Any:
-    """Return what a policy sees: of a dict its `observation`; a copy, since it is kept."""
+    """Return the policy's part of an observation: of a dict its `observation`; a copy, since it is kept."""
     return np.array(observation["observation"] if isinstance(observation, dict) else observation)
 
 

@@ -81,7 +81,7 @@ def target_for(
 
 
 def lower_profile_velocity(drives: Drives) -> None:
-    """Lower 6081h where it is beyond the envelope's limit, with which nobody could write it back between episodes."""
+    """Lower 6081h where it is beyond the envelope's limit, which would refuse to write it back between episodes."""
     if not drives.safety:
         return
     limit = given(drives.safety.limits.velocity, drives.num_axes)

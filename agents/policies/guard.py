@@ -168,7 +168,7 @@ class GuardedPolicy:
         return rows
 
     def _ask(self, function: Callable[[Any], Any], argument: Any, within: float | None) -> Any:
-        """Return what the policy answers; PolicyStoppedError if it does not in time, or raises what it may."""
+        """Return the policy's answer; PolicyStoppedError if it comes too late, or the policy raises."""
         try:
             if within is None:
                 return function(argument)

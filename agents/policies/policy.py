@@ -33,16 +33,16 @@ class PolicyError(RuntimeError):
 
 
 def load_policy(path: str | Path) -> Any:
-    """Return what a bundle's kind makes of it.
+    """Return the policy of a bundle, by its kind.
 
     Raises:
-        BundleError: If the file is none, or its kind is not known here.
+        BundleError: If the file is not a bundle, or its kind is not known here.
     """
     return policy_of(AgentFile.load(path))
 
 
 def policy_of(bundle: AgentFile) -> Any:
-    """Return what a bundle's kind makes of it."""
+    """Return the policy of a bundle, by its kind."""
     if bundle.kind not in KINDS:
         raise BundleError(f"an agent of kind {bundle.kind!r} needs a newer drive-env; this one has {', '.join(KINDS)}")
     module, _, name = KINDS[bundle.kind].partition(":")

@@ -177,7 +177,7 @@ class _Study:
         self._states = optuna.trial.TrialState
 
     def known(self) -> Any:
-        """Return what is known now, as a study of its own."""
+        """Return the finished trials as a study of its own."""
         import optuna
 
         known = optuna.create_study()

@@ -198,7 +198,7 @@ def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> AgentFile:
     """Return the agent of a checkpoint.
 
     Raises:
-        CheckpointError: If the file is none, or its writer is not trusted.
+        CheckpointError: If the file is not a checkpoint, or its writer is not trusted.
     """
     table = checkpoint.read_run(Path(path))
     model, normaliser = checkpoint.load(Path(path), trust=trust)
@@ -320,7 +320,7 @@ def _named(value: Any) -> tuple[str, dict[str, Any]]:
 
 
 def found(name: str) -> Any:
-    """Return what "module:name" names.
+    """Import the object of "module:name".
 
     Raises:
         HyperparameterError: If there is no such thing.

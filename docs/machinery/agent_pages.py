@@ -29,7 +29,7 @@ def pages() -> dict[str, str]:
 
 
 def section(name: str) -> str:
-    """Return what is known of an agent."""
+    """Return an agent's section: task, training, figures."""
     agent = AgentFile.load(shipped(name))
     card = agent.card
     if agent.environment in TASKS:

@@ -88,7 +88,7 @@ def press(driver: Chrome, css: str) -> None:
 
 
 def enable(driver: Chrome) -> None:
-    """Have the axis enabled, and at a place that is none of the beginning."""
+    """Enable the axis, and move it away from its start."""
     press(driver, "[data-test=enable]")
     time.sleep(1.0)
     press(driver, "[data-test=move-by]")

@@ -326,8 +326,8 @@ def _announce(
         if hub.is_public:
             print(
                 f"drive-env: {hub.host}:{hub.port} is open to the network: any program that can reach it and has "
-                "the token may read and move these drives. Token and frames travel as plain text; where others listen, serve on "
-                f"{LOOPBACK} and use an SSH tunnel."
+                "the token may read and move these drives. Token and frames travel as plain text; where others listen, "
+                f"serve on {LOOPBACK} and use an SSH tunnel."
             )
         print("import can")
         print(f'bus = can.Bus(interface="slcan", channel="{hub.channel}", sleep_after_open=0)')

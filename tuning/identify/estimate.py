@@ -1,4 +1,4 @@
-"""The results of an identification: each value with its 95 % interval, or with the reason why there is none."""
+"""The results of an identification: each value with its 95 % interval, or with the reason why it is refused."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class Experiments:
     """
 
     thorough = True  # also what only tells better what is told
-    corrects = False  # drives that somebody set up go on with what their wiring needs, too
+    corrects = False  # drives that a user has set up keep the settings of their wiring, too
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         check_linear_model(target.device)  # what is moved with here comes from it
@@ -243,7 +243,7 @@ class Experiments:
             go_back(replace(working, where=on), "csv", to=0.0)
 
     def hold(self, working: Working) -> Floats:
-        """Return what holds the axes [A], at rest in csp."""
+        """Return the currents that hold the axes at rest in csp [A]."""
         drives = working.target.drives
         trace = drives.record([cia402.TORQUE_ACTUAL], HOLD * CYCLE)
         alive = still_enabled(working, drives.read(cia402.STATUSWORD))

@@ -190,7 +190,7 @@ def _there_and_back(speed: float, ramp: int, cruise: int) -> Floats:
 
 
 def _of_machines(target: Target, values: Floats, choose: Callable[..., Floats]) -> Floats:
-    """Return what each machine's axes have in common, shape (num_axes,)."""
+    """Reduce the values of each machine's axes to one by `choose`, shape (num_axes,)."""
     axes = target.axes_per_machine
     return np.repeat(choose(values.reshape(-1, axes), axis=1), axes)
 
@@ -254,7 +254,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
 
 
 def identify_mechanics(working: Working, holding: Floats) -> tuple[list[Mechanics], Floats]:
-    """Move the axes, which are enabled in csv at rest, and return what that says, and the total inertias [kg*m^2].
+    """Move the axes, which are enabled in csv at rest; return the mechanics of each, and total inertias [kg*m^2].
 
     Machines move side by side. The axes of one move one after the other while the others hold, unless they pull at the
     same thing: then they move together, and each inertia is what its drive has to move.
@@ -298,7 +298,7 @@ def are_linked(working: Working) -> bool:
 
 
 def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked: bool) -> list[Mechanics]:
-    """Move the axes there are and return what each says; `inertia` is brought up to date."""
+    """Move the axes and return the mechanics of each; `inertia` is brought up to date."""
     target = working.target
     results: list[Mechanics] = []
     softness = np.ones(target.num_axes, np.int64)
@@ -477,7 +477,7 @@ def _with_losses(
 
 
 def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
-    """Return what cogging and the sensors' offsets leave of the inertia's error, 95 %, as a share of it.
+    """Return the inertia's error by cogging and the sensors' offsets, 95 %, as a share of it.
 
     Both repeat with the angle: over many turns they average out, over a short way every move has the same of them.
     """
@@ -491,7 +491,7 @@ def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
 
 
 def _ripple(target: Target) -> float:
-    """Return what repeats with the angle, cogging and the sensors' offsets, as an RMS current [A]."""
+    """Return the current that repeats with the angle, by cogging and the sensors' offsets, as RMS [A]."""
     motor = target.motor
     offsets = [target.device.stage[name] for name in ("adc_offset_a", "adc_offset_b")]
     # Uniform between their limits; a cosine of the angle.

@@ -52,7 +52,7 @@ class Solved(NamedTuple):
 
 
 def motion(angle: Floats, current: Floats, demand: Floats) -> Motion:
-    """Return what an axis did by its angles [rad], currents [A] and set-points of speed [rad/s], shape (samples,)."""
+    """Return an axis' motion from its angles [rad], currents [A] and set-points of speed [rad/s], shape (samples,)."""
     speed = np.gradient(angle) / CYCLE
     smooth = smoothed(speed)
     # The demand tells the size, and the speed the sign.

@@ -421,7 +421,7 @@ def _solve(
 
 
 def _judge(working: Working, axis: _AxisWinding, found: _Fit, window: _Window) -> Winding:
-    """Return the estimates with their intervals, or why there are none."""
+    """Return the estimates with their intervals, or with the reason of a refusal."""
     target = working.target
     t = t_quantile(found.freedom)
     gain = gain_error(target.device, target.motor)

@@ -58,12 +58,12 @@ Settings = Mapping[Key, Setting]
 
 
 def findings(device: Device) -> dict[Key, str]:
-    """Return what a cable can be wrong in, by the object that makes up for it, as far as the device has such ones."""
+    """Return the possible mistakes in wiring, by the object that compensates each, as far as the device has them."""
     return {device.roles[role]: text for role, text in FINDINGS.items() if role in device.roles}
 
 
 def judge_halls(field: Floats, halls: Floats) -> Halls:
-    """Return what angles of the field and of the halls [electrical rad] say, shape (n,), read while the field turns."""
+    """Judge the halls by angles of field and halls [electrical rad], shape (n,), read while the field turns."""
 
     def turned(angle: Floats) -> float:
         return float(_wrapped(np.diff(angle)).sum())
@@ -100,7 +100,7 @@ def needed(device: Device, reads: Mapping[Key, int], encoder: float, halls: Hall
 
 
 def changes(settings: Settings) -> dict[Key, int]:
-    """Return what must be written."""
+    """Return the values to write."""
     return {key: one.needs for key, one in settings.items() if one.has != one.needs}
 
 
@@ -124,7 +124,7 @@ def named(key: Key) -> str:
 def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key, int]]) -> tuple[Target, Integers]:
     """Write settings of axes that are off, and return the target and where its rotors had begun [inc], as then counted.
 
-    A drive that counts the other way shows another position where the rotor is, and nobody knows whether a travel was
+    A drive that counts the other way shows another position where the rotor is, and it is unknown whether a travel was
     meant in the old direction or in the new: what is left is free to both sides.
 
     Args:

@@ -40,7 +40,7 @@ STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is al
 
 
 def borrowed(device: Device) -> tuple[ObjectName, ...]:
-    """Return what experiments change, in the order in which it is given back, as far as the device has it."""
+    """Return the objects that experiments change, in the order of giving them back, as far as the device has them."""
     names: tuple[ObjectName, ...] = (
     Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
     Role.ENCODER_STEPS, *FINDINGS,
