@@ -36,8 +36,8 @@ Mask = NDArray[np.bool_]
 
 # What counts as a violation, each time anew that it begins:
 OVERSPEED = 1.2  # times the target's limit of speed
-BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that nobody has stopped after 100 ms
-SLACK = 0.02  # rev beyond the travel that are none yet: a few counts of an overshoot at its end
+BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that has not been stopped after 100 ms
+SLACK = 0.02  # rev beyond the travel that do not count yet: a few counts of an overshoot at its end
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
 
@@ -61,7 +61,7 @@ class DriveAudit(Observer):
     """
 
     objects = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD)
-    hides_machine = True  # true parameters are nobody's business who tunes
+    hides_machine = True  # a tuner must not see true parameters
 
     def __init__(self, target: Target) -> None:
         drives = target.drives

@@ -25,7 +25,7 @@ class Punctuality(Observer):
 
 
 def told_lateness(drives: Drives) -> str:
-    """Return what to say of SYNCs of a bus in real time that were late, which distorts moves and responses; or "".
+    """Return a sentence on late SYNCs of a bus in real time, which distort moves and responses; "" without late ones.
 
     Of those since the tuner began, where it is known when (`tuning.target.timed` knows), else since the drives were
     opened.

@@ -26,7 +26,7 @@ SLOWER = 0.9  # by which positioning moves are made slower in turn that would ov
 
 
 def link_energy(target: Target) -> Floats:
-    """Return what each DC link holds above its supply until the stage is cut [J], shape (num_axes,).
+    """Return the energy that each DC link holds above its supply until the stage is cut [J], shape (num_axes,).
 
     By the least capacitance of the drive's class. The axes of a drive share its link, and may brake at one time.
     """

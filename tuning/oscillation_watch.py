@@ -133,7 +133,7 @@ class OscillationWatch(Observer):
 
 
 def watch_of(drives: Drives) -> OscillationWatch | None:
-    """Return who watches drives for oscillation, None for nobody."""
+    """Return the watch of drives for oscillation, None without one."""
     return next((each for each in drives.observers if isinstance(each, OscillationWatch)), None)
 
 

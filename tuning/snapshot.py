@@ -153,7 +153,7 @@ def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
 
 
 def _borrowed(drives: Drives) -> dict[int, dict[Key, int]]:
-    """Return what a master changes of the axes of nodes that are left out, as they are."""
+    """Return the objects that a master changes of the axes of nodes that are left out, with their values."""
     bus = drives.bus
     if bus is None:
         return {}
@@ -176,7 +176,7 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
         unchecked: Take also one that was changed since it was written, or that has no check sum.
 
     Raises:
-        SnapshotError: If the file is none; FileChangedError if it is not as it was written.
+        SnapshotError: If the file is not a snapshot; FileChangedError if it is not as it was written.
         CommandObjectError: If it holds commands or services.
     """
     where = Path(path)
@@ -203,7 +203,7 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
 
 
 def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
-    """Return the parameters of an axis; SnapshotError, or CommandObjectError, for what are none."""
+    """Return the parameters of an axis; SnapshotError, or CommandObjectError, for other tables."""
     if not isinstance(table, dict):
         raise SnapshotError(f"{file}: {table!r} is not an axis; give a file that drive-tune saved before a change")
     values = {}
@@ -258,7 +258,7 @@ def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, ot
 def restore(
     drives: Drives, snapshot: Snapshot, where: Mask | None = None, *, whole: bool = True
 ) -> list[list[Difference]]:
-    """Bring drives back to a snapshot, axis by axis, each all or none; return what was changed on each.
+    """Bring drives back to a snapshot, axis by axis, each all or none; return the changes of each.
 
     The axes must not be enabled. Set-points of speed and torque are 0 afterwards: no file has them, and with what a
     program left there an axis would turn once it is enabled.
@@ -299,7 +299,7 @@ def _set_points(known: Description) -> list[Key]:
 
 
 def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Difference]]:
-    """Return what is not as a snapshot says, as (number of the axis, difference), read anew from drives of a bus.
+    """Return the differences from a snapshot, as (number of the axis, difference), read anew from drives of a bus.
 
     Set-points of speed and torque that would turn an axis once it is enabled are among them.
 
@@ -355,7 +355,7 @@ def check_place(file: Path) -> None:
 
 
 def what_is_left(file: Path) -> str:
-    """Return what a run says that has put everything back."""
+    """Return the message of a run that has put everything back."""
     return f"the drives have their state from before; if not, drive-tune undo {file} restores it"
 
 
@@ -408,7 +408,7 @@ class Transaction:
             raise OSError(error.errno, f"{error.strerror}; {what_is_left(self.path)}", error.filename) from error
 
     def _untouched(self) -> Mask:
-        """Return the axes that somebody else runs and that were let alone, as they are in a run that refuses them."""
+        """Return the axes that another program runs and that were let alone, as they are in a run that refuses them."""
         if not self._ran.any():
             return self._ran
         now = _read_axes(self._target.drives)

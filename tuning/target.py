@@ -377,7 +377,7 @@ def of_bus(
 
 
 def check_coupling(axes: str) -> None:
-    """Raise ValueError for a word that is none of `AXES`."""
+    """Raise ValueError for a word that is not one of `AXES`."""
     if axes not in AXES:
         raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
 
@@ -442,7 +442,7 @@ def _limits(
 def address_of(
     interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what opens these drives again; what a file cannot hold, such as an open bus, is left out."""
+    """Return the options that open these drives again, without those that a file cannot hold, such as an open bus."""
     from drive_env.master.can.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE
 
     found = {

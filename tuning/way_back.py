@@ -40,7 +40,7 @@ def way_back(file: Path | None, program: str) -> Iterator[None]:
 
 
 def what_is_changed(file: Path) -> str:
-    """Return what drives of a bus, asked anew, have other than a file with their state before says, and the way back.
+    """Ask drives of a bus anew; return what differs from a file with their state before, and the way back.
 
     A node that is silent is not woken: it may be stopping by itself (docs/safety.md).
     """
@@ -65,7 +65,7 @@ TOLD = 5  # differences that a line names
 
 
 def read_anew(snapshot: Snapshot) -> list[tuple[int, Difference]]:
-    """Return what the drives of a snapshot have other than it says, as `differences`; raise if they do not answer."""
+    """Read the drives of a snapshot anew; return their `differences`; raise if they do not answer."""
     address = {name: value for name, value in snapshot.bus.items() if name != "axes"}
     if address.get("pace") == "lockstep":
         address["timeout"] = LOCKSTEP_PATIENCE

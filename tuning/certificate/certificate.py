@@ -60,7 +60,7 @@ class StepResponse:
         reference, actual: Set-point and actual value, shape (n,).
         current: Actual current [A, peak i_q], shape (n,).
         figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "greatest dip [turns]" -> value;
-            nan where there is none. A disturbance exists on the emulator only.
+            nan for one that does not apply. A disturbance exists on the emulator only.
     """
 
     name: str
@@ -168,7 +168,7 @@ class AxisCertificate:
         frequency_responses: Open loops.
         dynamics: Name of the dynamics that were asked for, or their numbers.
         requirements: What these ask for, and whether it is kept.
-        figures: The `CROSSOVERS` of the loops; nan where there is none.
+        figures: The `CROSSOVERS` of the loops; nan without a crossover.
         corrections: Which gains gave way to which, and why, in their order.
         notes: What no integer reached, limits met, what was left out.
         hardware_seconds: Time that passed on the drive [s].

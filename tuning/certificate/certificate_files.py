@@ -59,7 +59,7 @@ def is_unchanged(path: str | Path) -> bool:
     """Return whether a certificate.json, a stepper-certificate.json or a report.html is as it was written.
 
     Raises:
-        CertificateError: If the file is none of them.
+        CertificateError: If the file is another one.
     """
     where = Path(path)
     if where.suffix == ".html":

@@ -194,7 +194,7 @@ class DriveOptions:
         check_linear_model(find_device(self.device))
 
     def machine(self) -> dict[str, Any]:
-        """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
+        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
         self.check()
         check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
         named = {name: getattr(self, name) for name in ("device", "load", "seed", "supply")}
@@ -222,14 +222,14 @@ class TargetOptions(DriveOptions):
         check_machines("--machines", self.machines)
 
     def machine(self) -> dict[str, Any]:
-        """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
+        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
         return super().machine() | {"num_machines": self.machines, "randomise": self.randomise}
 
 
 def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command these options beside its own; it gets them together, as its argument `drive`.
 
-    Whoever types an option of a bus means the bus.
+    An option of a bus means drives on the bus.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -330,7 +330,7 @@ def ask_to_turn(
 
 
 def open_target(drive: DriveOptions) -> Target:
-    """Return what a command's options name, drives on a bus or emulated ones, without asking.
+    """Open the drives of a command's options, on a bus or emulated ones, without asking.
 
     Raises:
         ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer, or

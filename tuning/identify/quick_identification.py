@@ -130,7 +130,7 @@ class _Brief(Experiments):
         self.respond(working, inertia)
 
     def _move_together(self, working: Working, trials: Trials, holding: NDArray[np.float64]) -> Working:
-        """Find the inertia that axes of one machine push while all of them move; return those that did not oscillate."""
+        """Find the inertia that axes of one machine push while all of them move; return those without oscillation."""
         target, lanes = working.target, working.target.axes_per_machine
         whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
         if lanes == 1 or target.linked or not whole.any():  # which have moved together as it is

@@ -164,7 +164,7 @@ class Shaker:
         )
 
     def hold(self) -> Floats:
-        """Return what holds the axes at rest [A], shape (axes,)."""
+        """Return the currents that hold the axes at rest [A], shape (axes,)."""
         trace = self._drives.record([cia402.TORQUE_ACTUAL], (REST + LOOK) * CYCLE)
         return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
 

@@ -242,12 +242,12 @@ class _Measurement:
 
     # --- how strongly ---------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
-        """Return what may flow [A]: the user's limit, or the drive's own."""
+        """Return the highest permitted current [A]: the user's limit, or the drive's own."""
         own = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)
         return np.asarray(np.minimum(self._target.current, own))
 
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
-        """Return what a weak shaking shows; an axis that oscillates gets softer gains first, if it may."""
+        """Return the response to a weak excitation; an axis that oscillates gets softer gains first, if it may."""
         drives = self._target.drives
         watch = watch_of(drives)
         for left in reversed(range(SOFTER + 1)):
@@ -271,7 +271,7 @@ class _Measurement:
         return speed
 
     def _falling(self, shaker: Shaker, speed: Floats, passes: int, periods: int) -> Floats:
-        """Return what weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
+        """Return the energy that weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
         steady, _ = shaker.steady(speed, passes, periods)
         return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding, self._friction)
 

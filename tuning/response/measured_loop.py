@@ -45,7 +45,7 @@ class Loops(NamedTuple):
 
 
 class AtLeast(NamedTuple):
-    """Lower bounds of margins that were not measured; nan where there is none."""
+    """Lower bounds of margins that were not measured; nan without a bound."""
 
     phase_deg: float
     gain_db: float
@@ -124,7 +124,7 @@ class MeasuredLoop:
     def loops(
         self, gains: Sequence[int] | Integers, axis: int = 0, *, plant: Plant | None = None, refined: bool = True
     ) -> Loops:
-        """Return what a measured velocity loop says of other gains: by as much as those change the linear model.
+        """Return the loops with other gains from a measured velocity loop: changed as those change the linear model.
 
         What is not in the model, as friction or a second resonance, was measured; gains of the outer loops change it by
         a factor that is known exactly, those of the torque loop by what the winding makes of them.
@@ -154,7 +154,7 @@ class MeasuredLoop:
         return Loops(f, velocity, outer_loop(self.device, fit.plant, now, f, velocity), trusted)
 
     def at_least(self, loop: str, gains: Sequence[int] | Integers, axis: int = 0) -> AtLeast:
-        """Return what the margins of a loop are at least, by the fitted model, everything within its intervals.
+        """Return lower bounds of a loop's margins, by the fitted model, everything within its intervals.
 
         Args:
             loop: "velocity" or "position".

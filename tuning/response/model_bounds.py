@@ -47,7 +47,7 @@ def why_unbounded(identified: Identification) -> str:
 
 
 def at_least_by_model(device: Device, plant: Plant, identified: Identification, gains: RawGains) -> dict[str, AtLeast]:
-    """Return what the margins of both outer loops are at least, by the linear model at all corners of the intervals.
+    """Return lower bounds of both outer loops' margins, by the linear model at all corners of the intervals.
 
     Args:
         device: The drive.

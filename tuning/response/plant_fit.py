@@ -79,7 +79,7 @@ class Pair(NamedTuple):
 
 
 class PlantFit(NamedTuple):
-    """The fitted plant, and each parameter with its interval; `reason` says why there is none.
+    """The fitted plant, and each parameter with its interval; `reason` says why the fit is refused.
 
     The plant has the first pair of anti-resonance and resonance; a second one, above it, is in `second`.
     """

@@ -58,11 +58,11 @@ class Workbench:
         self._notes: list[str] = []
 
     def p(self, loop: str, value: float) -> float:
-        """Take a proportional gain [V/A, A*s/rad, 1/s] of a loop; return what it became."""
+        """Take a proportional gain [V/A, A*s/rad, 1/s] of a loop; return the value after rounding to an integer."""
         return self._take((loop, "P"), value)
 
     def time(self, loop: str, value: float) -> float:
-        """Take an integration time [s], infinite for none, of the current or velocity loop; return what it became."""
+        """Take an integration time [s], infinite for none, of the current or velocity loop; return it as rounded."""
         inverse = self._take((loop, "I"), 1.0 / value)
         return 1.0 / inverse if inverse else math.inf
 
@@ -73,7 +73,7 @@ class Workbench:
         return value / self.per_si[part]
 
     def si(self, part: Part, value: float) -> float:
-        """Return what a raw gain means in SI, of an I 1/s."""
+        """Return a raw gain in SI units, of an I 1/s."""
         return value / self.per_si[part]
 
     def row(self, part: Part) -> Gain:
@@ -85,16 +85,16 @@ class Workbench:
         return min(max(round(wanted), 1), self._rows[part].highest)
 
     def note(self, text: str) -> None:
-        """Say something to whoever reads the proposal."""
+        """Add a note to the proposal."""
         self._notes.append(text)
 
     def so_far(self, more: Mapping[Part, int] | None = None) -> tuple[int, ...]:
-        """Return what was taken so far, and more, in the device's order; 1 for what is not taken yet."""
+        """Return the gains taken so far, and more, in the device's order; 1 for a gain that is not taken yet."""
         found = self._raw | dict(more or {})
         return tuple(found.get(part, 1) for part in self._rows)
 
     def proposal(self) -> Proposal:
-        """Return what was taken."""
+        """Return the proposal of the gains taken."""
         return Proposal(tuple(self._raw[part] for part in self._rows), dict(self._wanted), tuple(self._notes))
 
     def _take(self, part: Part, value: float) -> float:

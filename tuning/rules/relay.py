@@ -125,7 +125,7 @@ def finish(bench: Workbench, ultimate: Ultimate, slope: float) -> Proposal:
 
 
 def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats | None = None) -> Swing:
-    """Swing axes by a relay and return what that says; the drives are enabled in cst meanwhile and off afterwards.
+    """Swing axes by a relay and evaluate the swing; the drives are enabled in cst meanwhile and off afterwards.
 
     The current loop must work: write its gains first. An axis that nears the end of its travel is left alone.
 
@@ -173,7 +173,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
 
 
 def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside: Mask, count_angle: float) -> Swing:
-    """Return what recorded swings say.
+    """Evaluate recorded swings.
 
     Args:
         speed: Velocity once a cycle [rad/s], shape (n, num_axes).

@@ -50,7 +50,7 @@ MEANINGS: Mapping[str, str] = {
 
 
 def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Return what a rule proposes.
+    """Return the proposal of a rule.
 
     Raises:
         ValueError: For an unknown rule, naming those there are, or a drive without a linear model of its loops.

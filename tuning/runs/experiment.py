@@ -173,7 +173,7 @@ def load_experiment(
         closed_loop: Without a file take the one that ships for steppers with a loop of this kind closed.
         overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
             sweeps the same gains of any device, over the same range in its units, with the device's usual motor where
-            its own is none of that device's.
+            its own does not suit that device.
 
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
@@ -211,7 +211,7 @@ def shipped_experiment(device: str | None, *, closed_loop: str | None = None) ->
     """Return the experiment that ships for a device, None for the default one.
 
     Raises:
-        ExperimentError: For a device that is none, or that closes no loop where one is wanted.
+        ExperimentError: For an unknown device, or one that closes no loop where one is wanted.
     """
     if device is None:
         return CLOSED_LOOPS[closed_loop] if closed_loop else DEFAULT
@@ -296,7 +296,7 @@ def _velocity_ratio(device: Device, dictionary: ObjectDictionary, preset: Mappin
 
 
 def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
-    """Return what a scale's objects make, of a preset, else by default."""
+    """Return the scale that a preset gives, with defaults for objects that it lacks."""
     given = {dictionary.find(name).label: value for name, value in preset.items()}
     entries = [dictionary.find(key) for key in scale.keys]
     values = [np.array([given.get(entry.label, entry.default)], float) for entry in entries]
@@ -304,7 +304,7 @@ def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[st
 
 
 def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
-    """Return what an experiment sweeps as another device has it: its gains of the same parts, in its units."""
+    """Return the gains of an experiment for another device: its gains of the same parts, in its units."""
     try:
         device = find_device(name)
     except ValueError as error:

@@ -81,7 +81,7 @@ class Input(str):
         return self
 
     def __repr__(self) -> str:
-        """Return what tells it from others, wherever its copy lies."""
+        """Return its name and hash, wherever its copy lies."""
         return f"Input({self.kept!r}, {self.hash!r})"
 
 
@@ -119,7 +119,7 @@ def inputs_in(value: Any) -> list[Input]:
 
 
 def hashes(inputs: Iterable[Input]) -> dict[str, str]:
-    """Return what settings say of inputs: where the folder has each -> its hash."""
+    """Return the table of inputs in settings: place in the folder -> hash."""
     return {one.kept: one.hash for one in inputs}
 
 
@@ -252,7 +252,7 @@ def is_shipped(what: str, name: str) -> bool:
 
 
 def _check(what: str, name: str | Path) -> None:
-    """Raise ValueError, with the path as it is given, for what is none."""
+    """Raise ValueError, with the path as it is given, for a file that is not of this kind."""
     if what == "motor":
         from drive_env.motors import find_motor
 
@@ -322,7 +322,7 @@ def _of_load(path: Path) -> list[Path]:
 
 
 def _of_device(path: Path) -> list[Path]:
-    """Return the files of a variant, or of a device's folder; whatever else lies in that is none of the device's."""
+    """Return the files of a variant, or of a device's folder; other files in the folder are left out."""
     if not path.is_dir():
         return [path]
     from drive_env.devices.own_folder import own_data

@@ -306,7 +306,7 @@ def _compile(experiment: Experiment) -> None:
 
 
 def _signals(resolved: Resolved) -> list[ObjectName]:
-    """Return what is recorded: velocity and current, or what an open loop has in place of a measured current."""
+    """Return the objects to record: velocity and current, or those of an open loop without a measured current."""
     if resolved.loop is not None:
         return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL]
     if resolved.device.gains.is_open_loop:
@@ -461,7 +461,7 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
 
 
 def _score(columns: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Return what ranks: inf for a point with a flag, or without the figure."""
+    """Return the key of the ranking: inf for a point with a flag, or without the figure."""
     flagged = np.any([columns[flag] for flag in FLAGS], axis=0) | np.isnan(columns["score"])
     return np.where(flagged, np.inf, columns["score"])
 

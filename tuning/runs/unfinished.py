@@ -28,14 +28,14 @@ def unfinished_folder(folder: str | Path) -> Path:
 
 
 def settings_of(folder: str | Path) -> Path | None:
-    """Return the settings of an unfinished run, None if there is none."""
+    """Return the settings of an unfinished run, None without an unfinished run."""
     path = unfinished_folder(folder) / SETTINGS
     return path if path.is_file() else None
 
 
 @contextmanager
 def shard_log(folder: str | Path, settings: str, *, resume: bool, inputs: Iterable[Input] = ()) -> Iterator[ShardLog]:
-    """Give the shards of a run that are done, and keep those to come; leave nothing behind if there are none.
+    """Give the shards of a run that are done, and keep those to come; leave no folder behind without any shard.
 
     Args:
         folder: Where the results will be.
@@ -85,7 +85,7 @@ def telling_what_is_kept(folder: str | Path) -> Iterator[None]:
 
 
 def _recorded(settings: Path) -> object:
-    """Return what the settings of an unfinished run say of its inputs; of settings that are none, nothing."""
+    """Return the inputs in the settings of an unfinished run, None if the file cannot be read."""
     try:
         return read_toml(settings).get("inputs")
     except (OSError, ValueError, tomllib.TOMLDecodeError):

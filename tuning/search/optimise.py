@@ -547,7 +547,7 @@ def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow
 
 
 def objective_values(row: TrialRow, objectives: Sequence[str]) -> tuple[float, ...]:
-    """Return what a trial is worth in each objective, less is better."""
+    """Return a trial's value in each objective, less is better."""
     broken = math.log(2.0 - math.exp(min(row.slack, 0.0)))  # as the robust cost counts it
     return tuple(
         row.robust_cost if name == COST else row.objectives[OBJECTIVES.index(name)] + broken for name in objectives

@@ -87,7 +87,7 @@ def new_proposer(
         study: What the journal calls the study, and what it is of: one of something else is refused.
 
     Raises:
-        ValueError: For a sampler that is none, that has one objective only, or that lacks a package.
+        ValueError: For an unknown sampler, one that has one objective only, or one that lacks a package.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"no sampler is named {sampler!r}; there are {', '.join(SAMPLERS)}")

@@ -122,7 +122,7 @@ def is_tried_by_pid(device: str, gains: tuple[str, ...] | None) -> bool:
 
 
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
-    """Return what a trial reached in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
+    """Return a trial's figure in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
     scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
     told = dict(zip((COST, *OBJECTIVES), (row.cost, *row.objectives), strict=True))
     return [scales[name] * math.exp(told[name]) if name in scales else told[name] for name in objectives]
@@ -156,7 +156,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
 
 
 def axis_numbers(machine: Mapping[str, Any], count: int) -> list[int]:
-    """Return what results call the axes of a search: chosen ones by their number among all axes of the nodes."""
+    """Return the numbers of a search's axes in results: chosen ones by their number among all axes of the nodes."""
     from drive_env.devices import find_device
 
     parts = machine.get("axis")

@@ -22,7 +22,7 @@ LONG = 14  # letters from which a cell is a text rather than a figure
 
 
 def identified_rows(found: Identification) -> list[tuple[str, str, str]]:
-    """Return title, value with unit, and interval or the reason why there is none."""
+    """Return rows of title, value with unit, and interval or the reason of a refusal."""
     rows = []
     for name, estimate in found.estimates.items():
         if estimate.is_known:

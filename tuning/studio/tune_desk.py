@@ -172,7 +172,7 @@ class TuneDesk:
         return mine[::-1][: LAST + 1]
 
     def note(self, axis: int, before: Sequence[int], after: Sequence[int], what: str) -> None:
-        """Add a change to the history; one that changes nothing is none."""
+        """Add a change to the history, unless the gains are equal."""
         old, new = tuple(map(int, before)), tuple(map(int, after))
         if old != new:
             self.changes.append(GainChange(axis, old, new, what))
