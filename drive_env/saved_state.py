@@ -2,7 +2,7 @@
 
 A class names the attributes that make up its state in `STATE`. Each is data (numbers, text, arrays; dicts, lists and
 tuples of such), a bundle of arrays, or an object that has a state itself. What follows from how an object was made is
-none of it: a state is put back into an object that was made alike.
+left out: a state is put back into an object that was made alike.
 """
 
 from __future__ import annotations

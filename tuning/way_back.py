@@ -40,7 +40,7 @@ def way_back(file: Path | None, program: str) -> Iterator[None]:
 
 
 def what_is_changed(file: Path) -> str:
-    """Ask drives of a bus anew; return what differs from a file with their state before, and the way back.
+    """Ask drives of a bus anew; return a message of the differences from a file of the state before.
 
     A node that is silent is not woken: it may be stopping by itself (docs/safety.md).
     """

@@ -376,7 +376,7 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
 
     Args:
         gains: The answers, (environments, axes, count).
-        trials: What was told of every trial of all environments, by the names of TRIAL_OF.
+        trials: The info of every trial of all environments, by the names of TRIAL_OF.
         last: What the environment told in the last step of each environment; changed.
     """
     for lane, told in enumerate(last):

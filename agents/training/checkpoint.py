@@ -77,7 +77,7 @@ def check_trust(path: Path, trust: bool) -> None:
     if not trust:
         raise UntrustedError(
             f"{path} holds pickles: loading it runs code that its author put there, with your rights (your files, "
-            "your network, the drives). If it is yours, or from somebody whose programs you would run here, give "
+            "your network, the drives). If it is yours, or from a person whose programs you would run here, give "
             "--trust (in Python trust=True); an agent.npz runs no code and needs no trust"
         )
 

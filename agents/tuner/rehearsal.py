@@ -244,7 +244,7 @@ def _error_control(target: Target, axis: int) -> Iterator[Check]:
                                     f"time 0420h would be set to {1e3 * silence:.0f} ms")  # fmt: skip
     elif description.has((0x1016, 1)):
         value = _read(target, (0x1016, 1), axis)
-        now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
+        now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "no node"
         yield Check("heartbeat", OK, f"the drive can monitor its master by heartbeat: 1016h, now {now}; in real time "
                                      f"it "
                                      f"would be set to {1e3 * silence:.0f} ms")  # fmt: skip

@@ -604,7 +604,7 @@ class Node:
         self._segment_at = math.inf
 
     def _on_lss(self, data: bytes, now: float) -> None:
-        assert self._lss is not None, "nobody else is called"
+        assert self._lss is not None, "called on nodes with LSS only"
         self._work = self._device.canopen.sdo_time
         try:
             answer = self._lss.request(data)

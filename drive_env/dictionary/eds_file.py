@@ -64,7 +64,7 @@ MOST_ENTRIES = 20_000  # sections, those included that CompactSubObj stands for:
 MOST_SUB = 254  # highest sub-index (CiA 301)
 MOST_LINES = 300_000  # an entry has some ten
 LONGEST_NAME = 200  # letters of a section's name
-LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 members, and in what is told
+LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 members, and in messages
 
 VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
 MEMBER_KEYS = (*VALUE_KEYS, "ParameterValue", "ObjFlags", "Unit", "Factor", "Description")  # that an array hands down

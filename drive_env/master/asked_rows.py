@@ -1,4 +1,4 @@
-"""What no process data carry, asked for by SDO while cycles pass: each row has what was told last.
+"""Objects that no process data carry, read by SDO while cycles pass: each row has the value that was read last.
 
 For states alone, which change seldom: of a position a row would be wrong by what is some milliseconds old.
 """

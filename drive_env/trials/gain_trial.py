@@ -131,7 +131,7 @@ class Trials(Saved):
         self._t_0 = t_0
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the present gains; return what was identified, and where the axes began [inc].
+        """Move there and back with the present gains; return the identified axes, and where they began [inc].
 
         Args:
             reach: How far the rotors may turn from here, with the sign [rad], shape (num_axes,).

@@ -321,7 +321,7 @@ class OpenLoopTrials(Trials):
         start(self._drives, wrapped(target + self.shift()).astype(np.int64), where)
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the present currents; return what the load angle shows, and where the axes began.
+        """Move there and back with the present currents; return the axes by their load angles, and their starts [inc].
 
         The weight of the load is unknown: an axis that loses steps in moves for a light one makes slower ones, while
         the others stand.
@@ -369,7 +369,7 @@ class OpenLoopTrials(Trials):
         self._zero = np.where(where, now, 0.0 if self._zero is None else self._zero)
 
     def _identify_by(self, move: Move, origin: Integers, reach: Floats, where: Mask) -> tuple[Identified, Floats, Mask]:
-        """Move there and back, and swing; return what was identified, the encoder's way, and which axes lost steps."""
+        """Move there and back, and swing; return the identified axes, the encoder's way, and which axes lost steps."""
         drives, motor = self._drives, self._motor
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]

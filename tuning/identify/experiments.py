@@ -75,7 +75,7 @@ class Experiments:
         found: What is known so far of each axis, by the names of `NAMES`.
     """
 
-    thorough = True  # also what only tells better what is told
+    thorough = True  # also experiments that only narrow an interval
     corrects = False  # drives that a user has set up keep the settings of their wiring, too
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:

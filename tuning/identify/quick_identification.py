@@ -86,7 +86,7 @@ class _Brief(Experiments):
 
     def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
         super().__init__(target, where, progress)
-        # What is told of each axis where `found` has a guess.
+        # The estimates of each axis by measurement, where `found` has a guess.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
         self._pushed: list[tuple[float, ...]] = [() for _ in range(target.num_axes)]
 
