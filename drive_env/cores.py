@@ -1,4 +1,4 @@
-"""How many cores this process may use: of a machine, what the affinity and a container's quota leave."""
+"""How many cores this process may use: those that affinity and a container's quota leave of the machine's."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class Gains(NamedTuple):
 
 
 class Bandwidths(NamedTuple):
-    """What gains mean on a motor with a total inertia.
+    """The bandwidths of gains on a motor with a total inertia.
 
     current_hz, velocity_hz [Hz], velocity_integration_s [s], position_hz [Hz] (k_v / 2 pi).
     """
@@ -168,7 +168,7 @@ def bandwidths_from_gains(
 
 # --- the baseline rule ------------------------------------------------------------------------------------------------
 class Rule(NamedTuple):
-    """Gains from what is identified: the total inertia, and what the motor's data sheet says.
+    """A rule that computes gains from the total inertia, as identified, and the motor's data sheet.
 
     With T the sum of the small time constants:
 
@@ -196,7 +196,7 @@ BASELINE_RULE = Rule(current_hz=1000.0, speed=0.25, integration=4.0, position=0.
 def rule_gains(
     device: Device, motor: Motor, inertia: ArrayLike, rule: Rule = BASELINE_RULE, *, supply: float | None = None
 ) -> NDArray[np.int64]:
-    """Return a rule's raw gains, shape (n, count) in the order of the device's set; what leaves its range is cut off.
+    """Return a rule's raw gains, shape (n, count) in the order of the device's set, clipped to their ranges.
 
     Args:
         device: The drive.

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent  # where our packages lie side by 
 
 
 class ForeignPackageError(ImportError):
-    """Another package stands in the way of ours; the message names it and says what to do."""
+    """A foreign package has the name of ours; the message names it and its remedy."""
 
 
 def check_own(*names: str, root: Path = ROOT) -> None:

@@ -108,7 +108,7 @@ def output_is_closed() -> bool:
 
 
 def _forget(stream: Any) -> None:
-    """Have what a stream still holds, and what comes, go nowhere."""
+    """Discard the content of a stream's buffer, and later writes to it."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())

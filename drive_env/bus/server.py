@@ -71,7 +71,7 @@ class Server:
         self._thread.start()
 
     def stop(self) -> None:
-        """End serving; also from a signal handler or another thread. What ended a thread's serving is raised here."""
+        """End serving; also from a signal handler or another thread. Raises the error that ended a serving thread."""
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()

@@ -24,7 +24,7 @@ Outcome = Literal["received", "lost", "error", "error passive", "bus off"]
 
 
 class Transmission(NamedTuple):
-    """What ended on the bus at time `end` [s], and what became of it.
+    """A transmission that ended on the bus at time `end` [s], and its result.
 
     "received": everybody but the sender has it. "lost": a fault kept it from everybody. "error": an error frame ended
     it and the sender tries again; "error passive": the same, and the sender's controller has become error passive;
@@ -63,7 +63,7 @@ class _Waiting:
 
 
 class _Sender:
-    """A CAN controller: what it has to send leaves in the order in which it was given."""
+    """A CAN controller: its frames leave in the order in which they were given."""
 
     def __init__(self) -> None:
         self.queue: deque[_Waiting] = deque()
@@ -116,7 +116,7 @@ class Wire:
         self.statistics.most_waiting = max(self.statistics.most_waiting, self._num_waiting)
 
     def silence(self, sender: Hashable, until: float) -> None:
-        """Take a sender's controller off the bus until `until` [s], as many errors do; what waited there is lost."""
+        """Take a sender's controller off the bus until `until` [s], as many errors do; its waiting frames are lost."""
         controller = self._senders.get(sender)
         self._give_up(self._add(sender) if controller is None else controller, until)
 

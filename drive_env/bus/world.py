@@ -20,7 +20,7 @@ MAX_NODE_ID = 127
 
 
 class BusNode(Protocol):
-    """What a world asks of a node; drive_env/canopen/node.py says what each call means."""
+    """The calls of a world to a node; drive_env/canopen/node.py says what each means."""
 
     def receive(self, frame: Frame, now: float) -> None:
         """Take a frame of the bus."""
@@ -29,7 +29,7 @@ class BusNode(Protocol):
         """Prepare for a communication cycle."""
 
     def after_cycle(self, now: float) -> None:
-        """Send what a communication cycle has brought."""
+        """Send the results of a communication cycle."""
 
     def error_passive(self, now: float) -> None:
         """Learn that its controller has become error passive."""
@@ -48,16 +48,16 @@ class BusNode(Protocol):
 
 
 class Beside(Protocol):
-    """What lives by a world's time without being on its bus: another fieldbus of the same machines."""
+    """A second fieldbus of the same machines, which lives by a world's time."""
 
     def begin_cycle(self) -> None:
         """Prepare for a communication cycle."""
 
     def end_cycle(self) -> None:
-        """Take what a communication cycle has brought."""
+        """Take the results of a communication cycle."""
 
     def pass_time(self, now: float) -> None:
-        """Do what is due between cycles until `now` [s]."""
+        """Run everything due between cycles until `now` [s]."""
 
     def next_event(self) -> float:
         """Return when something is due next [s]."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class NmtState(IntEnum):
-    """NMT state; the number is what heartbeat and guarding send."""
+    """NMT state; the number is the one in heartbeats and guarding."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -26,7 +26,7 @@ class Command(IntEnum):
 
 
 class Services(NamedTuple):
-    """A row of CiA 301, table 37: what works in a state; NMT and error control work in all three."""
+    """A row of CiA 301, table 37: the services of a state; NMT and error control work in all three."""
 
     sdo: bool
     pdo: bool

@@ -138,7 +138,7 @@ class Node:
         self._empty_buffers(takes_time)
 
     def _empty_buffers(self, takes_time: bool) -> None:
-        """Have no frame received and no answer under way, and know what takes time."""
+        """Drop received frames and answers under way."""
         device = self._device
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
         self._takes_time = takes_time
@@ -222,7 +222,7 @@ class Node:
             self._send_segments(now)
 
     def _send_segments(self, now: float) -> None:
-        """Send what the bus takes of a block upload: a controller's buffer is filled no further than half."""
+        """Send segments of a block upload: a controller's buffer is filled no further than half."""
         while self._has_room():
             segment = self._sdo.next_segment(now)
             if segment is None:
@@ -256,7 +256,7 @@ class Node:
             handler(frame.data, now)
 
     def before_cycle(self, now: float) -> None:
-        """Do what is due before the drives advance by one communication cycle that begins at `now` [s].
+        """Run everything due before the drives advance by one communication cycle that begins at `now` [s].
 
         A lost master so stops the drives in the cycle that begins.
         """
@@ -295,7 +295,7 @@ class Node:
             self._on_sync(data, now)
 
     def after_cycle(self, now: float) -> None:
-        """Do what is due after it: emergencies, event-driven PDOs, timers, heartbeat; the cycle ended at `now` [s]."""
+        """Run everything due after it: emergencies, event-driven PDOs, timers, heartbeat; it ended at `now` [s]."""
         self._now = now
         if not self._is_online:
             return
@@ -465,7 +465,7 @@ class Node:
         self._handlers = {lss.REQUEST: (self._on_lss,)}
 
     def _configure(self, index: int) -> None:
-        """Let the service behind a communication object take over what was written."""
+        """Have the service behind a communication object read its written value."""
         module = self._module
         if index in (communication.EMERGENCY_ID, communication.EMERGENCY_INHIBIT):
             raw = module.value(communication.EMERGENCY_ID)
@@ -667,7 +667,7 @@ class Node:
         self._react(COMMUNICATION_ERROR, "heartbeat_lost")
 
     def _react(self, error_class: int, told: str = COMMUNICATION) -> None:
-        """Do what 1029h says of an error that is detected in operational."""
+        """Change the NMT state as 1029h says for an error that is detected in operational."""
         if self.state is not NmtState.OPERATIONAL:
             return
         raw = self._module.value(communication.ERROR_BEHAVIOUR, error_class)
@@ -728,7 +728,7 @@ class Node:
 
     # --- what LSS asks for (drive_env/canopen/lss.py) -----------------------------------------------------------------
     def identity(self) -> LssIdentity:
-        """Return vendor, product, revision and serial number, 0 for what the device lacks."""
+        """Return vendor, product, revision and serial number; 0 for one that the device lacks."""
         has = self._module.subs(IDENTITY)
         port = self.dictionary.port
         parts = [port(IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]

@@ -15,7 +15,7 @@ EPSILON = 1e-6  # s: times are sums of cycles
 
 
 class Pdo:
-    """What both directions have in common: identifier, transmission type and the mapped objects.
+    """Common part of both directions: identifier, transmission type and the mapped objects.
 
     Args:
         index: Index of its communication parameter.
@@ -31,7 +31,7 @@ class Pdo:
         self.configure()
 
     def configure(self) -> None:
-        """Take over what the objects say."""
+        """Read the settings from the objects."""
         objects, index = self._objects, self.index
         cob_id = objects.value(index, 1)
         self.can_id = None if cob_id & frames.INVALID else cob_id & frames.IDENTIFIER
@@ -50,7 +50,7 @@ class ReceivePdo(Pdo):
     """A PDO that the drive receives."""
 
     def configure(self) -> None:
-        """Take over what the objects say; what waits for SYNC is forgotten."""
+        """Read the settings from the objects; data waiting for SYNC are dropped."""
         super().configure()
         self._waiting: bytes | None = None
 
@@ -64,14 +64,14 @@ class ReceivePdo(Pdo):
         return self._apply(data)
 
     def latch(self) -> str | None:
-        """Let what came since the last SYNC take effect; return the condition that it makes."""
+        """Let data received since the last SYNC take effect; return the error condition, if it makes one."""
         if self._waiting is None:
             return None
         data, self._waiting = self._waiting, None
         return self._apply(data)
 
     def forget(self) -> None:
-        """Forget what waits for SYNC."""
+        """Drop data waiting for SYNC."""
         self._waiting = None
 
     def _apply(self, data: bytes) -> str | None:
@@ -100,7 +100,7 @@ class TransmitPdo(Pdo):
         super().__init__(index, objects, port)
 
     def configure(self) -> None:
-        """Take over what the objects say."""
+        """Read the settings from the objects."""
         before = self.can_id, self._sent_at
         super().configure()
         self._inhibit = self._objects.value(self.index, 3) * self._inhibit_unit

@@ -1,4 +1,4 @@
-"""What a cold start shows on stderr while Numba compiles the kernels: a line, and on a terminal a bar."""
+"""The progress of a cold start on stderr while Numba compiles the kernels: a line, and on a terminal a bar."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def show_compiling() -> CompileBar:
 
 
 class CompileBar(logging.Handler):
-    """Shows what `mechanics.kernel_files` logs: lines as they are, kernels as a bar whose parts are functions."""
+    """Shows the log of `mechanics.kernel_files`: lines as they are, kernels as a bar whose parts are functions."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -159,7 +159,7 @@ def _tell_plan(
     raw: bool,
     json: bool,
 ) -> None:
-    """Say what the drive has, and what would be written; raises for a value that the object cannot take."""
+    """Print the present values and those to write; raises for a value that the object cannot take."""
     from drive_env.dictionary.access import check_limits, check_writable
 
     check_writable(entry)

@@ -166,7 +166,7 @@ class _OneAxis:
         self.drives.write(name, raw, where=self.where)
 
     def rows(self, raw: list[int], others: int) -> Any:
-        """Return rows of what is played: of it, and of the others what does nothing."""
+        """Return rows to play: those of the axis, and for the others values without effect."""
         import numpy as np
 
         return np.where(self.where, np.array(raw, int)[:, None], others)
@@ -183,7 +183,7 @@ class _OneAxis:
 
 @dataclass(frozen=True)
 class _Movement:
-    """What an axis shall do, in the drive's units: turn at a speed for a time [s], or by a distance if there is one."""
+    """The movement of an axis, in the drive's units: turn at a speed for a time [s], or by a distance if given."""
 
     velocity: int
     duration: float
@@ -290,7 +290,7 @@ def _tell_plan(
     *,
     json: bool,
 ) -> None:
-    """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
+    """Print where the axis is and the planned movement; raises for an axis in fault, which could not be enabled."""
     from drive_env.master import quantities
 
     status = one.read(cia402.STATUSWORD)

@@ -197,7 +197,7 @@ def _write(file: Path, data: Mapping[str, object]) -> None:
 
 
 def _tell(file: Path, row: Motor) -> None:
-    """Say what the numbers make of the motor, by which a wrong one is noticed."""
+    """Print figures that follow from the numbers, so that a wrong one is noticed."""
     from drive_env.devices import device_names, find_device
     from drive_env.firmware import motor_kinds
     from drive_env.motors import is_extra_low

@@ -155,7 +155,7 @@ def look_first(
 
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
-    """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    """End with one red line: code 1 for an error of a drive or the bus, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
 
@@ -170,7 +170,7 @@ def ending_by(
     refused: tuple[type[Exception], ...],
     mistakes: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """End a program by its own `fail`, which takes what to say and the exit code.
+    """End a program by its own `fail`, which takes the message and the exit code.
 
     Args:
         fail: What ends it.
@@ -205,7 +205,7 @@ def ending_by(
 
 @contextmanager
 def told_if_interrupted(what: str) -> Iterator[None]:
-    """Say what was written, if Ctrl-C ends a block before the command has said it."""
+    """Print which files were written, if Ctrl-C ends a block before the command has printed it."""
     try:
         yield
     except KeyboardInterrupt:

@@ -238,7 +238,7 @@ def _exchange(
     json: bool,
     dry_run: bool,
 ) -> None:
-    """Write parameters and say what the drive holds then, as another connection reads it.
+    """Write parameters, and print the drive's values as another connection reads them then.
 
     Args:
         bus: The node.
@@ -296,7 +296,7 @@ def _exchange(
 
 
 def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, json: bool) -> None:
-    """Say what would be written."""
+    """Print the parameters that would be written."""
     if json:
         rows = [_row(difference, scale) for difference in differences]
         print_json({"would change": rows, "would store": store, "written": 0})
@@ -348,7 +348,7 @@ def _check_axis(drives: BusDrives, axis: int) -> None:
 
 
 def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
-    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
+    """Return parameters as TOML; the objects' names are comments, their indices are read."""
     from drive_env.master.identity import read_identity
     from drive_env.whole_file import FORMAT
 

@@ -1,4 +1,4 @@
-"""What stops the drives when `drive-env replay` itself dies: their heartbeat consumers, set for as long as it runs."""
+"""The watchdog for the death of `drive-env replay` itself: heartbeat consumers of the drives, set while it runs."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class ReplayWatchdog:
         return without
 
     def give_up(self, nodes: Iterable[int]) -> list[str]:
-        """Give nodes whose motors are proved off what they had; the others stop by themselves.
+        """Give nodes whose motors are proved off their settings back; the others stop by themselves.
 
         Returns:
             What could not be put back, in words.

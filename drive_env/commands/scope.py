@@ -234,7 +234,7 @@ def _record(
     before: float,
     wait: float,
 ) -> tuple[dict[Any, Any], int, BaseException | None]:
-    """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
+    """Return rows of each entry, the row at which the trigger fired, and the error that ended the recording."""
     count, keep = round(duration / 0.001), round(before / 0.001)
     if trigger is None:
         samples = _Samples(drives, axes, entries)

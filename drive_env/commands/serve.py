@@ -143,7 +143,7 @@ def serve(
 
 
 def _bus(one: Mapping[str, Any], config: Path | None, bitrate: int | None, store: Path | None, seed: int | None) -> Bus:
-    """Return the bus that the arguments ask for; `one` are those of its one machine, None for what is not given."""
+    """Return the bus of the arguments; `one` are those of its one machine, None for those not given."""
     from drive_env.bus.config import Bus, BusConfigError, Machine, load_bus
 
     one = {key: value for key, value in one.items() if value is not None}
@@ -293,7 +293,7 @@ def _can_port(interface: str, channel: str | None, bit_rate: int) -> Transport:
 
 
 def _warm_up(bus: Bus) -> None:
-    """Do once on drives that are thrown away what serving does: what happens first compiles or loads for long."""
+    """Do once, on drives that are thrown away, the work of serving: its first time compiles or loads for long."""
     from drive_env.bus.config import build_world
     from drive_env.canopen.frames import NMT, SDO_REQUEST, SYNC, Frame
 

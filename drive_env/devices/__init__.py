@@ -87,7 +87,7 @@ class AxisOffset(NamedTuple):
 
 
 class CanopenBehaviour(NamedTuple):
-    """What a device does on a CANopen bus; times in s.
+    """Behaviour of a device on a CANopen bus; times in s.
 
     Attributes:
         sdo_timeout: Time after which the server gives a transfer up.
@@ -127,7 +127,7 @@ class CanopenBehaviour(NamedTuple):
 
 
 class MasterHints(NamedTuple):
-    """What a master must know of a device besides its EDS; times in s.
+    """Facts about a device that a master needs besides its EDS; times in s.
 
     Attributes:
         rpdo_type: Transmission type of an RPDO that waits for SYNC.
@@ -198,7 +198,7 @@ class Device(NamedTuple):
 
     @property
     def firmware(self) -> Firmware:
-        """What runs in the drive; it is composed at the first look, and compiled at its first use."""
+        """The drive's firmware; it is composed at the first look, and compiled at its first use."""
         return find_firmware(self.firmware_name)
 
     @property
@@ -355,7 +355,7 @@ def find_device(name: str) -> Device:
 
 
 def _own_device(folder: Path) -> Device:
-    """Return the device in a folder of one's own; ValueError names the file that is wrong, and what is wrong in it."""
+    """Return the device in a folder of one's own; ValueError names the file and its mistake."""
     with naming(folder / "device.toml"):
         data = own_data(folder)
         eds = folder / data["eds"]

@@ -1,4 +1,4 @@
-"""Process images that a device has ready-made, as packed structures: its `images.toml` says what each field is."""
+"""Process images that a device has ready-made, as packed structures: `images.toml` has the object of each field."""
 
 from __future__ import annotations
 

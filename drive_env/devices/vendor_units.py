@@ -48,14 +48,14 @@ _ANGLE = re.compile(r"(\d+(?:\.\d+)?)?\*?(m?)(deg|degree|degrees|\u00b0|rad)(/s|
 
 
 class Feed(NamedTuple):
-    """Units of position in a turn of the shaft that 6092h counts, and what says so; 0 and "" where nothing does."""
+    """Units of position in a turn of the shaft that 6092h counts, and their source; 0 and "" without a source."""
 
     units: float
     source: str
 
 
 class VendorUnits(NamedTuple):
-    """Units of a drive, and what says so.
+    """Units of a drive, and their sources.
 
     Attributes:
         velocity, acceleration, torque: Names of units (dictionary/units.py).
@@ -110,7 +110,7 @@ def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", accelerati
 
 
 class UnitCode(NamedTuple):
-    """What an object of 60A8h to 60AAh says."""
+    """The unit code of an object of 60A8h to 60AAh."""
 
     prefix: float
     numerator: int

@@ -53,12 +53,12 @@ class Code(NamedTuple):
 
     @property
     def least(self) -> int:
-        """Least integer that stands for what the factor gives."""
+        """Least integer that is computed by the factor."""
         return self.low + any(raw == self.low for raw, _ in self.specials) if self.specials else self.low
 
     @property
     def greatest(self) -> int:
-        """Greatest integer that stands for what the factor gives."""
+        """Greatest integer that is computed by the factor."""
         return self.high - any(raw == self.high for raw, _ in self.specials) if self.specials else self.high
 
 

@@ -1,4 +1,4 @@
-"""What makes an EDS that of a CiA 402 drive: its axes, and objects that are integers of the standard's length."""
+"""Checks that an EDS is of a CiA 402 drive: its axes, and objects that are integers of the standard's length."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An EDS as makers write it, made readable: sections, and what had to be put right in them.
+"""An EDS as makers write it, made readable: sections, and the corrections that they needed.
 
 CiA 306 says how an EDS is written; real ones have stray lines, other spellings of numbers and names, sections twice,
 lists that count wrong, sub-objects without their object. Nothing is invented here: what cannot be understood is left
@@ -73,14 +73,14 @@ Section = dict[str, str]
 
 
 class Repair(NamedTuple):
-    """What was put right in a file: where (a section, or a line), and what."""
+    """A correction of a file: where (a section, or a line), and what was wrong."""
 
     where: str
     what: str
 
 
 class EdsFile(NamedTuple):
-    """An EDS: its sections in a clean order, every one as CiA 306 writes it, and what was put right."""
+    """An EDS: its sections in a clean order, every one as CiA 306 writes it, and the corrections."""
 
     sections: dict[str, Section]
     repairs: tuple[Repair, ...]
@@ -282,7 +282,7 @@ class _Repairer:
             row["SubNumber"] = str(len(subs))
 
     def _move_value_to_sub_0(self, name: str, row: Section) -> None:
-        """Let what an object with sub-objects says of itself be its sub-index 0, at which CiA 301 has a value."""
+        """Make the value of an object with sub-objects that of its sub-index 0, where CiA 301 has a value."""
         own = {key: row.pop(key) for key in VALUE_KEYS if key in row}
         self._sections[f"{name}sub0"] = {"ParameterName": row.get("ParameterName", "")} | own
         self._tell(f"[{name}]", "has a DataType beside its sub-objects: that of sub-index 0, which was added")
@@ -467,7 +467,7 @@ def _is_known_sum(text: str) -> bool:
 
 
 def _in_range(number: int, bits: int, low: int, high: int) -> int | None:
-    """Return a number as its type has it; what is written in two's complement, or as -1 for all bits, is understood."""
+    """Return a number as its type has it; two's complement, and -1 for all bits, are understood."""
     if low <= number <= high:
         return number
     if low < 0 and high < number < 1 << bits:

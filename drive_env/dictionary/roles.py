@@ -10,7 +10,7 @@ from enum import Enum
 
 
 class Role(Enum):
-    """A part that an object plays; the value is what a message calls it."""
+    """A part that an object plays; the value is its name in messages."""
 
     POSITION_SCALE = "scale of positions (increments of a revolution)"
     ENCODER_INCREMENTS = "increments of the encoder"

@@ -21,7 +21,7 @@ TWO_PI = 2.0 * np.pi
 
 
 class Context(NamedTuple):
-    """What factors depend on, one value per axis or one for all."""
+    """The values on which factors depend, one per axis or one for all."""
 
     position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
@@ -31,7 +31,7 @@ class Context(NamedTuple):
 
 
 class Unit(NamedTuple):
-    """A row: name, what it is, and SI per drive unit.
+    """A row: name, quantity, and SI per drive unit.
 
     Attributes:
         period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.

@@ -1,4 +1,4 @@
-"""The Drives interface: what callers may ask of drives, emulated, on a bus, or behind an observer."""
+"""The Drives interface: the calls that drives answer, emulated, on a bus, or behind an observer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Integers = NDArray[np.int64]
 
 
 class BasicDrives(Protocol):
-    """What it takes to move axes: objects that are read and written, and time that passes.
+    """The part that moves axes: objects that are read and written, and time that passes.
 
     Integers are those of the wire, one for each axis, shape (num_axes,).
     """
@@ -51,11 +51,11 @@ class Drives(BasicDrives, Protocol):
 
     @property
     def device(self) -> Device | None:
-        """What the drives are; None where only their EDS is known."""
+        """The device that the drives are; None where only their EDS is known."""
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called: its number among all axes of the drives, of which these may be chosen ones."""
+        """Each axis' number among all axes of the drives, of which these may be chosen ones."""
 
     @property
     def machine(self) -> Machines | None:
@@ -67,7 +67,7 @@ class Drives(BasicDrives, Protocol):
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
+        """The envelope around drives that may be real."""
 
     @property
     def time_waits(self) -> bool:
@@ -93,7 +93,7 @@ class Drives(BasicDrives, Protocol):
         """Restart nodes, as after power-on."""
 
     def close(self) -> None:
-        """Release what the drives hold."""
+        """Release the drives' resources."""
 
     def __enter__(self) -> Self: ...
 

@@ -143,7 +143,7 @@ def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
 
 
 def _has_target_inside(drives: BasicDrives) -> bool:
-    """Return whether an object is the same as 607Ah: an image that carries it would bring what it had before back."""
+    """Return whether an object doubles 607Ah: an image that carries it would bring its old value back."""
     device: Device | None = getattr(drives, "device", None)
     return device is not None and Role.TARGET_INSIDE in device.roles
 
@@ -159,7 +159,7 @@ def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
 
 
 def _stay_in_own_mode(drives: BasicDrives, axes: Mask, mode: str | None) -> None:
-    """Have axes stay once they are enabled: in a mode, or in what each of them has, None."""
+    """Keep axes in place once they are enabled: in a mode, or with None in each axis' own."""
     if mode is not None:
         stay(drives, mode, axes)
         return
@@ -319,7 +319,7 @@ def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0
 
 
 def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
-    """Command a quick stop; what follows the ramp is 605Ah's."""
+    """Command a quick stop; 605Ah decides what follows the ramp."""
     _command_stop(drives, cia402.QUICK_STOP, where)
 
 
@@ -403,7 +403,7 @@ def _raise_bit_4(drives: BasicDrives, word: int, where: Mask, timeout: float, mo
 
 @contextlib.contextmanager
 def _bit_4_is_low(drives: BasicDrives, word: int, where: Mask | None) -> Iterator[None]:
-    """Lower bit 4 of the controlword, which must rise to begin anything; and again where what follows fails.
+    """Lower bit 4 of the controlword, which must rise to begin anything; and again if the block fails.
 
     Left high it would keep each move and each homing from beginning until the axis is disabled.
     """

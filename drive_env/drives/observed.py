@@ -40,7 +40,7 @@ class Observer:
         return None
 
     def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
-        """Take note of what was written."""
+        """Note a write."""
 
     def passes(self, duration: float) -> None:
         """Take note that time is about to pass [s]."""
@@ -53,7 +53,7 @@ class Observer:
         asked: Sequence[ObjectName],
         play: Mapping[ObjectName, ArrayLike] | None,
     ) -> None:
-        """Look at what has passed.
+        """Note time that has passed.
 
         Args:
             below: The drives to act on.
@@ -83,12 +83,12 @@ class ObservedDrives:
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called."""
+        """Each axis' number."""
         return self._drives.axis_numbers
 
     @property
     def device(self) -> Device | None:
-        """What the drives are."""
+        """The device that the drives are."""
         return self._drives.device
 
     @property
@@ -103,7 +103,7 @@ class ObservedDrives:
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
+        """The envelope around drives that may be real."""
         return self._drives.safety
 
     @property

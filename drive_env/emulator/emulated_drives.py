@@ -153,7 +153,7 @@ class EmulatedDrives(Saved):
         self._commission(np.array(numbers), is_commissioned=commissioned)
 
     def _apply_what_was_drawn(self, supply: float) -> None:
-        """Give the records what machines, motor and supply [V] are."""
+        """Write the drawn values of machines, motor and supply [V] into the records."""
         self._set_constants(supply)
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)

@@ -66,7 +66,7 @@ class Machines:
 
     @property
     def parameter_rows(self) -> Mapping[str, MachineParameter]:
-        """What each parameter is by name: unit, default, and the range in which random machines have it."""
+        """Each parameter by name: unit, default, and the range in which random machines have it."""
         return self._drives._parameter_rows
 
     @property
@@ -370,7 +370,7 @@ class Machines:
 
     @property
     def leds(self) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-        """What the run lamp and the error lamp of each axis' node show, by name, each of shape (num_axes,).
+        """The run lamp and the error lamp of each axis' node, by name, each of shape (num_axes,).
 
         "off", "on", "blinking", "single flash" or "double flash" (CiA 303-3; their times are in canopen/leds.py).
         Drives on no bus show what they do after power-on: pre-operational, without an error.
@@ -383,7 +383,7 @@ class Machines:
         return run, error
 
     def connect_lamps(self, axes: slice, lamps: Callable[[], tuple[str, str]]) -> None:
-        """Let the lamps of axes show what a node's do: run and error, by name."""
+        """Set the lamps of axes to those of a node: run and error, by name."""
         self._lamps.append((axes, lamps))
 
     @property

@@ -1,4 +1,4 @@
-"""A payload that changes while machines run: which parameter of the load it is, when it changes, and to what."""
+"""A payload that changes while machines run: which parameter of the load it is, its times and its values."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def find_payload(load: Load, chosen: str, low: float | None, high: float | None)
 
 
 class PayloadChanges(Saved):
-    """When each machine's payload changes in an episode, and to what: once in each of its equal parts.
+    """The times and values of each machine's payload in an episode: one change in each of its equal parts.
 
     Args:
         payload: What changes.

@@ -376,7 +376,7 @@ def shipped() -> list[str]:
 
 
 def laws_of(load: str, device: Device, parameters: Collection[str]) -> Distributions:
-    """Return the set that ships for a load, with what the device's machines have otherwise than servo drives.
+    """Return the set that ships for a load, with the distributions that differ for the device's machines.
 
     Args:
         load: Name of a load that has a set.

@@ -225,7 +225,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """What it was made by, with the steps of an episode as they are configured; None if not by Gymnasium."""
+        """The spec that it was made by, with the configured steps of an episode; None if not by Gymnasium."""
         return self._spec
 
     @spec.setter
@@ -275,7 +275,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return observation, info
 
     def step(self, actions: Any) -> Stepped:
-        """Act in every environment; what follows the end of an episode is `autoreset_mode`'s.
+        """Act in every environment; `autoreset_mode` decides what follows the end of an episode.
 
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
@@ -479,7 +479,7 @@ def merge_info(chosen: Info, others: Info, mask: Mask) -> Info:
 
 
 def one_of(tree: Any) -> Any:
-    """Return environment 0 of an array, or of a dict of arrays; of a masked entry only what is there."""
+    """Return environment 0 of an array, or of a dict of arrays; masked entries only where they are valid."""
     if not isinstance(tree, dict):
         return tree[0]
     if not any(key.startswith("_") for key in tree):
@@ -537,7 +537,7 @@ def _are_finite(actions: Any) -> bool:
 
 
 def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
-    """Return actions with 0 for what is no number in environments whose action is ignored.
+    """Return actions with 0 for those that are not a number, in environments whose action is ignored.
 
     Raises:
         ValueError: For what is no number elsewhere: a drive would be told whatever its integer happens to be.

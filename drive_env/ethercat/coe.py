@@ -73,6 +73,6 @@ class MailboxEmergencies:
         return taken
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Drop waiting emergencies."""
         self._waiting.clear()
         self.told = 0

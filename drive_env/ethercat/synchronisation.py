@@ -35,7 +35,7 @@ TYPES = {SYNCHRONISATION[0]: (WITH_OUTPUTS, WITH_SYNC0), SYNCHRONISATION[1]: (IN
 
 
 class Synchronisation:
-    """The objects, and what happens by them.
+    """The objects of synchronisation, and their effects.
 
     Args:
         device: Whose they are.
@@ -99,7 +99,7 @@ class Synchronisation:
         return AlStatusCode.NO_ERROR
 
     def leave(self) -> None:
-        """Be in Pre-Op again: what the master has set counts."""
+        """Be in Pre-Op again: the master's settings count."""
         self._shown = {}
 
     def outputs_came(self, now: float) -> None:

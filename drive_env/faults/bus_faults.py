@@ -38,7 +38,7 @@ BABBLE = bytes(8)
 
 
 class BusFault(NamedTuple):
-    """A fault that is still to come or is there: its number, what was asked for, its node, and whether it is there."""
+    """A fault that is scheduled or active: its number, its order, its node, and whether it is active."""
 
     number: int
     order: Order
@@ -160,7 +160,7 @@ class BusFaults:
         return fault.ends is not None
 
     def _act(self) -> None:
-        """Begin, go on with and end what is due; the world calls it as a communication cycle begins."""
+        """Begin, go on with and end faults that are due; the world calls it as a communication cycle begins."""
         if not self._faults and not self._ended:
             return
         now = self._world.cycles

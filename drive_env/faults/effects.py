@@ -1,4 +1,4 @@
-"""What the faults of machines change: rows of quantities, each with its value under the fault by its value without."""
+"""Effects of the machines' faults: rows of quantities, each with its value under the fault by its value without."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Given = Mapping[str, float]
 
 
 class Quantity(NamedTuple):
-    """What a fault changes.
+    """A quantity that a fault changes.
 
     kind: "record", a field of the drives' records, one per axis; "load", a parameter of the load, one per machine;
         "jam", what holds the load [N*m at the rotor], one per axis.

@@ -17,7 +17,7 @@ _WORDS = ("at", "when", "duration", "node", "axis")
 
 @dataclass(frozen=True)
 class Condition:
-    """What a fault waits for, of the axes that it is of; any of them will do.
+    """The condition of a fault, on the axes that it is of; any of them will do.
 
     quantity: "enabled": operation enabled. "position": true rotor angle [rad]; "speed": its rate without its sign
         [rad/s]; these are compared with `limit`. "" means none.

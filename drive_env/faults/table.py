@@ -1,4 +1,4 @@
-"""The table of faults: what can fail, with which parameters, and what drive and master make of it."""
+"""The table of faults: names, parameters, and the reactions of drive and master."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRIVE = "tmcm1636"  # whose reactions the table has
 
 @dataclass(frozen=True)
 class FaultParameter:
-    """A number of a fault: default, lowest and highest value, unit, and what it means."""
+    """A number of a fault: default, lowest and highest value, unit, and meaning."""
 
     default: float
     low: float

@@ -1,4 +1,4 @@
-"""What emulated machines truly are, linearised where their loads start: the truth that scores and tests measure by.
+"""Emulated machines, linearised where their loads start: the truth that scores and tests measure by.
 
 Flanks that transmit count as pressed, dry friction and gravity as none.
 """
@@ -56,7 +56,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
 
 
 class LinearLoad(NamedTuple):
-    """M q'' + D q' + K q = torque: (copies, D, D) each, and what each rotor turns by joint, (axes, D)."""
+    """M q'' + D q' + K q = torque: (copies, D, D) each, and the joint coordinates of each rotor's angle, (axes, D)."""
 
     M: Floats
     D: Floats

@@ -48,7 +48,7 @@ class AskedRows:
             self._error = error
 
     def rows(self, count: int) -> dict[Key, Integers]:
-        """Return each object of shape (count, num_axes); raises what kept it from being asked."""
+        """Return each object of shape (count, num_axes); raises the error that ended the reads."""
         if self._error is not None:
             raise self._error
         # The first answer stands for the rows before it, too.

@@ -212,7 +212,7 @@ class BusDrives:
         return Trace(times, values, self._description.dictionary, lambda: scales_of(self))
 
     def can_record(self, objects: Sequence[ObjectName]) -> bool:
-        """Return whether objects can be recorded together; what would be mapped for it is not."""
+        """Return whether objects can be recorded together; nothing is mapped for it."""
         self._enter()
         return self._cycle_runner.can_record(objects)
 
@@ -255,7 +255,7 @@ class BusDrives:
             self.safety.after_reset(chosen)
 
     def close(self) -> None:
-        """Stop what still runs, put process data and watchdogs back, and close the bus, after which nothing works."""
+        """Stop axes that still run, put process data and watchdogs back, and close the bus, which ends its use."""
         if self._closed:
             return
         if self.safety is not None:
@@ -302,7 +302,7 @@ class BusDrives:
     # --- what the envelope and the tools use ----------------------------------------------------------------------
     @property
     def description(self) -> Description:
-        """What is known of the device."""
+        """The description of the device."""
         return self._description
 
     @property
@@ -320,7 +320,7 @@ class BusDrives:
         return self._link.sdo(node)
 
     def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, past what is lent to it."""
+        """Write an object of one axis, past lent values."""
         node, index, sub, label = self._place_of(entry, axis)
         data = self._description.encode(entry, value)
         self._link.sdo(node).write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
@@ -332,7 +332,7 @@ class BusDrives:
         return self._description.decode(entry, data)
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes, by position, were configured to: they have restarted."""
+        """Forget the configuration of nodes (by position) that have restarted."""
         self._link.process.forget(nodes)
         self._started = False
 
@@ -341,7 +341,7 @@ class BusDrives:
         self._started = False
 
     def prepare_watch(self, envelope: Envelope) -> None:
-        """Have mapped what an envelope watches."""
+        """Map the objects that an envelope watches."""
         self._cycle_runner.prepare(envelope)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
@@ -400,7 +400,7 @@ class BusDrives:
         return node, *self._description.key(entry, part), self._description.label(entry, part)
 
     def _addressed(self, entry: Entry, axis: int, value: int) -> tuple[int, Key, bytes]:
-        """Return the node of an axis by its position, an object there, and what it gets as bytes."""
+        """Return the node of an axis by its position, an object there, and its value as bytes."""
         node, index, sub, _ = self._place_of(entry, axis)
         return node, (index, sub), self._description.encode(entry, value)
 
@@ -478,7 +478,7 @@ class BusDrives:
 
 
 def checked_limits(safety: Limits | bool) -> Limits | None:
-    """Return the limits that hold, None for none at all; TypeError for what is neither."""
+    """Return the limits in force, None for no envelope; TypeError for a value of another type."""
     if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that there is no envelope
         raise TypeError(f"safety = {safety!r} must be Limits, True for those of the drives, or False for an emulator")
     return (Limits() if safety is True else safety) or None
@@ -486,7 +486,7 @@ def checked_limits(safety: Limits | bool) -> Limits | None:
 
 @contextlib.contextmanager
 def _logged(consequence: str) -> Any:
-    """Log a failure to tidy up, and go on: what remains must be tried, too."""
+    """Log a failure to tidy up, and go on: the other steps must be tried, too."""
     try:
         yield
     except (BusError, ObjectAccessError) as error:

@@ -36,7 +36,7 @@ _NOW = 0
 
 @dataclass(eq=False)
 class RecordCall:
-    """What `record` must know of its objects: found out once, for a policy makes the same call every millisecond.
+    """The entries of a call of `record`, looked up once: a policy makes the same call every millisecond.
 
     sampled: Entries to return.
     played: Entries to write, in the order given.
@@ -55,7 +55,7 @@ class RecordCall:
 
     @property
     def mapped(self) -> tuple[Entry, ...]:
-        """What process data are to carry of `sampled`."""
+        """Those of `sampled` that process data are to carry."""
         return tuple(entry for entry in self.sampled if entry not in self.asked)
 
     def ask_for_states(self) -> bool:
@@ -106,7 +106,7 @@ class CycleRunner:
             self._pace.end(self._link.receive)
 
     def prepare(self, envelope: Envelope) -> None:
-        """Have mapped what the envelope watches, as far as it fits."""
+        """Map the objects that the envelope watches, as far as they fit."""
         with self._running:
             self._map(self._nothing, envelope)
 
@@ -115,7 +115,7 @@ class CycleRunner:
         return self._process.sampled_entries()
 
     def poll(self, envelope: Envelope) -> bool | None:
-        """Send a SYNC of the supervisor's own and look at what comes back.
+        """Send a SYNC of the supervisor's own and process its samples.
 
         Returns whether all of it came; None where the program's own cycles are under way, or nothing is mapped.
         """
@@ -218,7 +218,7 @@ class CycleRunner:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _map(self, call: RecordCall, envelope: Envelope | None) -> None:
-        """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
+        """Map a call's objects, and those that the envelope watches if they fit besides, from now on."""
         watched = NOTHING if envelope is None else envelope.watched()
         played = tuple(dict.fromkeys(call.played))
         if call.watched is not watched:

@@ -1,4 +1,4 @@
-"""What the master knows of a device: its dictionary, data types, axes, time-outs and emergencies.
+"""Description of a device for the master: its dictionary, data types, axes, time-outs and emergencies.
 
 A known device brings its own; any other CiA 402 drive is described by its EDS and CiA's defaults.
 """

@@ -1,4 +1,4 @@
-"""Which drive it is: what a node says of itself in 1008h to 100Ah and 1018h, so that a file is not written to another.
+"""Which drive it is: a node's identity in 1008h to 100Ah and 1018h, so that a file is not written to another drive.
 
 A serial number is asked for also where the EDS lists none: later firmware of the same device has it.
 """
@@ -23,7 +23,7 @@ class OtherDriveError(ValueError):
 
 
 class Identity(NamedTuple):
-    """What a node says of itself; None, or "", where it says nothing.
+    """A node's identity; None, or "", for an entry that it lacks.
 
     Attributes:
         device: Name of the device, or of the EDS.
@@ -43,7 +43,7 @@ class Identity(NamedTuple):
     serial: int | None = None
 
     def to_toml(self) -> list[str]:
-        """Return the lines of a TOML table; what the node does not say is left out."""
+        """Return the lines of a TOML table; entries that the node lacks are left out."""
         rows = {name: value for name, value in self._asdict().items() if value not in (None, "")}
         return [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in rows.items()]
 

@@ -63,11 +63,11 @@ class CommandObjectError(ValueError):
 
 
 class RollbackError(BusError):
-    """A write failed and what was written before could not be taken back: the drive holds a mixture."""
+    """A write failed and earlier writes could not be taken back: the drive holds a mixture."""
 
 
 class NotRestoredError(BusError):
-    """A write failed; what was written before was taken back."""
+    """A write failed; earlier writes were taken back."""
 
 
 def command(index: int, hints: MasterHints) -> str:
@@ -106,7 +106,7 @@ def parameters(drives: BusDrives) -> list[Entry]:
 
 
 def read_parameters(drives: BusDrives, axis: int = 0) -> dict[Key, int]:
-    """Return all parameters of an axis that the drive has; what it refuses to show is left out."""
+    """Return all parameters of an axis that the drive has; those that it refuses to show are left out."""
     found = {}
     for entry in parameters(drives):
         with contextlib.suppress(ObjectAccessError):

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 
 class EnteredUnit(NamedTuple):
-    """A unit: what it measures, and how many of the dimension's own unit it is (rev, rev/s, rev/s^2, A, V, s)."""
+    """A unit: its dimension, and its size in the dimension's own unit (rev, rev/s, rev/s^2, A, V, s)."""
 
     dimension: str
     factor: float
 
 
 class AxisScale(NamedTuple):
-    """What units of an axis follow, each None where it is not known.
+    """The scales of an axis' units, each None if it is not known.
 
     These are position increments of a revolution, rpm of a velocity unit, and the motor's peak current [A].
     """

@@ -32,7 +32,7 @@ from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
 
 class ObjectPort(NamedTuple):
-    """The way to one object: what it is, its value, the check of a new value, the write of a checked one.
+    """Access to one object: its entry, its value, the check of a new value, the write of a checked one.
 
     `event` names what a write sets off, as in a binding. `write_text` takes a text or a domain, each byte of which is a
     character; None where it cannot be written. `fit` returns what a value of process data is taken as, where the device
@@ -114,7 +114,7 @@ class Axis:
         return [QueuedEmergency((word & 0xFF) - 1, word >> 8) for word in words]
 
     def store(self, values: Mapping[tuple[int, int], int]) -> None:
-        """Set what a restart restores; the values are those of objects that exist, within their range."""
+        """Set the values that a restart restores; those of existing objects, within their range."""
         self._objects.store(self.number, values)
 
     def forget_texts(self) -> None:

@@ -35,7 +35,7 @@ def crc(data: bytes) -> int:
 
 
 class Received(NamedTuple):
-    """What a download's end brings: the data, once they are whole."""
+    """The result of a download: the data, once they are whole."""
 
     data: bytes
 

@@ -1,4 +1,4 @@
-"""What a node remembers of errors: the error history (1003h), and the conditions of its communication."""
+"""A node's memory of errors: the error history (1003h), and the conditions of its communication."""
 
 from __future__ import annotations
 

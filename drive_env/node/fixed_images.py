@@ -34,7 +34,7 @@ class PackedFields:
         self._fields = ReceivedFields([one for one in self._ports if one is not None])
 
     def pack(self) -> bytes:
-        """Return their values as they are now; 0 of what is reserved."""
+        """Return their present values; 0 for reserved fields."""
         return self._layout.pack(
             *(self._read(k) % (1 << bits) for k, bits in enumerate(self._bits))  # negative ones as their bits
         )

@@ -1,4 +1,4 @@
-"""What a node does of errors, whatever its fieldbus: error register (1001h), history (1003h), emergencies, reactions.
+"""A node's errors on any fieldbus: error register (1001h), history (1003h), emergencies, reactions.
 
 An emergency is an event here: code, error register and additional bytes. How it travels, and when it may, is the
 fieldbus' own, and so is what becomes of the node's state.
@@ -22,7 +22,7 @@ NETWORK_LOST = ("communication_error", "heartbeat_lost")  # conditions that may 
 
 
 class EmergencySink(Protocol):
-    """What takes a node's emergencies.
+    """Takes a node's emergencies.
 
     Attributes:
         told: Error register of the last message that was queued; 0 before the first.
@@ -34,7 +34,7 @@ class EmergencySink(Protocol):
         """Queue a message."""
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Drop waiting emergencies."""
 
 
 class NodeErrors:
@@ -84,12 +84,12 @@ class NodeErrors:
             objects.commands[ERROR_HISTORY, 0] = self.history.write
 
     def restart(self) -> None:
-        """Forget what was to be told, and all conditions; the history stays."""
+        """Forget waiting emergencies, and all conditions; the history stays."""
         self._sink.clear()
         self.conditions.clear()
 
     def register(self, without: Axis | None = None) -> int:
-        """Return 1001h: what the axes and the node's communication have."""
+        """Return 1001h: the errors of the axes and of the node's communication."""
         register = 0
         for number, axis in enumerate(self._axes):
             if axis is not without:
@@ -132,7 +132,7 @@ class NodeErrors:
             self.condition(name, now)
 
     def collect(self, now: float) -> None:
-        """Tell of what the axes had since the last call; call it after each cycle of the drives."""
+        """Queue the axes' emergencies since the last call; call it after each cycle of the drives."""
         for axis, take in self._queues:
             for emergency in take():
                 self._tell_of(axis, emergency, now)

@@ -1,4 +1,4 @@
-"""The objects that a node has once, whatever its axes: 1000h to 1FFFh, and what else its device's data name.
+"""The objects that a node has once for all axes: 1000h to 1FFFh, and others that its device's data name.
 
 Each write is checked by the rule of its object before it changes anything; the owner of the service behind an object is
 notified of the change. Which rules there are is the fieldbus' own.

@@ -19,7 +19,7 @@ _RANK = {"mode": 1, "controlword": 2}  # all else is 0
 
 
 class ReceivedFields:
-    """Fields of what a node receives, and the objects behind them.
+    """Fields of the data that a node receives, and the objects behind them.
 
     Args:
         ports: The way to the object of each field.

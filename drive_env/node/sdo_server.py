@@ -309,7 +309,7 @@ def check_length(entry: Entry, size: int) -> None:
 
 
 def take(port: ObjectPort, content: bytes) -> None:
-    """Write what the wire carries, of the object's length, to an object; ObjectAccessError if it does not take it."""
+    """Write received bytes, of the object's length, to an object; ObjectAccessError if it does not take them."""
     if port.entry.bits is None:
         if port.write_text is None:
             raise ObjectAccessError(CANNOT_BE_STORED, f"{port.entry.label} is a text that cannot be written")

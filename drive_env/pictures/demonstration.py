@@ -224,7 +224,7 @@ def _load_torque(row: Demonstration, drives: EmulatedDrives) -> float:
 
 
 def rated_load_torque(drives: EmulatedDrives) -> float:
-    """Return the torque on the load [N*m; N on what moves in a line] that takes the rated torque of a motor."""
+    """Return the torque on the load [N*m; N on a load that moves in a line] that takes the rated torque of a motor."""
     from mechanics.shaft import way
 
     packed = drives.inside.groups[0].load

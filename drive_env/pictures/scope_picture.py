@@ -37,7 +37,7 @@ RPM = 30.0 / math.pi
 
 
 class Panel(NamedTuple):
-    """One set of axes: what it shows, its unit, demand and actual in that unit, each of shape (n, A)."""
+    """One set of axes: its title, its unit, demand and actual in that unit, each of shape (n, A)."""
 
     name: str
     unit: str

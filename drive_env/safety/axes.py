@@ -1,4 +1,4 @@
-"""What is known of the axes: whether they are live, where they are, how fast, and since when."""
+"""The present knowledge of the axes: whether they are live, where they are, how fast, and since when."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CURRENT_MEMORY = 0.03  # s
 
 
 class Axes:
-    """What is known of every axis; arrays have shape (num_axes,).
+    """The present knowledge of every axis; arrays have shape (num_axes,).
 
     Args:
         drives: The drives.
@@ -158,7 +158,7 @@ class Axes:
         self._kept = self.rotor.turns(self.position)
 
     def place(self, position: Integers, scale: Floats) -> None:
-        """Take positions [inc] and scales [inc/rev] that were read: what moved scale or zero has not moved the rotors.
+        """Take positions [inc] and scales [inc/rev] that were read: changes of scale or zero have not moved the rotors.
 
         Args:
             position: What 6064h shows now.
@@ -174,7 +174,7 @@ class Axes:
         self._placed[:] = True
 
     def take(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> bool:
-        """Keep what the newest samples say.
+        """Keep the newest samples.
 
         Args:
             rows: The samples, each object of shape (rows, num_axes).

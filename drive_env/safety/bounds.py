@@ -248,7 +248,7 @@ def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
 
 
 def read_own(drives: BusDrives, key: Key, absent: int) -> Integers:
-    """Return an object of every axis, or what stands for it where the drive does not have it, whatever its EDS says."""
+    """Return an object of every axis, or the default where the drive does not have it, whatever its EDS says."""
     if drives.description.has(key):
         with contextlib.suppress(RefusedError):
             found: Integers = drives.read_entry(drives.description.dictionary.find(key))

@@ -1,4 +1,4 @@
-"""What a program is about to write or play, held against the limits before it is sent."""
+"""Checks of a program's writes and played rows against the limits, before they are sent."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ _PARTNERS = {
 
 
 class Commands:
-    """The set-points of some drives, and whether what is commanded next would lead beyond a limit.
+    """The set-points of some drives, and the checks whether the next command would lead beyond a limit.
 
     Args:
         drives: The drives.
@@ -94,7 +94,7 @@ class Commands:
         self._set_points: dict[Key, Integers] = {}  # as they were written or read last
 
     def check_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Raise SafetyError for a value that would pass a limit, or change what positions mean at the wrong time."""
+        """Raise SafetyError for a value that would pass a limit, or redefine positions at the wrong time."""
         self._check_value(entry, raw, where)
         self._check_meaning(entry, where)
 
@@ -235,7 +235,7 @@ class Commands:
             self._check_position(target, base + np.cumsum(steps, axis=0), (rises & relative).any(axis=0), (PP,))
 
     def _check_sum(self, entry: Entry, rows: Integers, played: Mapping[Entry, Integers]) -> None:
-        """Check target and offset of csp as what they add up to; of a target in pp it is the target alone."""
+        """Check the sum of target and offset in csp; in pp the target alone."""
         by_key = {(other.index, other.sub): values for other, values in played.items()}
         if (entry.index, entry.sub) == POSITION_OFFSET and TARGET_POSITION in by_key:
             return  # with the target
@@ -269,7 +269,7 @@ class Commands:
             self._check_magnitude(entry, raw, where, played or {})
 
     def _check_meaning(self, entry: Entry, where: Mask, *, is_played: bool = False) -> None:
-        """Raise SafetyError for what would change the meaning of positions at the wrong time."""
+        """Raise SafetyError for a write that would change the meaning of positions at the wrong time."""
         key = (entry.index, entry.sub)
         moves_scale = key in self._scale_objects
         if moves_scale and is_played:

@@ -110,7 +110,7 @@ class Envelope:
 
     @property
     def limits(self) -> Limits:
-        """What the program may do."""
+        """The limits of the program."""
         return self._limits.user
 
     @limits.setter
@@ -119,7 +119,7 @@ class Envelope:
 
     @property
     def epoch(self) -> int:
-        """What samples are asked for in: it grows with every controlword."""
+        """The number by which samples are requested: it grows with every controlword."""
         return self._axes.epoch
 
     # --- what BusDrives calls -------------------------------------------------------------------------------------
@@ -133,7 +133,7 @@ class Envelope:
         self._lending.left_alone = frozenset(axes)
 
     def enter(self) -> None:
-        """Take note that the program does something; raise once what the supervisor had to do meanwhile."""
+        """Begin a call of the program; raise once for a stop that the supervisor made meanwhile."""
         self.alive()
         if self._watch.booted:
             self._after_restart()
@@ -173,7 +173,7 @@ class Envelope:
             self._limits.keep_place()
 
     def after_failed_write(self, entry: Entry) -> None:
-        """Take note that a drive may have taken what was written, or not."""
+        """Note that a drive may or may not have taken a write."""
         key = (entry.index, entry.sub)
         self._commands.forget(key)
         if key in scale_objects(self._drives.description):
@@ -185,7 +185,7 @@ class Envelope:
                 self._lend()
 
     def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Take note of what was written."""
+        """Note a write."""
         key = (entry.index, entry.sub)
         self._note_mode(key, where)
         if key == CONTROLWORD:
@@ -209,7 +209,7 @@ class Envelope:
         return key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT) or key in gains
 
     def _note_mode(self, key: Key, where: Mask) -> None:
-        """Take note of what may make an axis ignore commands for a moment, until it has both of its modes."""
+        """Note that an axis may ignore commands for a moment, until both of its modes have changed."""
         if key in (MODE, self._drives.description.role(Role.MODE_GATE)):
             self._axes.forget_motion(where)
             self._axes.mode_written = np.where(where, self._axes.now(), self._axes.mode_written)
@@ -323,7 +323,7 @@ class Envelope:
             )
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Take note of what was played."""
+        """Note played rows."""
         self._played = {}
         for entry, rows in played.items():
             if len(rows):
@@ -364,7 +364,7 @@ class Envelope:
             self._watch.note_restart(node)
 
     def _after_restart(self) -> None:
-        """Take down what was known of nodes that restarted, and have the program told."""
+        """Forget the state of nodes that restarted, and have the program informed."""
         nodes = sorted(self._watch.booted)
         self._drives.forget(nodes)
         self.after_reset(nodes)  # a boot-up says nothing of the axes: reset communication leaves them running
@@ -383,7 +383,7 @@ class Envelope:
         return self._watch.looks.watched()
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
-        """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
+        """Note the objects that come with every SYNC; the other watched ones are read."""
         self._watch.looks.sampled(chosen)
 
     def observe(
@@ -411,7 +411,7 @@ class Envelope:
                 self._axes.mode = rows[coming - 1].copy()
 
     def stop(self, reason: str) -> None:
-        """Bring what is live to rest by grades and switch it off; what fails is logged.
+        """Bring live axes to rest by grades and switch them off; failures are logged.
 
         Axes that this program has not armed are left alone: it neither enabled nor commanded them. Neither Ctrl-C nor
         SIGTERM cuts the stop short.
@@ -427,7 +427,7 @@ class Envelope:
             self._watch.await_stop(ends=True)
 
     def stop_at_once(self, reason: str) -> None:
-        """Have what is live quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
+        """Have live axes quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
 
         Any thread may call it; it returns at once. The program gets a SafetyError at its next call, or in the one that
         is under way. An axis that a weight pulls is held, as after a limit was passed.
@@ -438,7 +438,7 @@ class Envelope:
         self._watch.ask_to_stop(reason)
 
     def close(self) -> None:
-        """Stop what is live; give the drives back what they had, and their watchdogs, once they are proved off."""
+        """Stop live axes; give the drives their lent values and watchdogs back, once they are proved off."""
         if self._is_ours():
             with self._uninterrupted():
                 self.stop("the drives are closed while enabled")

@@ -1,4 +1,4 @@
-"""What the drives do, held against the limits: speed, position, following error, current and its swings."""
+"""Checks of samples against the limits: speed, position, following error, current and its swings."""
 
 from __future__ import annotations
 

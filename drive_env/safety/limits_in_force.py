@@ -76,7 +76,7 @@ class LimitsInForce:
             self.lend()
 
     def forget(self) -> None:
-        """Read anew what the limits depend on before they are used again."""
+        """Read anew the values that the limits depend on, before they are used again."""
         self._generation += 1
         self.latest = None
 
@@ -102,7 +102,7 @@ class LimitsInForce:
         return rotor_limits(user, self._drives, self._axes.rotor, self._axes.position)
 
     def place(self) -> None:
-        """Read where the rotors are and what a revolution counts; what moved scale or zero has not moved them."""
+        """Read where the rotors are and the scale of a revolution; changes of scale or zero have not moved them."""
         position = read_own(self._drives, POSITION, 0)
         scale, ratio = read_scale(self._drives), read_ratio(self._drives)
         with self._axes.lock:
@@ -114,7 +114,7 @@ class LimitsInForce:
             self.lend()
 
     def bounds(self) -> Bounds:
-        """Return the limits of every axis as integers of its drive; what the user left open is read from the drives."""
+        """Return the limits of every axis as integers of its drive; those left open by the user are the drives' own."""
         bounds, generation = self.latest, self._generation
         if bounds is None:
             if self._must_place or not self._axes.rotor.is_placed:

@@ -1,4 +1,4 @@
-"""What is watched: sampled with every SYNC as far as it fits, and otherwise asked for."""
+"""The objects that the envelope watches: sampled with every SYNC as far as they fit, the others read."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def answer_time(drives: BusDrives, usual: float = ASK) -> float:
 
 
 class Looks:
-    """What comes with every SYNC, and what is asked for besides.
+    """The objects that come with every SYNC, and those that are read besides.
 
     Args:
         drives: The drives.
@@ -62,11 +62,11 @@ class Looks:
 
     @property
     def is_short(self) -> bool:
-        """Whether some of what is watched does not come with SYNC."""
+        """Whether some of the watched objects do not come with SYNC."""
         return bool(self._unsampled)
 
     def ask_unsampled(self) -> None:
-        """Ask for what no PDO carries, when it is due."""
+        """Read the objects that no PDO carries, when they are due."""
         now = time.monotonic()
         if self._unsampled and now >= self._unsampled_at:
             self._unsampled_at = now + UNSAMPLED
@@ -87,14 +87,14 @@ class Looks:
         return entries
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
-        """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
+        """Note the objects that come with every SYNC; the other watched ones are read."""
         self._unsampled = [entry for entry in self.watched() if entry not in chosen]
         keys = [(entry.index, entry.sub) for entry in self._unsampled]
         if DEMAND in keys and POSITION not in keys:  # a following error is told by both of a moment
             self._unsampled.insert(0, self._known.find(POSITION))
 
     def with_unsampled(self, rows: Mapping[Key, Integers]) -> Mapping[Key, Integers]:
-        """Return samples and what no PDO carries, which is asked for now and then: no time passes in lockstep."""
+        """Return samples with the objects that no PDO carries, read now and then: no time passes in lockstep."""
         count = len(next(iter(rows.values()))) if rows else 1
         if self._axes.clock + count * self._drives.description.cycle < self._unsampled_at:
             return rows

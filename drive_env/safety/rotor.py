@@ -1,4 +1,4 @@
-"""Where the rotors are, in revolutions since the drives were opened: what scale and zero of 6064h do not move."""
+"""Where the rotors are, in revolutions since the drives were opened: independent of scale and zero of 6064h."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def outside(bounds: Bounds, position: Floats | Integers) -> Floats:
 
 
 class StopEnds:
-    """Where stops would end that begin now, by what the axes were seen to do.
+    """Where stops would end that begin now, from the axes' motion.
 
     Args:
         axes: What is known of the axes.
@@ -136,7 +136,7 @@ class StopEnds:
             self._before, self._before_at = self.speed, now
 
     def ways(self, bounds: Bounds) -> tuple[Floats, Floats]:
-        """Return how far the axes go on by the speed that they have, and by what was asked for [inc]."""
+        """Return how far the axes go on by their speeds, and by their commands [inc]."""
         axes = self._axes
         own = stop_way(axes, bounds, self.speed) + self._held(bounds)
         asked = ramp_way(bounds, axes.asked_speed) + axes.asked_speed * LATENCY + self._short

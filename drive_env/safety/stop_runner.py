@@ -1,4 +1,4 @@
-"""Stops of some drives: which axes, what their drives must be told meanwhile, and what is left to the watchdogs."""
+"""Stops of some drives: which axes, their drives' settings meanwhile, and the cases left to the watchdogs."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class StopRunner:
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
     def make_sure_of_ramps(self) -> None:
-        """Have quick stops ramp by 6085h, and what else stops an axis ramp: an option code of 0 would let it coast.
+        """Make quick stops ramp by 6085h, and other stops ramp, too: an option code of 0 would let an axis coast.
 
         Raises:
             SafetyError: If a drive takes no other option for its quick stop.
@@ -200,7 +200,7 @@ class StopRunner:
                 self._lending.lend(QUICK_STOP_OPTION, axis, ramp)
 
     def stop_for(self, what: str, remedy: str) -> NoReturn:
-        """Stop all axes that count as live, and raise SafetyError with what is wrong and what to do."""
+        """Stop all axes that count as live, and raise SafetyError with the cause and the remedy."""
         with self._axes.lock:
             self.begin(self._axes.may_turn, holds=True)
         raise SafetyError(f"{what}: the drives were quick-stopped; {remedy}")

@@ -42,7 +42,7 @@ class Phase(Enum):
 
 
 class Sample(NamedTuple):
-    """What is known of an axis: when it was seen [s], statusword, speed [inc/s]."""
+    """The present knowledge of an axis: when it was seen [s], statusword, speed [inc/s]."""
 
     time: float
     status: int
@@ -92,7 +92,7 @@ class AxisStop:
         return self.phase in (Phase.OFF, Phase.LOST) or (self.phase is Phase.REST and self.holds)
 
     def step(self, now: float, sample: Sample) -> int | None:
-        """Take what is known now; return the controlword to send, None for none."""
+        """Take the newest sample; return the controlword to send, None for none."""
         fresh = sample.time > self._seen
         if fresh:
             self._seen = sample.time
@@ -223,7 +223,7 @@ class Stop:
         return all(axis.is_over for axis in self.axes.values())
 
     def step(self, now: float) -> None:
-        """Send what each axis needs at `now` [s]."""
+        """Send the controlword that each axis needs at `now` [s]."""
         for number, axis in self.axes.items():
             if axis.phase not in (Phase.OFF, Phase.LOST) and (word := axis.step(now, self._sample(number))) is not None:
                 self._send(number, word)

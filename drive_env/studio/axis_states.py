@@ -1,4 +1,4 @@
-"""What is known of every axis, for people: state, mode, motion, faults, switches, temperatures."""
+"""The state of every axis, for people: mode, motion, faults, switches, temperatures."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class AxisFault:
 
 @dataclass(frozen=True)
 class AxisState:
-    """What is known of an axis.
+    """The present knowledge of an axis.
 
     Attributes:
         axis: Its number, from 0.
@@ -110,7 +110,7 @@ class AxisState:
 
 
 class AxisStates:
-    """Keeps what is known of the axes; refreshed by the thread of the drives, read by any.
+    """Keeps the present knowledge of the axes; refreshed by the thread of the drives, read by any.
 
     Args:
         drives: The drives.
@@ -149,7 +149,7 @@ class AxisStates:
         return []
 
     def hear(self, message: EmergencyMessage) -> tuple[str, str]:
-        """Take note of an emergency; return how grave it is, and what it says."""
+        """Note an emergency; return its severity and its text."""
         text = fault_text(message.name)
         axis = self.axes[message.axis]
         if message.code == 0 or message.name in NO_FAULT:

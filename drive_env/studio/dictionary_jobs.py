@@ -1,4 +1,4 @@
-"""What the page Dictionary asks of the drives: values, writes, comparisons, backups, restores."""
+"""The jobs of the page Dictionary: values, writes, comparisons, backups, restores."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ShownValue(NamedTuple):
 
 @dataclass(frozen=True)
 class Checked:
-    """What was entered for an object: the integer that it means, and how that reads."""
+    """A value entered for an object: its integer, and its text."""
 
     raw: int
     text: str
@@ -126,7 +126,7 @@ def checked(entry: Entry, text: str, scale: Scale) -> Checked:
 
 
 def write(entry: Entry, raw: int, axis: int) -> Callable[[Drives], int]:
-    """Return the job that writes an object of an axis, and returns what it reads back."""
+    """Return the job that writes an object of an axis, and returns the value read back."""
 
     def job(drives: Drives) -> int:
         key = (entry.index, entry.sub)
@@ -155,7 +155,7 @@ def factory(known: Description) -> dict[Key, int]:
 
 
 class _DescriptionAlone:
-    """What `parameters` asks of drives: their description."""
+    """The part of drives that `parameters` needs: their description."""
 
     def __init__(self, description: Description) -> None:
         self.description = description
@@ -185,7 +185,7 @@ def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
 def restore(
     known: Description, content: bytes, name: str, axis: int, *, unchecked: bool, other_drive: bool
 ) -> Callable[[Drives], list[Difference]]:
-    """Return the job that writes a backup, all or none, as `drive-env restore` does; it returns what was changed.
+    """Return the job that writes a backup, all or none, as `drive-env restore` does; it returns the changes.
 
     Args:
         known: The device.
@@ -212,7 +212,7 @@ def restore(
 
 @contextmanager
 def _as_file(content: bytes, name: str) -> Iterator[Path]:
-    """Yield what was handed in as a file of its name."""
+    """Yield an uploaded content as a file of its name."""
     with tempfile.TemporaryDirectory(prefix="drive-env-studio-") as folder:
         path = Path(folder) / (Path(name).name or "parameters.toml")
         path.write_bytes(content)

@@ -123,7 +123,7 @@ class StudioGate:
 
 
 def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
-    """Return why a request is refused by its shape: what browsers never send, and others may read differently."""
+    """Return why a request is refused by its shape: browsers never send it, and others may read it differently."""
     if twice := [name for name in ONCE if names.count(name) > 1]:
         return 400, f"The request has {names.count(twice[0])} {twice[0].capitalize()} headers; it may have one."
     if path.startswith("//") or "\\" in path or not path.isprintable():

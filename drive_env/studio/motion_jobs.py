@@ -1,4 +1,4 @@
-"""What the page Axes asks of the drives, each a job: a function of the drives."""
+"""The jobs of the page Axes, each a function of the drives."""
 
 from __future__ import annotations
 

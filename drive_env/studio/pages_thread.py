@@ -1,4 +1,4 @@
-"""The thread of the pages: what a page computes delays other pages, but neither the quick stop nor a page's life line.
+"""The thread of the pages: a page's computation delays other pages, but neither the quick stop nor a page's life line.
 
 The web server takes requests in one event loop, in which nothing is computed; the pages live in another one, of a
 thread of its own.

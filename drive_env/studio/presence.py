@@ -1,4 +1,4 @@
-"""Which browser pages are there, and what each has set in motion: a motion lasts as long as its page says so.
+"""The open browser pages, and their motions: a motion lasts as long as its page says so.
 
 A page sends a beat every tenth of a second, and which button it holds. A page that is closed says goodbye, or its
 connection ends; one whose browser sleeps, or whose computer does, is silent. What moves by a job lasts as long as the
@@ -24,7 +24,7 @@ ABANDONED = 5.0  # s without any page after which an axis that is enabled is sto
 
 @dataclass
 class PageMotion:
-    """What a page has set in motion.
+    """A motion of a page.
 
     Attributes:
         number: Of this motion.
@@ -86,7 +86,7 @@ class Presence:
             return motion
 
     def end_of_page(self, page: str, axes: Mask) -> None:
-        """Take note that a page has ended what it had set in motion for as long as it is there, on some axes."""
+        """Note that the end of a page ended its motions that last as long as it is there, on some axes."""
         with self._lock:
             for number, motion in list(self._motions.items()):
                 if motion.page == page and not motion.held and np.any(motion.axes & axes):

@@ -1,4 +1,4 @@
-"""What one page's scope shows: channels in their units, rolling or from a trigger on, and recordings to keep.
+"""The scope of one page: channels in their units, rolling or from a trigger on, and recordings to keep.
 
 It reads the recorder, and touches no drive.
 """
@@ -108,7 +108,7 @@ class ScopeView:
         self.arm()
 
     def halt(self) -> None:
-        """Keep what is shown."""
+        """Keep the recording on display."""
         if self.is_running and self.kept is None:
             self.kept = self._rolling()
         self.is_running = False
@@ -131,7 +131,7 @@ class ScopeView:
 
     @property
     def status(self) -> str:
-        """What it is doing, in a word or two."""
+        """Its state, in a word or two."""
         if not self.is_running:
             return "halted"
         if self.mode == "roll":

@@ -1,4 +1,4 @@
-"""What went wrong as one plain sentence with its remedy, for people at a web page."""
+"""Errors as one plain sentence with the remedy, for people at a web page."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Studio:
             return Response(status_code=307, headers={"location": first})
 
     async def live(self, line: WebSocket, page: str) -> None:
-        """Hear a page's beats until it is gone: what it has set in motion ends with it."""
+        """Receive a page's beats until it is gone: its motions end with it."""
         await line.accept()
         held: dict[int, int] = {}  # the page's number of a button that is held -> of its motion
         presence = self.session.presence
@@ -152,13 +152,13 @@ class StudioServer(uvicorn.Server):
         self.should_exit = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End the connections and the pages, and go on without what does not end."""
+        """End the connections and the pages, and go on without those that do not end."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(super().shutdown(sockets), LONGEST_END)
 
 
 def web_app(studio: Studio, host: str, port: int, token: str | None) -> StudioGate:
-    """Return the whole application: behind the gate, what waits for no page, and the pages."""
+    """Return the whole application: behind the gate, quick stop and life lines, and the pages."""
     own, pages = _stops(studio), PagesThread(_pages(studio))
 
     async def behind(scope: Scope, receive: Receive, send: Send) -> None:

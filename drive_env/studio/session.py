@@ -57,7 +57,7 @@ WATCH = 0.2  # s between two looks whether the drives' thread has stopped what i
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """Something that happened: when (time of day [s]), how grave (info, warning, error), and what."""
+    """An event: when (time of day [s]), how grave (info, warning, error), and its text."""
 
     at: float
     level: str
@@ -66,7 +66,7 @@ class SessionEvent:
 
 @dataclass(eq=False)
 class Job:
-    """A function of the drives, and what becomes of it.
+    """A function of the drives, and its result.
 
     Attributes:
         title: What it does, in a few words.
@@ -157,7 +157,7 @@ class Session:
         self._watch.start()
 
     def close(self) -> None:
-        """Stop what moves, close the drives, end the thread."""
+        """Stop moving axes, close the drives, end the thread."""
         if self.state == "closed":
             return
         self.stop_now("the studio ends")
@@ -267,13 +267,13 @@ class Session:
             shared.lock.release()
 
     def say(self, level: str, text: str) -> None:
-        """Add to what happened: level info, warning or error."""
+        """Add an event: level info, warning or error."""
         self.events.append(SessionEvent(time.time(), level, text))
         self.num_events += 1
 
     @property
     def job(self) -> Job | None:
-        """What is under way."""
+        """The present job, None without one."""
         return self._current
 
     @property
@@ -288,12 +288,12 @@ class Session:
 
     @property
     def axes(self) -> Sequence[AxisState]:
-        """What is known of every axis; empty before the drives are open."""
+        """The state of every axis; empty before the drives are open."""
         return () if self._states is None else self._states.axes
 
     @property
     def scales(self) -> Sequence[Scale]:
-        """What the units of each axis follow; empty before the drives are open."""
+        """The scales of each axis' units; empty before the drives are open."""
         return () if self._states is None else self._states.scales
 
     def forget_faults(self, axis: int) -> None:
@@ -350,7 +350,7 @@ class Session:
             self._end()
 
     def _read_stored(self) -> None:
-        """Read the parameters of every axis: after a start they are what the drive has stored."""
+        """Read the parameters of every axis: after a start they are the stored ones."""
         assert self._drives is not None
         drives = self._drives
         self.stored = {axis: {} for axis in range(self.num_axes)}
@@ -456,7 +456,7 @@ class Session:
             raise JobStoppedError(job.stopped)
 
     def _end_if_left(self, job: Job) -> None:
-        """End a job that moves axes and whose page is gone, or silent, and stop what it moves."""
+        """End a job that moves axes and whose page is gone, or silent, and stop these axes."""
         if why := self._why_left(job):
             assert self._drives is not None
             job.stopped = why
@@ -470,7 +470,7 @@ class Session:
         return self.presence.why_gone(job.page) if moves and job is not None and job.page else ""
 
     def _watch_pages(self) -> None:
-        """Stop everything where the drives' thread does not stop what is overdue: a call of its takes too long.
+        """Stop everything where the drives' thread does not stop overdue motions: a call of its takes too long.
 
         On a bus set-points are played in one call, however long that takes.
         """
@@ -489,7 +489,7 @@ class Session:
         return "" if self._current is None else self._current.stopped
 
     def _await_rest(self) -> None:
-        """Let emulated axes come to rest: what a stopped job puts back takes their voltage away, and they would coast.
+        """Let emulated axes come to rest: a stopped job's clean-up takes their voltage away, and they would coast.
 
         Drives of a bus are brought to rest by the supervisor of their envelope.
         """
@@ -504,7 +504,7 @@ class Session:
                 waited += PIECE
 
     def _obey(self) -> None:
-        """Do what `stop_now` asks of this thread."""
+        """Carry out a `stop_now` in this thread."""
         reason, self._stop_asked = self._stop_asked, ""
         now = time.monotonic()
         if now - self._told_at > TOLD_ONCE:  # a page has two ways to ask

@@ -118,7 +118,7 @@ class SharedDrives:
 
     @property
     def device(self) -> Device | None:
-        """What the drives are."""
+        """The device that the drives are."""
         return self._drives.device
 
     @property
@@ -133,12 +133,12 @@ class SharedDrives:
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
+        """The envelope around drives that may be real."""
         return self._drives.safety
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called."""
+        """Each axis' number."""
         return self._drives.axis_numbers
 
     @property
@@ -266,7 +266,7 @@ class SharedDrives:
         play: Mapping[Any, ArrayLike] | None,
         period: float,
     ) -> Trace:
-        """Let a piece of time pass, with as much of what the recorder wants as can be sampled besides."""
+        """Let a piece of time pass, with as many of the recorder's objects as can be sampled besides."""
         wanted = self._recorder.objects
         while (chosen := (*asked, *wanted)) in self._refused and wanted:
             wanted = wanted[:-1]
@@ -288,7 +288,7 @@ class SharedDrives:
         return trace
 
     def _begin(self) -> float:
-        """Return when what passes now begins [s]: right after what passed before, unless there was a gap."""
+        """Return when the time that passes now begins [s]: right after the last piece, unless there was a gap."""
         before = self._recorder.now
         if self._drives.time_waits:
             return before

@@ -37,12 +37,12 @@ class Visitor:
 
     @property
     def id(self) -> str:
-        """What tells it from other pages."""
+        """The page's identifier."""
         return self.client.id
 
     @property
     def state(self) -> AxisState | None:
-        """What is known of its axis; None before the drives are open."""
+        """The state of its axis; None before the drives are open."""
         axes = self.session.axes
         return axes[self.axis] if self.axis < len(axes) else None
 

@@ -54,7 +54,7 @@ LAG = 3  # ms by which a filtered speed may lag behind its rotor: a move has beg
 
 
 class Identified(NamedTuple):
-    """What a drive's own signals say of its machine, each of shape (num_axes,).
+    """Properties of a machine by the drive's own signals, each of shape (num_axes,).
 
     Inertia is measured over the torque constant, and given with that of the data sheet.
     """
@@ -66,7 +66,7 @@ class Identified(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What a trial showed; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
+    """The result of a trial; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
 
     following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
     error: demand less actual of the move over its size, shape (TRIAL, num_axes).
@@ -232,7 +232,7 @@ class Trials(Saved):
         start(self._drives, _on_the_counter(target), where)
 
     def leave(self) -> None:
-        """Give the drives back what trials have changed besides gains and profiles; the axes must be disabled."""
+        """Put back all that trials have changed in the drives besides gains and profiles; the axes must be disabled."""
 
     def down(self) -> Mask:
         """Return which axes are not enabled."""
@@ -278,7 +278,7 @@ class Trials(Saved):
         return np.asarray(shakes(current, self._motor.rated_current))
 
     def _prepare(self, objects: list[Any]) -> None:
-        """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""
+        """Have a bus map the objects of a recording: in real time the 10 ms for it would miss samples of a move."""
         if not self._drives.time_waits:
             self._drives.record(objects, 0.0)
 

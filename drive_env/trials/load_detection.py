@@ -157,7 +157,7 @@ class LoadDetectionTrials(OpenLoopTrials):
         return np.where(seen, angle_of(np.where(seen, left, 0.0)), np.nan)
 
     def _terms(self, gains: Integers, plain: Steady, cooled: Steady, seen: Floats) -> OpenLoopTerms:
-        """Return the terms of a phase, (num_axes,) each; where nothing was seen the worst of what could be."""
+        """Return the terms of a phase, (num_axes,) each; without samples the worst that they could be."""
         one = np.ones(len(gains))
         angle = np.nan_to_num(cooled.settled, nan=0.5 * math.pi)
         left = np.sin(np.abs(plain.settled)) / np.maximum(np.sin(np.clip(np.abs(angle), 1e-3, 0.5 * math.pi)), 1e-3)

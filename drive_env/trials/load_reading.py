@@ -1,4 +1,4 @@
-"""What a stepper's load reading says in spread cycle: all but linear in the voltage that a falling phase gives back.
+"""A stepper's load reading in spread cycle: all but linear in the voltage that a falling phase gives back.
 
 Against its current i, at speed w, with the load angle d (electrical):
 

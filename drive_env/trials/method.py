@@ -161,7 +161,7 @@ class OpenLoop(NamedTuple):
         return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return the move of trials: with what friction and a constant load leave of the torque."""
+        """Return the move of trials, with the torque that friction and a constant load leave."""
         speed = SPEED_SHARE * self.motor.rated_speed
         taken = self.motor.torque_constant * (found.coulomb + np.abs(found.offset) + found.viscous * speed)
         share = acceleration_share(self.device, self.motor, taken)
@@ -230,7 +230,7 @@ class ClosedStepper(NamedTuple):
         return OpenLoop(self.device, self.motor).highest()
 
     def first(self, supply: Floats) -> Integers:
-        """Return the rated current, and the loop's first values, or what the device is commissioned with for it."""
+        """Return the rated current with the loop's first values, or the commissioned values for it."""
         gains = OpenLoop(self.device, self.motor).first(supply)
         dictionary = self.device.new_dictionary()
         entries = [(dictionary.find(name), value) for name, value in self.device.preset(self.motor).items()]
@@ -289,7 +289,7 @@ class ClosedStepper(NamedTuple):
 
 
 class LoadSettings(NamedTuple):
-    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or what a load needs."""
+    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or that of a load."""
 
     device: Device
     motor: Motor
@@ -374,7 +374,7 @@ def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Meth
 
 
 def check_tried(device: Device, names: tuple[str, ...]) -> None:
-    """Raise ValueError unless trials can tell what gains of these names do, before anything moves."""
+    """Raise ValueError, before anything moves, unless trials can show the effect of gains of these names."""
     if not names and not device.gains.outer:
         raise ValueError(
             f"{device.name} has no gains of a velocity or position loop and no phase currents, which trials could "

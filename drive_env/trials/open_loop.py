@@ -149,7 +149,7 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
 
 
 class OpenLoopTrial(NamedTuple):
-    """What a trial showed, as `gain_trial.Trial` has it; where an axis was stopped, it had lost steps or tripped.
+    """The result of a trial, as `gain_trial.Trial` has it; where an axis was stopped, it had lost steps or tripped.
 
     lost: Whether steps were lost, (phases, num_axes).
     """
@@ -179,7 +179,7 @@ def unmeasured(device: Device) -> str:
 
 
 def _highest(drives: Drives, name: int) -> float:
-    """Return the highest value of an object that drives take, less what a profile may be short of it."""
+    """Return the highest value of an object that drives take, less the shortfall that a profile may have."""
     high = device_of(drives).new_dictionary().find(name).high
     assert high is not None, "ramps and speeds are numbers"
     return HIGHEST_SHARE * high
@@ -288,7 +288,7 @@ class OpenLoopTrials(Trials):
                     drives.write(role, off, where=acting)
 
     def _watch_no_window(self) -> None:
-        """Take 6065h away, which drives have again that were switched on: what falls behind is seen by the encoder."""
+        """Switch 6065h off, which drives have again that were switched on: the encoder shows axes that fall behind."""
         drives = self._drives
         if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
             drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
@@ -302,7 +302,7 @@ class OpenLoopTrials(Trials):
                 drives.write(Role.LOOP_MODE, OPEN, where=closed)
 
     def leave(self) -> None:
-        """Give 606Ah and the loop's mode back what they were; the axes must be disabled."""
+        """Put 606Ah and the loop's mode back; the axes must be disabled."""
         if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
             self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
         for role, values in self._speeds.items():

@@ -102,7 +102,7 @@ class LogFit(NamedTuple):
         return self.narrowed[name] < UNSEEN
 
     def to_toml(self) -> str:
-        """Return the fitted set as `Distributions.load` reads it, with what was found as comments."""
+        """Return the fitted set as `Distributions.load` reads it, with the results of the fit as comments."""
         lines = [
             "# Fitted to a recorded move: the range of the machines that respond like it, 5th to 95th percentile.",
             f"# Distance (mean NRMSE): nominal machine {self.nominal:.4f}, best {self.distance[0]:.4f}, "

@@ -38,7 +38,7 @@ class NoBlockTransferError(Exception):
 
 
 class SdoChannel(Protocol):
-    """What a transfer needs of its client; errors are python-canopen's."""
+    """The client's side that a transfer needs; errors are python-canopen's."""
 
     def send_request(self, request: bytes) -> None:
         """Send a frame."""

@@ -170,7 +170,7 @@ class CanLink:
         return self.port.wait(done, timeout)
 
     def drain(self) -> None:
-        """Hand out what has arrived, without waiting."""
+        """Process the received frames, without waiting."""
         self.port.drain()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A dry run: what would go over the bus is written down, and a drive that obeys at once is imagined behind it.
+"""A dry run: frames are written down in place of being sent, and a drive that obeys at once is simulated behind it.
 
 Without an answer nothing would go on, so reads return the dictionary's defaults or what was written, and the
 statusword follows the controlword.

@@ -1,4 +1,4 @@
-"""What the drive does when its master dies: it misses heartbeats (1016h) or its life is not guarded (100Ch, 100Dh).
+"""The drive's watch over its master: it misses heartbeats (1016h) or its life is not guarded (100Ch, 100Dh).
 
 Each process sends heartbeats under a node-ID of its own: two that shared one would hide each other's death.
 """
@@ -182,7 +182,7 @@ class ErrorControl:
         self.kind = "none"
 
     def forget(self) -> None:
-        """Forget what was: the node was reset."""
+        """Forget the settings: the node was reset."""
         self._objects.forget()
         self.kind = "none"
 
@@ -245,7 +245,7 @@ class Beats:
             self._beat()
 
     def keep(self) -> None:
-        """Send what is due."""
+        """Send the heartbeats or requests that are due."""
         if not self.has_ceased and self._clock() >= self._next:
             self._beat()
 
@@ -339,7 +339,7 @@ class ErrorControls:
         self._controls[node].restore()
 
     def forget(self, node: int) -> None:
-        """Forget what was: the node was reset, and its error control is its own again."""
+        """Forget the settings: the node was reset, and its error control is its own again."""
         self._controls[node].forget()
 
     def take_rival(self) -> str:

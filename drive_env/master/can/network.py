@@ -19,7 +19,7 @@ _EMCY_LAYOUT = struct.Struct("<HB5s")
 
 
 class Network:
-    """Commands the nodes' communication states and collects what they report by themselves.
+    """Commands the nodes' communication states and collects their boot-ups, heartbeats and emergencies.
 
     Args:
         port: The bus.

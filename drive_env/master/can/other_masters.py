@@ -14,7 +14,7 @@ from drive_env.master.errors import BusError
 
 
 class OtherMastersError(BusError):
-    """Another master commands the nodes, and what we would do disturbs both."""
+    """Another master commands the nodes, so that our commands and its own would disturb each other."""
 
 
 class OtherMasters:

@@ -176,7 +176,7 @@ class PdoConfiguration:
         tidying.end()
 
     def forget(self) -> None:
-        """Forget what was found: the node was reset and has its own configuration again."""
+        """Forget the configuration found: the node was reset and has its own again."""
         self._before.clear()
         self._silenced.clear()
         self._quiet.clear()

@@ -161,7 +161,7 @@ class Port:
         return True
 
     def drain(self) -> None:
-        """Hand out what has arrived, without waiting (and without end, where more comes than can be received)."""
+        """Process the received frames, without waiting (and not for ever, where more come than can be received)."""
         for _ in range(MOST_FRAMES):
             if not self.receive():
                 return

@@ -48,7 +48,7 @@ class RpdoRows:
 
 
 class PdoProcessData:
-    """What is mapped at present, and the way between its integers and its frames.
+    """The present mapping, and the conversion between its integers and its frames.
 
     Args:
         port: The bus.
@@ -154,7 +154,7 @@ class PdoProcessData:
         return PdoSamples(self._port, of_nodes, self._description.num_axes)
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes were configured to: they have restarted, and nothing counts as mapped."""
+        """Forget the configuration of nodes that have restarted: nothing counts as mapped."""
         for k in nodes:
             self._configurations[k].forget()
         self.mapping += 1

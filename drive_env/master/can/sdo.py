@@ -90,7 +90,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._transfer(index, sub, data, f"the write of {label}", timeout)
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write what an object had before; where no answer comes it is written once more, and waited for longer.
+        """Write an object's value of before; without an answer it is written once more, with a longer wait.
 
         A node that has missed its master's heartbeats may be stopped, where it answers no SDO: it is woken first, into
         pre-operational.
@@ -193,7 +193,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._has_retried = False
 
     def _read(self, index: int, sub: int) -> bytes:
-        """Read in segments what is short, and in blocks what the server says to be long."""
+        """Read short values in segments, and in blocks those that the server says to be long."""
         with ReadableStream(self, index, sub) as stream:
             if stream.exp_data is not None or (stream.size or 0) < BLOCK_FROM or not self._has_blocks:
                 return bytes(stream.read())

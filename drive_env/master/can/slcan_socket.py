@@ -75,7 +75,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         return (self._frames.popleft() if self._frames else None), False
 
     def _read(self, timeout: float | None) -> None:
-        """Take in what is there, after waiting for something."""
+        """Read the received bytes, after waiting for some."""
         try:
             if timeout == 0.0 or select.select([self._socket], [], [], timeout)[0]:
                 data = self._socket.recv(_CHUNK)

@@ -211,7 +211,7 @@ class EtherCatLink:
         return True
 
     def drain(self) -> None:
-        """Do nothing: what comes back is taken with the exchange."""
+        """Do nothing: answers are taken with the exchange."""
 
     def close(self) -> None:
         """Take all slaves to Init and let go of the segment."""

@@ -1,4 +1,4 @@
-"""What the link over EtherCAT asks of a master: slaves found, states, objects over CoE, one exchange of images.
+"""The interface of a master under the link over EtherCAT: slaves, states, objects over CoE, exchange of images.
 
 There are two: `soem_master.py` has SOEM do it, for network interfaces; `frame_master.py` does it by itself, for
 whatever carries frames as bytes: UDP, or a segment of the same process.
@@ -37,7 +37,7 @@ class SlaveStatus(NamedTuple):
 
 
 class SlaveIdentity(NamedTuple):
-    """What the EEPROM of a slave says: vendor, product code, revision, serial number."""
+    """A slave's identity in its EEPROM: vendor, product code, revision, serial number."""
 
     vendor: int
     product: int

@@ -45,7 +45,7 @@ LONGEST_IMAGE = 1400  # bytes of all slaves in one frame
 
 
 class SlavePlaces(NamedTuple):
-    """What a slave's EEPROM says: who it is, (address, length) of its mailboxes, (address, control) of its images."""
+    """A slave's EEPROM: identity, (address, length) of its mailboxes, (address, control) of its images."""
 
     identity: SlaveIdentity
     receive: tuple[int, int]
@@ -103,7 +103,7 @@ class FrameMaster:
         return None if found is None else found[0]
 
     def _surely(self, command: int, station: int, address: int, data: bytes, what: str) -> bytes:
-        """Do what may be done twice until a slave has had it.
+        """Repeat a datagram that may be done twice until a slave has had it.
 
         Raises:
             NoAnswerError: If none has.

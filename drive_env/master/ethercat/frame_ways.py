@@ -56,7 +56,7 @@ class CallWay:
         return self._came.pop(0) if self._came else None
 
     def close(self) -> None:
-        """Forget what came."""
+        """Drop received frames."""
         self._came.clear()
 
 

@@ -73,7 +73,7 @@ class ImageSamples:
 
 
 class ImageRows:
-    """Rows of what is played, ready to be put into the output images."""
+    """Rows to play, ready to be put into the output images."""
 
     def __init__(self, data: EtherCatProcessData, layout: ImageLayout, played: Mapping[Entry, Integers]) -> None:
         self._data = data
@@ -95,7 +95,7 @@ class ImageRows:
 
 
 class EtherCatProcessData:
-    """What is mapped at present, and the exchange of images.
+    """The present mapping, and the exchange of images.
 
     Args:
         master: Of the segment.
@@ -171,7 +171,7 @@ class EtherCatProcessData:
         return set(sampled) - set(self._layouts[INPUTS].entries) == set(self._beside)
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
-        """Have images carry entries of every axis besides what is in them, as far as there is room.
+        """Have images carry entries of every axis besides their present ones, as far as there is room.
 
         Raises:
             ObjectAccessError: 06040042h if they do not fit; 08000022h while an axis is enabled: images are changed in
@@ -209,7 +209,7 @@ class EtherCatProcessData:
         return ImageSamples(self, self._sampled_layout(), self._description) if self._ready else None
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes have: they have restarted."""
+        """Forget the images of nodes that have restarted."""
         self.mapping += 1
         with self.turn:
             self._ready -= set(nodes)
@@ -230,7 +230,7 @@ class EtherCatProcessData:
         return [k for k in range(len(self._nodes)) if k not in self._ready]
 
     def prepare(self) -> None:
-        """Give the slaves that are in Pre-Op their images, filled with what their objects have, and go to Safe-Op."""
+        """Give the slaves that are in Pre-Op their images, filled with their objects' values, and go to Safe-Op."""
         layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
         for k in self.missing:
             for direction, layout in layouts.items():
@@ -315,7 +315,7 @@ class EtherCatProcessData:
         return fitting
 
     def _sampled_layout(self) -> ImageLayout:
-        """Return where each object is in a row: the input image, and behind it what is read by SDO."""
+        """Return where each object is in a row: the input image, and behind it the objects read by SDO."""
         layout, members = self._layouts[INPUTS], []
         size = layout.size
         for entry in self._beside:
@@ -326,7 +326,7 @@ class EtherCatProcessData:
         return layout._replace(members=(*layout.members, *members), size=size)
 
     def _read_beside(self) -> list[bytes]:
-        """Return of each slave what is read by SDO, in the order of `_sampled_layout`."""
+        """Read the objects beside the image of each slave by SDO, in the order of `_sampled_layout`."""
         known, rows = self._description, []
         for client in self._clients:
             parts = []
@@ -383,7 +383,7 @@ class EtherCatProcessData:
         return any(entry in layout.entries for layout in self._layouts.values())
 
     def _as_it_is(self, node: int, layout: ImageLayout) -> bytearray:
-        """Return an output image of what the slave's objects have now; 0 of those that cannot be read."""
+        """Return an output image of the slave's present values; 0 for those that cannot be read."""
         image = bytearray(layout.size)
         for member in layout.members:
             if member.entry.access != "wo":

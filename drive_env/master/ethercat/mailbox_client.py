@@ -120,7 +120,7 @@ class MailboxClient:
             self._turn.release()
 
     def look(self, timeout: float) -> None:
-        """Take what waits and is no answer; who has no turn within `timeout` [s] leaves it to who has."""
+        """Take waiting messages that are no answers, unless another thread has the turn for `timeout` [s]."""
         if not self._turn.acquire(timeout=max(timeout, 0.0)):
             return
         try:

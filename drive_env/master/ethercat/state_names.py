@@ -1,4 +1,4 @@
-"""What a refused or missing state is called in messages (ETG.1000.6, table 11; ETG.1020)."""
+"""Messages about refused or missing states (ETG.1000.6, table 11; ETG.1020)."""
 
 from __future__ import annotations
 

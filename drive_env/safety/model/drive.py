@@ -67,7 +67,7 @@ def write_controlword(drive: Drive, word: int) -> Drive:
 
 
 def _remembering_less(drive: Drive) -> Drive:
-    """Return the drive without what of its controlword no longer matters, so that equal futures are equal states."""
+    """Return the drive without controlword bits that no longer matter, so that equal futures are equal states."""
     return drive if drive.ramps else drive._replace(word=drive.word & cia402.FAULT_RESET)
 
 

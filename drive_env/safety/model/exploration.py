@@ -1,4 +1,4 @@
-"""What must not happen in a session, and the search for it: breadth first, so that a trace found is a shortest one."""
+"""The forbidden situations of a session, and the search for them: breadth first, so that traces are shortest ones."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def described(s: Situation) -> str:
 
 @dataclass
 class Exploration:
-    """What was found.
+    """The result of an exploration.
 
     Attributes:
         states: How many situations are reachable.

@@ -1,4 +1,4 @@
-"""What the program may do between two calls, and what the library does in the program's thread."""
+"""The possible steps of the program between two calls, and of the library in the program's thread."""
 
 from __future__ import annotations
 

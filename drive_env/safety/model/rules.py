@@ -122,7 +122,7 @@ OURS = Rules(
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What the world is taken to do.
+    """Assumptions about the world.
 
     Attributes:
         troubles: How many troubles a run has: a frame lost, held back or doubled, a node that falls silent, an act of

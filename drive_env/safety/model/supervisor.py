@@ -1,4 +1,4 @@
-"""What the thread does that watches and stops; in the code before, the program stops in its own."""
+"""The steps of the thread that watches and stops; in the code before, the program stops in its own."""
 
 from __future__ import annotations
 
