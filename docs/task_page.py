@@ -144,7 +144,7 @@ def _toml(value: Any) -> str:
 
 
 def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:
-    """Take a benchmark's results into the scores, with what policies reach that have learnt nothing."""
+    """Take a benchmark's results into the scores, with those of untrained policies."""
     from agents.benchmark.unlearnt import unlearnt_scores
 
     rows = [row for row in json.loads((folder / "results.json").read_text(encoding="utf-8")) if row["task"] in TASKS]

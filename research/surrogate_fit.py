@@ -1,4 +1,4 @@
-"""The surrogate's network in torch, and its fit to trials; `surrogate.py` says what it computes, and acts with it."""
+"""The surrogate's network in torch, and its fit to trials; `surrogate.py` has its equations, and acts with it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def join(parts: Sequence[TrialData]) -> TrialData:
 
 
 class SurrogateNetwork(nn.Module):  # type: ignore[misc]
-    """What `surrogate.EnsembleMember` is, for normalised inputs."""
+    """The network of `surrogate.EnsembleMember`, for normalised inputs."""
 
     def __init__(self, gains: int) -> None:
         super().__init__()

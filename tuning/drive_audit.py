@@ -1,4 +1,4 @@
-"""An audit of what is done to drives: the time it took, moves, and what a drive must not be put through.
+"""An audit of a tuner's use of drives: time, moves, and violations of their limits.
 
 A tuner is compared by what it did, not by what it says: the audit stands between it and the drives, and it hides the
 emulated machine behind them.
@@ -48,7 +48,7 @@ def _dictionary(device: str) -> ObjectDictionary:
 
 
 class DriveAudit(Observer):
-    """Counts what is done to drives, and hides their machine.
+    """Counts a tuner's time, moves and violations, and hides the machine.
 
     Args:
         target: What is tuned.
@@ -91,7 +91,7 @@ class DriveAudit(Observer):
         return self._counter.moves
 
     def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
-        """Count what a write starts."""
+        """Count moves that a write starts."""
         axes = np.ones(len(self.seconds), bool) if where is None else where
         self.seconds[axes] = self.elapsed
         entry = self._dictionary.find(name)

@@ -1,4 +1,4 @@
-"""SYNCs of a bus that were late: what distorts a move, before anything else is blamed for what it shows."""
+"""Late SYNCs of a bus: they distort a move, and are named before anything else is blamed for it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def told_lateness(drives: Drives) -> str:
 
 
 def is_distorted(drives: Drives) -> bool:
-    """Return whether SYNCs were so late since the tuner began that what the drives showed says nothing."""
+    """Return whether SYNCs were so late since the tuner began that the samples cannot be used."""
     before, now = _before(drives), _timing(drives)
     late, worst = now.late - before.late, now.worst if now.worst > before.worst else 0.0
     return late > 0 and (worst >= DISTORTING or late > DISTORTING_SHARE * (now.cycles - before.cycles))

@@ -31,7 +31,7 @@ POSITIONS, SPEEDS, TORQUES = (
 
 
 class MoveCounter:
-    """Counts moves by what is written and played.
+    """Counts moves by writes and played rows.
 
     Args:
         speed: Fastest that axes may be turned [inc/s], shape (num_axes,).

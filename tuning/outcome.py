@@ -1,4 +1,4 @@
-"""What a tuner is: a function of a target and a random generator, and what it returns."""
+"""A tuner: a function of a target and a random generator, and its result."""
 
 from __future__ import annotations
 

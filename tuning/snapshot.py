@@ -135,7 +135,7 @@ def take(target: Target) -> Snapshot:
 
 
 def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
-    """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
+    """Return the present parameters of drives; `address` opens them again, empty for emulated ones."""
     identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
     return Snapshot(
         device_of(drives).name, _read_axes(drives), address, identities=tuple(identities), left_out=_borrowed(drives)
@@ -222,7 +222,7 @@ def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
 
 
 def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
-    """Return how drives are opened again; SnapshotError for what says nothing of that, which is not handed on."""
+    """Return the options that open the drives again, without others; SnapshotError if they do not say it."""
     if not isinstance(bus, dict):
         raise SnapshotError(f"{file}: bus = {bus!r} must be a table; give a file as drive-tune left it")
     for key, value in bus.items():
@@ -318,7 +318,7 @@ def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Differ
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Have Ctrl-C, and what else ends a command, wait for the block's end: drives are not left half brought back."""
+    """Have Ctrl-C, and other signals that end a command, wait for the block's end: no drive is left half restored."""
     with held_signals() as noted:
         yield
     if noted:
@@ -418,15 +418,15 @@ class Transaction:
 
     @property
     def changed(self) -> bool:
-        """Whether any axis keeps what it has now."""
+        """Whether any axis keeps its present settings."""
         return bool(self._committed.any())
 
     def commit(self, where: Mask | None = None) -> None:
-        """Keep what axes have now, all by default."""
+        """Keep the present settings of axes, all by default."""
         self._committed |= True if where is None else where
 
     def roll_back(self, where: Mask | None = None) -> None:
-        """Bring axes back to what they were, all by default: the gains at once, the rest once they are disabled."""
+        """Restore the settings of axes, all by default: the gains at once, the rest once they are disabled."""
         drives = self._target.drives
         axes = np.ones(drives.num_axes, bool) if where is None else where
         for key in device_of(drives).gains.keys:

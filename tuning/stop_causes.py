@@ -1,4 +1,4 @@
-"""Why drives switched themselves off: what their emergencies say."""
+"""Why drives switched themselves off: the texts of their emergencies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ UNTOLD = "no emergency message with the cause was received"
 
 
 class ToldCauses(Observer):
-    """Remembers what drives have told, for as long as a tuner works on them: an emergency can be read but once.
+    """Remembers the drives' emergencies for as long as a tuner works on them: each can be read but once.
 
     Attributes:
         told: What each axis told last, "" for nothing.

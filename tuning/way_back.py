@@ -1,4 +1,4 @@
-"""What a command that changes drives of a bus says at its end: what is changed still, and the line that restores it.
+"""The last lines of a command that changes drives of a bus: the changes that are left, and the line that restores.
 
 It is not what the run believes: the drives are opened anew, once the run has closed them, and compared with the file.
 """
@@ -21,7 +21,7 @@ from tuning.target import LOCKSTEP_PATIENCE
 
 @contextmanager
 def way_back(file: Path | None, program: str) -> Iterator[None]:
-    """Say on stderr, if a block that changes drives fails, what is changed still and the line that restores it.
+    """Print on stderr, if a block that changes drives fails, the changes that are left and the line that restores.
 
     Args:
         file: The file with the state before, which the block writes before it changes anything; None for emulated

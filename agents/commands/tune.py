@@ -167,7 +167,7 @@ def _emulated_node(
 
 
 def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
-    """Print the checks and what a run would do; the drive is only read. Return whether a run would start."""
+    """Print the checks and the plan of a run; the drive is only read. Return whether a run would start."""
     from agents.tuner.rehearsal import rehearse
 
     found = rehearse(target, keep=keep)

@@ -1,4 +1,4 @@
-"""Recorded episodes in a file, and what a policy would have done in them: the same, if it is the same policy."""
+"""Recorded episodes in a file, and a policy's actions in them: the same, if it is the same policy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class EpisodeRecording(NamedTuple):
 
 
 class Repeated(NamedTuple):
-    """What a policy does with recorded observations: largest and RMS difference from the recorded actions."""
+    """A policy's actions on recorded observations: largest and RMS difference from the recorded actions."""
 
     largest: float
     rms: float
@@ -64,7 +64,7 @@ def ends_of(episodes: Sequence[Episode]) -> tuple[NDArray[np.bool_], NDArray[np.
 
 
 def load(path: Path) -> EpisodeRecording:
-    """Read what `save` wrote.
+    """Read a recording of `save`.
 
     Raises:
         ValueError: If the file is not a recording.

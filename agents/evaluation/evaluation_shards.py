@@ -43,7 +43,7 @@ class Written(NamedTuple):
 
     @property
     def sha256(self) -> str:
-        """Hash of its file, or of the file of its function; "" of what the package has."""
+        """Hash of its file, or of the file of its function; "" for a policy of the package."""
         return self.source if self.content is None else hashlib.sha256(self.content).hexdigest()
 
     def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""What a policy does to the loops it acts in: their greatest sensitivity Ms, measured in the emulator.
+"""The greatest sensitivity Ms of loops with a policy in them, measured in the emulator.
 
 Every episode is run twice, alike to the last random number; in the second, a torque of many frequencies pushes one
 axis. By how much the motor's torque differs between the two tells how much of the push the loops answer, drives and
@@ -97,7 +97,7 @@ def measure_sensitivity(
 
 
 class NotKeptError(ValueError):
-    """The loops with an agent in them do not keep what is asked of them; the message says by how much."""
+    """The loops with an agent in them do not keep the requirements; the message says by how much."""
 
 
 def check_kept(found: Sensitivity, dynamics: Dynamics) -> None:

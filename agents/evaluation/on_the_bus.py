@@ -91,7 +91,7 @@ def lower_profile_velocity(drives: Drives) -> None:
 
 
 def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:
-    """Compile what the environment runs, on an emulated machine: a policy would else stall in its first step."""
+    """Compile the environment's kernels, on an emulated machine: a policy would else stall in its first step."""
     lanes = make_environments(environment, 1, _emulated(configuration))
     space: Any = lanes.action_space
     lanes.reset(seed=0)

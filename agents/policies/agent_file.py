@@ -33,7 +33,7 @@ AN_AGENT = "the .npz that drive-agent train writes, or the name of an agent that
 
 
 class BundleError(ValueError):
-    """A file is no bundle, is damaged, or would not be one; the message says which and what to do."""
+    """A file is not a bundle, is damaged, or would not be one; the message gives the mistake and the remedy."""
 
 
 @dataclass(frozen=True)

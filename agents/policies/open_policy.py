@@ -31,7 +31,7 @@ class PolicyNotFoundError(ValueError):
 
 @dataclass
 class LoadedPolicy:
-    """A policy and what is known of it.
+    """A policy and its description.
 
     Attributes:
         name: As the user wrote it.
@@ -156,7 +156,7 @@ class ModelPolicy:
         return action[0] if np.ndim(observation) == 1 else action
 
     def reset(self, mask: Any = None) -> None:
-        """Forget what was."""
+        """Forget the episode."""
         if mask is None or self._begins is None:
             self._state = self._begins = None
         else:

@@ -89,7 +89,7 @@ OUTPUTS: dict[str, Callable[[Array, Array, Array], Array]] = {"clip": _clip, "ta
 
 
 class Ends:
-    """What all networks have in front and behind: checks, normaliser, action bounds.
+    """Common first and last steps of all networks: checks, normaliser, action bounds.
 
     Arrays: observation_mean, observation_scale (1/standard deviation), shape (entries,); action_low, action_high, shape
     (actions,). Settings: observation_clip (of the normalised observation; None for no normaliser), output (OUTPUTS).

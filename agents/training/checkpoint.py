@@ -1,4 +1,4 @@
-"""A training run as one file: Stable-Baselines3's own .zip with what it leaves out beside it.
+"""A training run as one file: Stable-Baselines3's own .zip with the parts that it leaves out.
 
 SB3 saves networks, optimisers and counters. Added are `drive_agent.json` (the run), the normaliser, the replay buffer
 and the states of all random generators, so that the file alone can be resumed, exported and evaluated. Like every file
@@ -83,7 +83,7 @@ def check_trust(path: Path, trust: bool) -> None:
 
 
 def is_plain(path: Path) -> bool:
-    """Return whether a file is Stable-Baselines3's alone, without what drive-agent adds."""
+    """Return whether a file is Stable-Baselines3's alone, without the parts of drive-agent."""
     try:
         names = member_names(path)
     except (OSError, ValueError):

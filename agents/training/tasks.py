@@ -92,7 +92,7 @@ def make_environments(
 
 
 def without_machines(environment: str, configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of an environment, or of a task of the suite, for drives that are what they are."""
+    """Return the options of an environment, or of a task of the suite, for given drives: without those of machines."""
     own = SUITE[environment].options if environment in SUITE else {}
     return {key: value for key, value in {**own, **configuration}.items() if key not in OF_MACHINES}
 

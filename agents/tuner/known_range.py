@@ -1,4 +1,4 @@
-"""For which devices, motors, loads and machines a tuner's card holds, and what of a target lies outside."""
+"""For which devices, motors, loads and machines a tuner's card holds, and the parts of a target outside."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def context_of(identified: Array, shown: Array, dynamics: Dynamics) -> Array:
 
 
 class Normaliser(NamedTuple):
-    """What inputs are normalised with: mean and 1/standard deviation, shapes (21,), (16,); 1/reach of gains."""
+    """The scaling of inputs: mean and 1/standard deviation, shapes (21,), (16,); 1/reach of gains."""
 
     context_mean: Array
     context_scale: Array

@@ -1,4 +1,4 @@
-"""What MkDocs runs while it builds the site: the pages that are made from the packages' data, and their entries.
+"""Hooks of MkDocs while it builds the site: the pages that are made from the packages' data, and their entries.
 
 A page of the reference is never written by hand where a table of the packages has its facts: it is made anew in every
 build, so that it cannot say what the code does not. Nothing here needs the network.

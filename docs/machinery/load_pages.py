@@ -1,4 +1,4 @@
-"""The loads: an index with pictures, and a page for each with what it is made of and what can be set."""
+"""The loads: an index with pictures, and a page for each with its parts and parameters."""
 
 from __future__ import annotations
 

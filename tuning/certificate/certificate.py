@@ -1,4 +1,4 @@
-"""The certificate of a tuning: what was identified, changed and measured, with a hash that shows later changes.
+"""The certificate of a tuning: identified values, changes and measurements, with a hash that shows later changes.
 
 The hash is over the content, not over the file: indented otherwise or with its keys in another order it is the same
 certificate. It shows accidental changes; it is not a signature.
@@ -116,7 +116,7 @@ SEEN_KEPT = "kept where it was measured"  # a peak may lie where it was not
 
 @dataclass(frozen=True)
 class Requirement:
-    """What the dynamics ask of an axis, and what it has.
+    """A requirement of the dynamics, and the axis' value.
 
     Attributes:
         name: What is asked for, with its unit, e.g. "velocity loop, phase margin [deg]".

@@ -90,7 +90,7 @@ def _text(path: Path) -> str:
 
 
 def _built(kind: Any, data: Mapping[str, Any]) -> Any:
-    """Return a dataclass from what `_plain` made of it."""
+    """Return a dataclass from the plain data of `_plain`."""
     kinds = get_type_hints(kind)
     return kind(**{f.name: _value(kinds[f.name], data[f.name]) for f in fields(kind)})
 

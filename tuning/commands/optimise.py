@@ -180,7 +180,7 @@ def _on_machine(
     resume: bool,
     json: bool,
 ) -> None:
-    """Search on an emulated machine, write and print what was found."""
+    """Search on an emulated machine, write and print the result."""
     from tuning.runs import unfinished
     from tuning.runs.inputs import as_kept
 
@@ -198,7 +198,7 @@ def _on_machine(
 
 
 def _on_bus(given: DriveOptions, drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
-    """Search on the drives of a bus, write and print what was found.
+    """Search on the drives of a bus, write and print the result.
 
     They are opened as they were given: the state before names their device for a later undo.
     """
@@ -406,7 +406,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
 
 
 def _margins_by_model(found: Any, axes: Sequence[str]) -> list[str]:
-    """Return the margins of the outer loops with the best gains, for people; `axes` is what each axis is called."""
+    """Return the margins of the outer loops with the best gains, for people; `axes` are the axes' names."""
     lines = []
     for where, axis in zip(axes, found.margins.tolist(), strict=True):
         told = [
@@ -464,7 +464,7 @@ def _told(row: Any, objectives: Sequence[str], t_0: float) -> list[str]:
 
 
 def _cells(name: str, numbers: Sequence[int], gains: Any, told: list[str]) -> list[tuple[str, ...]]:
-    """Return the rows of a machine's gains, one for each of its axes; what it reached stands in the first."""
+    """Return the rows of a machine's gains, one for each of its axes; its figures stand in the first."""
     first = name if list(numbers) == list(range(len(numbers))) else f"{name}, axis {numbers[0]}"
     return [
         (first if k == 0 else f"  axis {axis}", *map(str, row), *(told if k == 0 else [""] * len(told)))

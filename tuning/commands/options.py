@@ -396,7 +396,7 @@ def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | N
 
 @contextmanager
 def unchanged(drive: DriveOptions, file: Path | None) -> Iterator[tuple[Target, Transaction | None]]:
-    """Open drives, with their state before in a file if there is one, and restore at the end what is not committed."""
+    """Open drives, with their state before in a file if one is given; restore at the end all but committed changes."""
     from tuning.snapshot import Transaction
     from tuning.way_back import way_back
 
@@ -414,7 +414,7 @@ def before_as_json(file: Path | None) -> dict[str, str]:
 
 
 def tell_before(file: Path | None) -> None:
-    """Print what drives of a bus have other than before, and the line that restores it."""
+    """Print the differences of a bus' drives from their state before, and the line that restores it."""
     if file is not None:
         from tuning.way_back import what_is_changed
 

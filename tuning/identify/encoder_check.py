@@ -148,7 +148,7 @@ def _push(working: Working) -> list[Estimate]:
 
 
 def _likeness(angle: Floats, torque: Floats) -> float:
-    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; what falls is left out."""
+    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; falling is left out."""
     t = np.linspace(-1.0, 1.0, len(angle))
     trend = np.stack([np.ones_like(t), t, t * t], axis=1)
     pair = np.stack([angle, np.cumsum(np.cumsum(torque))], axis=1)

@@ -65,7 +65,7 @@ VISCOUS_MODEL = 0.02  # the same, of viscous friction besides: a transmission lo
 
 
 class Mechanics(NamedTuple):
-    """What the moves say of one axis, in data sheet units: J/K_t times the data sheet's K_t."""
+    """The mechanics of one axis by its moves, in data sheet units: J/K_t times the data sheet's K_t."""
 
     inertia: Estimate
     coulomb: Estimate
@@ -74,7 +74,7 @@ class Mechanics(NamedTuple):
 
 
 class Rough(NamedTuple):
-    """What moves say of one axis however rough they are, for the next ones.
+    """Rough mechanics of one axis, for its next moves.
 
     Inertia [kg*m^2], current that holds the axis [A], and what dry friction takes of it in motion at least [A].
     """
@@ -327,7 +327,7 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
 def _moved(
     working: Working, plan: Callable[[], Plan], gains: Integers, softness: Integers
 ) -> tuple[Plan, Floats, Floats, Mask, Integers]:
-    """Move, once more with softer gains if an axis oscillates; return plan, what `move` returns, and the gains."""
+    """Move, once more with softer gains if an axis oscillates; return plan, the result of `move`, and the gains."""
     drives = working.target.drives
     watch = watch_of(drives)
     gains = working.target.device.gains.softened(gains, softness, "velocity")
@@ -397,7 +397,7 @@ def hidden_ripple(target: Target, k: int, gains: Integers, inertia: float) -> fl
 def _balance(
     working: Working, k: int, angle: Floats, current: Floats, plan: Plan, gains: Integers
 ) -> tuple[Mechanics, Rough]:
-    """Return the estimates of one axis, and what is known of it however rough."""
+    """Return the estimates of one axis, and its rough mechanics."""
     target = working.target
     motor, K = target.motor, target.motor.torque_constant
     cruises = plan.cruises[k]
@@ -445,7 +445,7 @@ def _with_losses(
     did: Motion, cruises: tuple[tuple[int, int, int], ...], motor: Motor, rows: BalanceRows, fit: Solved, least: float,
     hidden: float,
 ) -> tuple[float, Solved, Floats]:  # fmt: skip
-    """Return inertia [kg*m^2], the fit, and half of what else is open of its unknowns, for what a transmission loses.
+    """Return inertia [kg*m^2], the fit, and half of the remaining range of its unknowns, with a transmission's losses.
 
     Args:
         did: What the axis did.
@@ -530,7 +530,7 @@ def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[l
 
 
 def _fit(rows: BalanceRows, least: float) -> Solved:
-    """Return J/K, dry and viscous friction and offset, fitted with what the data ask for.
+    """Return J/K, dry and viscous friction and offset, fitted with the terms that the data ask for.
 
     A fan's drag or a load that changes with position only if it is clear. What is not clear may be there all the same:
     by what it would change, the intervals are wider.

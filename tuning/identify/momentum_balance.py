@@ -18,7 +18,7 @@ STANDS, SLOWEST = 0.02, 0.5  # share of the greatest speed, and rad/s: about sta
 
 
 class Motion(NamedTuple):
-    """What one axis did, shape (samples,) each."""
+    """A motion of one axis, shape (samples,) each."""
 
     angle: Floats  # rad
     current: Floats  # A

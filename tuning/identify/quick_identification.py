@@ -213,7 +213,7 @@ class _Brief(Experiments):
 
 
 def pushed_inertia(ways: NDArray[np.float64], inertia: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), by what they pushed while all moved.
+    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), from the inertias pushed while all moved.
 
     Args:
         ways: Which way each axis went, 1 or -1, (moves, axes): all alike first.

@@ -1,4 +1,4 @@
-"""What a screw or a gear loses in proportion to what it carries, where the moves of an axis show it.
+"""The losses of a screw or a gear in proportion to the transmitted torque, where the moves of an axis show them.
 
 While the motor drives the load, the loss adds to what it carries; while the load drives the motor, it takes from it.
 With i_L the current behind the rotor and behind the friction before the transmission, and T what is carried,
@@ -49,7 +49,7 @@ class Loss(NamedTuple):
 
     @property
     def loss(self) -> float:
-        """What is lost over what is carried; a screw of 90 % efficiency: 0.11."""
+        """Losses over the transmitted torque; of a screw of 90 % efficiency: 0.11."""
         return self.share / (2.0 + self.share)
 
     def load_alone(self, inertia: float, rotor: float) -> float:

@@ -40,7 +40,7 @@ CLEAR = np.radians(60.0)  # of what their angle is off: beyond half a sector and
 
 
 class Halls(NamedTuple):
-    """What the halls say of one axis: whether they count against the field, and stand opposite to it; None unknown."""
+    """The halls of one axis: whether they count against the field, and stand opposite to it; None unknown."""
 
     reversed: bool | None = None
     inverted: bool | None = None
@@ -48,7 +48,7 @@ class Halls(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What an object is, and what the wiring needs it to be."""
+    """An object's value, and the one that the wiring needs."""
 
     has: int
     needs: int
@@ -105,12 +105,12 @@ def changes(settings: Settings) -> dict[Key, int]:
 
 
 def finding(device: Device, settings: Settings) -> list[str]:
-    """Return in words what is wrong, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
+    """Return the mistake in words, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
     return [f"{findings(device)[key]}: write {named(key)} = {value}" for key, value in changes(settings).items()]
 
 
 def corrected(device: Device, settings: Settings) -> list[str]:
-    """Return in words what was wrong, once it is written: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
+    """Return the corrected mistake in words: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
     wrong = changes(settings)
     what = findings(device)
     return [f"{what[key]}: {named(key)} is {wrong[key]} now, and was {settings[key].has}" for key in wrong]

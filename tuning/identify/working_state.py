@@ -135,7 +135,7 @@ def cautious_bandwidth(motor: Motor, inertia: float, wanted: float = VELOCITY_HZ
 
 @contextmanager
 def working_state(target: Target, where: Mask | None = None) -> Iterator[Working]:
-    """Give drives that are commissioned, cautious and off; afterwards they are off and have back what they had.
+    """Give drives that are commissioned, cautious and off; afterwards they are off and have their own settings.
 
     Raises:
         RuntimeError: If a drive is enabled, moves, or does not take what it must.

@@ -1,4 +1,4 @@
-"""Pictures of measured open loops: Bode with coherence, and Nyquist. What is not coherent is grey, and not joined."""
+"""Pictures of measured open loops: Bode with coherence, and Nyquist. Incoherent lines are grey, and not joined."""
 
 from __future__ import annotations
 

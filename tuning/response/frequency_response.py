@@ -1,4 +1,4 @@
-"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and what coherence says.
+"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and the coherence.
 
 The set-point is the instrument: it is known exactly and independent of noise, so that the open loop is the quotient of
 two cross-spectra with it, answer over error, without the bias that noise inside the loop gives to answer over input.
@@ -73,7 +73,7 @@ OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, a
 
 @dataclass(frozen=True)
 class Signal:
-    """What a loop is shaken with.
+    """The excitation of a loop.
 
     Attributes:
         kind: "multisine" or "chirp".
@@ -185,7 +185,7 @@ def _closed_loops(target: Target, loop: str) -> Mask:
 
 
 class _Measurement:
-    """One measurement of axes side by side: a trial, the run proper, and what they say."""
+    """One measurement of axes side by side: a trial, the run proper, and their results."""
 
     def __init__(
         self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool,
@@ -298,7 +298,7 @@ class _Measurement:
     def _amplitude(
         self, shaker: Shaker, rough: Complex, trial: Pass, room: Floats, limit: Floats
     ) -> tuple[Floats, Floats]:
-        """Return amplitudes and steady speeds of the run proper by what the trial showed."""
+        """Return amplitudes and steady speeds of the run proper from the trial."""
         lines, omega = self._lines, 2.0 * math.pi * self._lines.f[:, None]
         gain, error = _bounded(rough, 1e-3, 10.0), _bounded(1.0 - rough, 0.02, 10.0)
         current = _bounded(self._current_gain() * error, 1e-12, np.inf)
@@ -360,7 +360,7 @@ class _Measurement:
         return velocity_noise(self._device, plant)
 
     def _note_oscillation(self, seen: Pass, where: Mask) -> Mask:
-        """Return which axes oscillate: the current has what does not repeat with the excitation."""
+        """Return which axes oscillate: their currents have parts that do not repeat with the excitation."""
         shape = (self._passes, self._periods, self._lines.samples, len(where))
         current = seen.current.reshape(shape)
         own = (current - current.mean(axis=1, keepdims=True)).reshape(self._passes, -1, len(where))

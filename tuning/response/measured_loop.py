@@ -1,4 +1,4 @@
-"""A loop as it was measured: its lines, which of them are trusted, and what lies between them."""
+"""A measured loop: its lines, which of them are trusted, and the values between them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MODEL_POINTS, MODEL_LOW, NYQUIST = 400, 2.0, 0.49  # frequencies of a model: how
 
 
 class Loops(NamedTuple):
-    """Both outer loops of an axis as one measurement shows them: frequencies [Hz], complex open loops, what is trusted.
+    """Both outer loops of an axis by one measurement: frequencies [Hz], complex open loops, trusted lines.
 
     All of shape (n,). The position loop is that of the measured velocity loop, closed, and of the position P.
     """
@@ -93,7 +93,7 @@ class MeasuredLoop:
         return np.asarray(self.open_loop / (1.0 + self.open_loop))
 
     def margins(self, axis: int = 0) -> margins_.Margins:
-        """Return the margins of an axis, by its trusted lines; what those do not show is nan."""
+        """Return the margins of an axis, by its trusted lines; nan for those that they do not show."""
         found = margins_.margins(*self.refined(axis))
         # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
         return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)

@@ -73,7 +73,7 @@ class Pair(NamedTuple):
     damping: float
 
     def response(self, f: Floats) -> Complex:
-        """Return by what the pair multiplies the velocity that a torque makes; 1 far below."""
+        """Return the factor by which the pair changes the velocity that a torque makes; 1 far below."""
         swing = 2.0 * self.damping * 1j * f / self.resonance
         return np.asarray((1.0 - (f / self.anti_resonance) ** 2 + swing) / (1.0 - (f / self.resonance) ** 2 + swing))
 
@@ -96,7 +96,7 @@ class PlantFit(NamedTuple):
         return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
 
     def drawn(self, rng: np.random.Generator, count: int) -> Iterator[PlantFit]:
-        """Yield fits whose parameters lie as the intervals say, each on its own; what was refused stays as it is."""
+        """Yield fits with each parameter drawn from its interval; refused ones stay as they are."""
         for _ in range(count):
             values = {}
             for name, estimate in self.estimates.items():
@@ -226,7 +226,7 @@ def _covariance(solution: _Solution) -> Floats:
 
 
 def _better(simple: _Solution, found: list[_Solution]) -> _Solution:
-    """Return the best of what was found, or the simpler one if the data do not clearly ask for more."""
+    """Return the best of the fits, or the simpler one if the data do not clearly ask for more."""
     sure = [solution for solution in found if _is_sure(solution)]
     best = min(sure, key=_criterion, default=simple)
     return best if _criterion(best) < _criterion(simple) - LEAST_GAIN else simple
@@ -261,7 +261,7 @@ def _doubted(fit: PlantFit, reason: str) -> PlantFit:
 
 
 class Seen(NamedTuple):
-    """What was seen of a closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
+    """A closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
 
     f: Floats  # Hz
     seen: Complex

@@ -1,4 +1,4 @@
-"""What a rule proposes: raw integers of the device's gains, what was wanted, and what no integer reaches."""
+"""The proposal of a rule: raw integers of the device's gains, the wanted values, and those that no integer reaches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Rule = Callable[["Device", "Motor", "Plant"], Proposal]
 
 
 class Workbench:
-    """Turns a rule's controllers into integers, the inner loops first, and tells what each integer really is.
+    """Turns a rule's controllers into integers, the inner loops first, and returns each integer's real value.
 
     A rule designs a loop, takes its gains here, and designs the next loop around what it got: the integration time and
     the outer loop follow the bandwidth that is reached, not the one that was wanted.
@@ -81,7 +81,7 @@ class Workbench:
         return self._rows[part]
 
     def integer(self, part: Part, wanted: float) -> int:
-        """Return the integer that is nearest to what is wanted of a gain, 1 at least."""
+        """Return the integer that is nearest to the wanted value of a gain, 1 at least."""
         return min(max(round(wanted), 1), self._rows[part].highest)
 
     def note(self, text: str) -> None:

@@ -56,7 +56,7 @@ class Ultimate(NamedTuple):
 
 
 class Swing(NamedTuple):
-    """What a relay experiment says of every axis, each of shape (num_axes,); nan and a reason where nothing.
+    """The swing of every axis under a relay, each of shape (num_axes,); nan and a reason for an axis without one.
 
     frequency: Of the swing [Hz]. amplitude: Of the velocity [rad/s]. slope: Acceleration per current [rad/(A*s^2)],
     K_t/J. lag: Sum of the small lags from current to measured velocity [s]. reason: Why there is nothing, else "".

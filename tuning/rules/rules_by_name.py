@@ -1,4 +1,4 @@
-"""The rules by name: from what is known of an axis to raw integers of its drive's gains.
+"""The rules by name: from an identified axis to raw integers of its drive's gains.
 
 A rule proposes; nothing is written.
 """

@@ -1,4 +1,4 @@
-"""Rules side by side: what each proposes for an axis as it was identified, with the margins that it would have."""
+"""Rules side by side: the proposal of each for an identified axis, with the margins that it would have."""
 
 from __future__ import annotations
 

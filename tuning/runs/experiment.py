@@ -57,7 +57,7 @@ class SweptObject:
     spacing: str
 
     def values(self) -> NDArray[np.int64]:
-        """Return the raw values in rising order; what is equal after rounding counts once."""
+        """Return the raw values in rising order; values that are equal after rounding count once."""
         spaced = np.geomspace if self.spacing == "log" else np.linspace
         raw = np.rint(spaced(self.low, self.high, self.count)).astype(np.int64)
         return np.unique(np.clip(raw, self.low, self.high))
@@ -65,7 +65,7 @@ class SweptObject:
 
 @dataclass(frozen=True)
 class Excitation:
-    """What every point gets; exactly one of each pair of units is set. Times [s] from the start of the recording."""
+    """The excitation of every point; exactly one of each pair of units is set. Times [s] from the recording's start."""
 
     velocity_time: float
     load_torque: float  # N*m on the load
@@ -88,7 +88,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class MetricChoice:
-    """What ranks: a metric, and its weights if it is a combination."""
+    """The metric of the ranking, and its weights if it is a combination."""
 
     name: str
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -136,7 +136,7 @@ class Experiment:
         return inputs_in([getattr(self, name) for name in _NAMES])
 
     def to_toml(self, versions: Mapping[str, str]) -> str:
-        """Return the experiment as TOML: where a run's folder has its inputs, and the versions of what ran it."""
+        """Return the experiment as TOML: where a run's folder has its inputs, and the versions that ran it."""
         lines = [f"{name} = {toml(as_kept(getattr(self, name)))}" for name in (*_NAMES, "seed")]
         for swept in self.sweep:
             lines += ["", "[[sweep]]", *toml_lines(swept)]
@@ -230,7 +230,7 @@ def shipped_experiment(device: str | None, *, closed_loop: str | None = None) ->
 
 
 def resolve(experiment: Experiment) -> Resolved:
-    """Check an experiment against what there is and look its names up.
+    """Look an experiment's names up, and check its values against the device.
 
     Raises:
         ExperimentError: For a name that does not exist, or a value beyond its limits.

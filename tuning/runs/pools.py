@@ -388,7 +388,7 @@ def _call(function: Callable[..., Any], *arguments: Any) -> bytes:
 
 
 class _Answer(NamedTuple):
-    """What a worker gives back of a task: on which work, with which versions, and the result with its hash."""
+    """A worker's answer to a task: on which work, with which versions, and the result with its hash."""
 
     work: str
     versions: Mapping[str, str]

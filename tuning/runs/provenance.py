@@ -42,7 +42,7 @@ SOURCES = hash_of_sources()
 
 
 def check_begun(what: object, recorded: object, remedy: str) -> None:
-    """Raise ValueError, with both hashes, if what is to be continued was begun with other sources.
+    """Raise ValueError, with both hashes, if a run to be continued was begun with other sources.
 
     Args:
         what: The file or folder that keeps it.

@@ -50,7 +50,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep found.
+    """The result of a sweep.
 
     Attributes:
         experiment: The experiment.
@@ -79,7 +79,7 @@ class SweepResult:
 
     @property
     def score(self) -> NDArray[np.float64]:
-        """What ranks, shape (points,)."""
+        """The metric of the ranking, shape (points,)."""
         return np.asarray(self.columns[self.score_column])
 
     @property
@@ -134,7 +134,7 @@ class SweepResult:
 
 
 class Shard(NamedTuple):
-    """A part of a grid: what a sweep is split into, whatever it runs on."""
+    """A part of a grid: a sweep is split into these, whatever it runs on."""
 
     experiment: Experiment
     first: int  # its points, of those of the grid

@@ -26,7 +26,7 @@ from tuning.toml_tables import toml
 
 
 class Search(NamedTuple):
-    """A search on an emulated machine: what `emulated` takes, and how it is searched."""
+    """A search on an emulated machine: the arguments of `emulated`, and the settings."""
 
     machine: Mapping[str, Any]
     settings: Settings

@@ -226,7 +226,7 @@ def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
 
 
 def _scale(axis: Any, set_scale: Any, name: str) -> None:
-    """Scale an axis of a picture: what is a factor by its logarithm, with plain numbers at the lines."""
+    """Scale an axis of a picture: factors by their logarithm, with plain numbers at the lines."""
     if name == "current":
         return
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -238,7 +238,7 @@ def _scale(axis: Any, set_scale: Any, name: str) -> None:
 
 
 def _draw_best(axes: Any, rows: list[TrialRow], values: list[float], label: str | None) -> None:
-    """Draw what a search had found by each of its trials, of those that were accepted."""
+    """Draw the best accepted trial of a search so far, by trials."""
     least, best, shown = math.inf, [], math.nan
     for row, value in zip(rows, values, strict=True):
         if row.accepted and row.robust_cost < least:

@@ -53,7 +53,7 @@ MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
 
 
 def check_stepper(target: Target) -> None:
-    """Load what the search needs; ValueError unless drives have a load detection to be set, before anything is done."""
+    """Import the search's packages; ValueError, before anything moves, for drives without a load detection to set."""
     if lacks := lacks_load_detection(target.device):
         raise ValueError(
             f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "

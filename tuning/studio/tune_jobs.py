@@ -1,4 +1,4 @@
-"""What the page Tune asks of the drives, each a job: a function of the drives."""
+"""The jobs of the page Tune, each a function of the drives."""
 
 from __future__ import annotations
 

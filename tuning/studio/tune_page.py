@@ -117,7 +117,7 @@ class TunePanel:
         return card(title, name)
 
     def gains_slide(self) -> None:
-        """Show what the sliders would make of the response."""
+        """Show the response with the sliders' gains."""
         self.response.show(tuple(self.gains.wanted))
 
     def _show(self) -> None:
@@ -138,7 +138,7 @@ class TunePanel:
                 await asyncio.wrap_future(future)
 
     def _machine_card(self) -> None:
-        """Ask what no bus tells: motor, travel, supply, coupling."""
+        """Ask for motor, travel, supply and coupling, which no bus knows."""
         desk = self.desk
         emulated = desk.is_emulated
         with self.card("Machine", "machine"):
