@@ -34,7 +34,7 @@ class Standing:
         seeds: Of trainings.
         score: Interquartile mean over seeds and episodes.
         mean: Of all scores: what the middle half hides, rare failures, is in it.
-        improvement: Probability that it is better than the expert in an episode; None of the expert.
+        improvement: Probability that it is better than the expert in an episode; None for the expert.
         ended_early: Share of the episodes that a fall or a trip ended.
         steps: Of a training.
         cpu_minutes: Of a training, mean over the seeds.

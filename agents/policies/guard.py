@@ -134,7 +134,7 @@ class GuardedPolicy:
         return rows
 
     def answer(self, observation: Any) -> Any:
-        """Return a tuner's choice after its last trial, as an action; None of a policy without a choice.
+        """Return a tuner's choice after its last trial, as an action; None for a policy without a choice.
 
         Raises:
             PolicyStoppedError: If it took too long, or is not a number.

@@ -122,7 +122,7 @@ class TransmitPdo(Pdo):
         """Return the data to send at this SYNC, None if there is nothing to send.
 
         Args:
-            counter: The count in the SYNC, None of one without; the one with the SYNC start value (1800h:06) is the
+            counter: The count in the SYNC, None without one; the one with the SYNC start value (1800h:06) is the
                 first.
         """
         if not self.is_synchronous or not len(self._mapped):

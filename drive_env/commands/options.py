@@ -289,7 +289,7 @@ def default_samples(known: ObjectDictionary, names: Iterable[str]) -> list[str]:
 
 
 def cycle_for(known: Description) -> float | None:
-    """Return a time between SYNCs [s] in which the bus has room for all axes of a node; None of a node with one."""
+    """Return a time between SYNCs [s] in which the bus has room for all axes of a node; None for a node with one."""
     return None if known.num_axes == 1 else AXIS_CYCLE * known.num_axes
 
 

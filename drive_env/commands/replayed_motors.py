@@ -148,7 +148,7 @@ class ReplayedMotors:
         return found
 
     def _ask(self, nodes: Iterable[int], index: int) -> dict[int, int | None]:
-        """Read an object of nodes; return the answers, None of a node without that object."""
+        """Read an object of nodes; return the answers, None for a node without that object."""
         answers: dict[int, int | None] = {}
 
         def take(node: int, data: bytes) -> None:

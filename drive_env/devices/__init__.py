@@ -306,7 +306,7 @@ def device_names() -> list[str]:
 
 
 def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
-    """Return the name of the device that a node says that it is, None of one that is not known.
+    """Return the name of the device that a node says that it is, None for an unknown one.
 
     Args:
         kind: Its 1000h; a device and its variants, which are one product, are identified by it.

@@ -133,7 +133,7 @@ def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
 
 
 def _rate(code: UnitCode, bases: tuple[str, ...], feed: Feed, position: UnitCode | None) -> str:
-    """Return the unit that a code of a speed or an acceleration is; "" of one not known."""
+    """Return the unit of a code of a speed or an acceleration; "" for an unknown code."""
     by_minute, counted = bases
     is_speed = by_minute == "rpm"
     if not is_speed and code.numerator == PER_MINUTE and code.denominator == SECOND:
@@ -203,7 +203,7 @@ def written_angle(text: str) -> tuple[float, int]:
 
 
 def written_unit(text: str) -> str:
-    """Return the name of a unit that an EDS writes beside an object: "0.1 r/min" is "0.1 rpm"; "" of one not known."""
+    """Return the name of a unit that an EDS writes beside an object: "0.1 r/min" is "0.1 rpm"; "" if unknown."""
     plain = re.sub(r"[\s\[\]]", "", text.lower())
     if plain in _WRITTEN:
         return _WRITTEN[plain]

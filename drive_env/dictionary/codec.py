@@ -29,7 +29,7 @@ class Code(NamedTuple):
         unit: Name of a unit (`find_unit`), whose factor is SI per integer.
         event: What a write sets off in the firmware, as in the binding.
         low, high: Least and greatest integer; what lies beyond saturates, integers of `specials` excepted.
-        period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
+        period: Number of integers of a counter that goes on past the end of its type; 0 for one that saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
         follows_scale: Whether the factor follows the scale of positions.
     """

@@ -99,7 +99,7 @@ def object_section(index: int, sub: int | None = None) -> str:
 
 
 def place_of(name: str) -> tuple[int, int] | None:
-    """Return index and sub-index of a section, sub-index -1 of an object as a whole; None of another section."""
+    """Return index and sub-index of a section, sub-index -1 for an object as a whole; None for another section."""
     if len(name) > LONGEST_NAME:
         return None
     if found := _OBJECT.match(name):
@@ -110,7 +110,7 @@ def place_of(name: str) -> tuple[int, int] | None:
 
 
 def place_of_line(line: str) -> tuple[int, int] | None:
-    """Return the same of a line of a file, None of one that begins no section of an object."""
+    """Return the same for a line of a file, None for one that begins no section of an object."""
     found = _section_of(line)
     return None if found is None else place_of(found[0])
 

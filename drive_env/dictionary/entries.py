@@ -170,7 +170,7 @@ def _entry(variable: ODVariable, name: str) -> Entry:
 
 
 def _as_key(name: str) -> tuple[int, int] | None:
-    """Return index and sub-index of "6081:0", as the files of a device write them; None of another text."""
+    """Return index and sub-index of "6081:0", as the files of a device write them; None for another text."""
     index, colon, sub = name.partition(":")
     is_key = bool(colon) and len(index) == 4 and all(letter in "0123456789abcdefABCDEF" for letter in index)
     return (int(index, 16), int(sub)) if is_key and sub.isdecimal() else None

@@ -34,7 +34,7 @@ class Unit(NamedTuple):
     """A row: name, quantity, and SI per drive unit.
 
     Attributes:
-        period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
+        period: Number of integers of a counter that goes on past the end of its type; 0 for one that saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
         follows_scale: Whether the factor follows a scale, of positions, velocities or torques: what is stored in such a
             unit is kept in raw integers when a scale changes.
@@ -129,7 +129,7 @@ UNITS: dict[str, Unit] = {
 
 
 def split_unit(name: str) -> tuple[float, str]:
-    """Return how many of which unit one is: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
+    """Split a unit into a number and a base: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
     number, _, base = name.partition(" ")
     if name in UNITS or base not in UNITS:
         return 1.0, name

@@ -149,7 +149,7 @@ def _has_target_inside(drives: BasicDrives) -> bool:
 
 
 def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
-    """Return an object of every axis, None of drives that have no such object."""
+    """Return an object of every axis, None if the drives have no such object."""
     try:
         return drives.read(name)
     except ObjectAccessError as error:

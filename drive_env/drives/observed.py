@@ -43,7 +43,7 @@ class Observer:
         """Note a write."""
 
     def passes(self, duration: float) -> None:
-        """Take note that time is about to pass [s]."""
+        """Note that time is about to pass [s]."""
 
     def passed(
         self,

@@ -242,7 +242,7 @@ class LiveDictionary:
         )
 
     def recordable(self, entry: Entry) -> Code | None:
-        """Return where the value of an entry is that changes by itself, None of one that only a write changes."""
+        """Return where the value of an entry is that changes by itself, None for one that only a write changes."""
         check_readable(entry)
         key = (entry.index, entry.sub)
         if key in self.device.parts:

@@ -87,7 +87,7 @@ class Machines:
 
     @contextmanager
     def pushed(self) -> Iterator[Callable[[ArrayLike], None]]:
-        """Give what puts a torque on each axis by itself, beside `load_torque`, which is all there is again at the end.
+        """Give a function that puts torques on the axes besides `load_torque`, which alone acts again at the end.
 
         It takes torques as the rotors see them [N*m], shape (num_axes,), one after the other; the load's joints that no
         axis turns feel nothing of them.

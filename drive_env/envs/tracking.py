@@ -289,7 +289,7 @@ class Tracking(VectorEnvironment):
     `terminated`: a drive tripped, its machine left physics, or the pole fell; `truncated`: time ran out.
 
     `info`: "reward_terms"; "parameters" of environments that begin, the true machine, not on a bus; "fault" once an
-    environment ended so, a name or several, "" of the others.
+    environment ended so, a name or several, "" for the others.
 
     Args:
         num_envs: Number of environments.

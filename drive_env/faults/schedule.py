@@ -70,7 +70,7 @@ def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tu
     """Return delay and length of a fault in communication cycles; `cycles` counts them in a time [s].
 
     Raises:
-        ValueError: For times that are no whole cycles, or a duration of what is a moment.
+        ValueError: For times that are not whole cycles, or a duration of a fault that is a moment.
     """
     if order.duration is not None and row.once:
         raise ValueError(f"fault {row.name} is a moment and has no duration; leave duration out")

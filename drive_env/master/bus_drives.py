@@ -337,7 +337,7 @@ class BusDrives:
         self._started = False
 
     def must_start(self) -> None:
-        """Take note that a node is not operational any more: the next command starts it."""
+        """Note that a node is not operational any more: the next command starts it."""
         self._started = False
 
     def prepare_watch(self, envelope: Envelope) -> None:

@@ -158,7 +158,7 @@ class ProcessData(Protocol):
         """Return the objects that come with every cycle."""
 
     def outputs(self, played: Mapping[Entry, Integers]) -> Outputs | None:
-        """Return rows to send, of integers of shape (cycles, num_axes) for all that is mapped; None of nothing."""
+        """Return rows to send, of integers of shape (cycles, num_axes) for all mapped objects; None without any."""
 
     def samples(self) -> Samples | None:
         """Begin to collect what is mapped out of the drives. None if nothing is mapped, or in a dry run."""

@@ -79,7 +79,7 @@ _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*
 
 
 def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
-    """Return a unit by name, None of one that there is not, or whose scale is not known."""
+    """Return a unit by name, None for an unknown unit, or one whose scale is not known."""
     known = scale if isinstance(scale, AxisScale) else AxisScale(scale)
     if name in _INCREMENTAL:
         return EnteredUnit(_INCREMENTAL[name], 1.0 / known.increments) if known.increments else None

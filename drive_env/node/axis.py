@@ -34,9 +34,9 @@ from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 class ObjectPort(NamedTuple):
     """Access to one object: its entry, its value, the check of a new value, the write of a checked one.
 
-    `event` names what a write sets off, as in a binding. `write_text` takes a text or a domain, each byte of which is a
-    character; None where it cannot be written. `fit` returns what a value of process data is taken as, where the device
-    takes more of them than the object's range; None of others.
+    `event` names the event of a write, as in a binding. `write_text` takes a text or a domain, each byte of which is a
+    character; None where it cannot be written. `fit` returns the value that data beyond the object's range become, if
+    the device takes such; None for other objects.
     """
 
     entry: Entry
@@ -280,7 +280,7 @@ class Axis:
         return write
 
     def _scale_writer(self, entry: Entry) -> Callable[[int], None] | None:
-        """Return how an object of the scale of positions is written, since much follows it; None of another one."""
+        """Return the writer of an object of the scale of positions, on which much depends; None for other objects."""
         if (entry.index, entry.sub) not in self._objects.scale_keys:
             return None
         return lambda raw: self._objects.write_checked(entry, raw, self.number)

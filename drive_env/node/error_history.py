@@ -62,7 +62,7 @@ class ErrorHistory:
             self._errors.appendleft(code | axis << 16 | (number & 0x3F) << 24)
 
     def read(self, sub: int) -> int:
-        """Return a sub-index; 08000024h of one that holds no error yet."""
+        """Return a sub-index; 08000024h for one that holds no error yet."""
         if sub == 0:
             return len(self._errors)
         if sub > len(self._errors):

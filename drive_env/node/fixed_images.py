@@ -52,7 +52,7 @@ class PackedFields:
         return self._named(value) if self._is_name[k] else value
 
     def _named(self, entry: int) -> int:
-        """Return the object that a mapping entry names; 0 of none, and of one that is not there."""
+        """Return the object that a mapping entry names; 0 for an entry without one, and for a missing object."""
         index, sub, _ = mapping.parse(entry)
         try:
             value = self._find(index, sub).read()

@@ -104,9 +104,9 @@ class NodeErrors:
         return register | bit if number and register else register
 
     def condition(self, name: str, now: float, key: Hashable = None) -> None:
-        """Tell of a condition of the bus at `now` [s], unless it is known already; `key` says whose it is.
+        """Report a condition of the bus at `now` [s], unless it is known already; `key` says whose it is.
 
-        CiA 301: 1003h notes what the emergencies tell.
+        CiA 301: 1003h has the errors of the emergencies.
         """
         condition = CONDITIONS.get(name) or OPTIONAL_CONDITIONS[name]
         key = name if key is None else key
@@ -127,7 +127,7 @@ class NodeErrors:
         self._flush(now)
 
     def condition_if_known(self, name: str, now: float) -> None:
-        """Tell of a condition that a device's table of emergencies may lack, since the standard leaves it open."""
+        """Report a condition that a device's table of emergencies may lack, since the standard leaves it open."""
         if name in self._device.emergencies:
             self.condition(name, now)
 

@@ -77,7 +77,7 @@ class NodeObjects:
         self._values[self._device.canopen.objects[role]] = raw
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Return a number; 0 of an object that this device does not have."""
+        """Return a number; 0 for an object that this device does not have."""
         raw: int | str = self._values.get((index, sub), 0)
         assert isinstance(raw, int), "a text is not a number"
         return raw

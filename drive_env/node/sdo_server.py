@@ -294,7 +294,7 @@ def encode(entry: Entry, value: int | str) -> bytes:
 
 
 def size_of(entry: Entry) -> int:
-    """Return the length [bytes] of an object; 0 of a text, which is as long as it is."""
+    """Return the length [bytes] of an object; 0 for a text, which is as long as it is."""
     return 0 if entry.bits is None else (entry.bits + 7) // 8
 
 

@@ -143,7 +143,7 @@ class Axes:
             self.live |= axes
 
     def forget_motion(self, axes: Mask) -> None:
-        """Take note that no set-point of a position moves some axes any more: a new one must be given."""
+        """Note that no set-point of a position moves some axes any more: a new one must be given."""
         self.moves = self.moves & ~axes
         self.led = np.where(axes, math.nan, self.led)
 

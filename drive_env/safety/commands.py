@@ -136,7 +136,7 @@ class Commands:
         return np.rint(raw * scale - 2.0**32 * np.rint(above / 2.0**32)).astype(np.int64)
 
     def note(self, key: Key, raw: Integers, where: Mask) -> None:
-        """Take note of a set-point that was written."""
+        """Note a set-point that was written."""
         if self._is_other_target(key):
             self.forget(TARGET_POSITION)
             self._axes.led = np.where(where, math.nan, self._axes.led)
@@ -150,7 +150,7 @@ class Commands:
             self.note_running(where, (key,))
 
     def note_running(self, where: Mask, keys: tuple[Key, ...] = (TARGET_VELOCITY, TARGET_TORQUE)) -> None:
-        """Take note that axes act on the set-points of speed and torque that they have, by default on both."""
+        """Note that axes act on the set-points of speed and torque that they have, by default on both."""
         for key in keys:
             asked = self._set_points.get(key, 0) + self._set_points.get(_PARTNERS[key], 0)
             if _MAGNITUDES[key] == "velocity":
@@ -170,7 +170,7 @@ class Commands:
             self._set_points.pop(key, None)
 
     def note_start(self, words: Integers, where: Mask) -> None:
-        """Take note of where moves in pp lead that a controlword has started."""
+        """Note where moves in pp lead that a controlword has started."""
         starts = where & cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0) & (self._axes.mode == PP)
         target = self._set_points.get(TARGET_POSITION)
         for axis in np.flatnonzero(starts).tolist() if target is not None else ():

@@ -129,7 +129,7 @@ class Envelope:
         self._limits.change(limits)
 
     def leave_alone(self, axes: Iterable[int]) -> None:
-        """Take note of axes that the program never moves: their drives are lent nothing."""
+        """Note axes that the program never moves: their drives are lent nothing."""
         self._lending.left_alone = frozenset(axes)
 
     def enter(self) -> None:
@@ -140,7 +140,7 @@ class Envelope:
         self._watch.raise_pending()
 
     def alive(self) -> None:
-        """Take note that the program waits for an answer."""
+        """Note that the program waits for an answer."""
         self._watch.alive()
 
     def before_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
@@ -330,7 +330,7 @@ class Envelope:
                 self.after_write(entry, rows[-1], self._axes.everywhere)
 
     def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Take note that the drives may have taken any of the rows."""
+        """Note that the drives may have taken any of the rows."""
         self._played = {}
         for entry in played:
             self.after_failed_write(entry)
@@ -345,7 +345,7 @@ class Envelope:
         self._axes.take_for_off(axes)
 
     def after_reset(self, nodes: Sequence[int]) -> None:
-        """Take note that nodes, by position, were reset: their error control is their own again."""
+        """Note that nodes, by position, were reset: their error control is their own again."""
         for k in nodes:
             self._watchdogs.forget(k)
             self._watch.booted.discard(k)
@@ -402,7 +402,7 @@ class Envelope:
         self._watch.observe(rows, epoch, where)
 
     def _note_rows(self, coming: int) -> None:
-        """Take note of the mode that axes have by the newest row, and of the set-points of the one that comes."""
+        """Note the axes' mode from the newest played row, and the set-points from the row that comes."""
         for key, rows in self._played.items():
             if key != MODE:
                 self._commands.note(key, rows[min(coming, len(rows) - 1)], self._axes.everywhere)

@@ -44,7 +44,7 @@ class RotorAngle:
         self.is_placed = False
 
     def place(self, increments: Integers, scale: Floats, turns: Floats | None = None) -> None:
-        """Take note that rotors are at `turns` where 6064h shows `increments`; where they were believed by default."""
+        """Note that rotors are at `turns` where 6064h shows `increments`; where they were believed by default."""
         if turns is None:
             turns = self.turns(increments) if self.is_placed else np.zeros(len(increments))
         self._increments, self._turns, self.scale = increments.copy(), turns.copy(), scale.copy()
@@ -62,7 +62,7 @@ class RotorAngle:
 
 
 def _own_scale(description: Description) -> PositionScale | None:
-    """Return the objects of the drive's own that say it, None of a drive that has CiA 402's."""
+    """Return the objects of the drive's own scale, None for a drive with CiA 402's."""
     own = position_scale(description.dictionary.roles)
     return own if own is not None and all(description.has(key) for key in own.keys) else None
 

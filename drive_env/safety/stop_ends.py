@@ -122,7 +122,7 @@ class StopEnds:
         self._current = np.zeros(count)
 
     def take(self, rows: Mapping[Key, Integers], bounds: Bounds) -> None:
-        """Take note of samples, each object of shape (rows, num_axes)."""
+        """Note samples, each object of shape (rows, num_axes)."""
         axes, now = self._axes, self._axes.now()
         self.speed = axes.newest_speed()
         if CURRENT in rows:

@@ -326,7 +326,7 @@ class StopRunner:
             self._drives.sdo(node).command(*known.key(entry, part), known.encode(entry, value))
 
     def _own_mode(self, axis: int) -> int | None:
-        """Return the drive's own mode with which an axis that ignores commands takes them; None of one that does."""
+        """Return the drive's own mode with which an axis that ignores commands takes them; None if it takes them."""
         device = self._drives.device
         if device is None or not self._ignores(axis):
             return None

@@ -147,7 +147,7 @@ class Watch:
             self._pending = SafetyError("the drives were stopped, since a signal ended the program")
 
     def forget_signal(self) -> None:
-        """Take note that the program goes on after a signal: it enables an axis."""
+        """Note that the program goes on after a signal: it enables an axis."""
         self._told_at = -math.inf
 
     @property
@@ -158,7 +158,7 @@ class Watch:
         return math.isfinite(self._told_at) and self._stops.current is not None and not self._stops.current.is_over
 
     def alive(self) -> None:
-        """Take note that the program waits for an answer."""
+        """Note that the program waits for an answer."""
         if not self._is_supervisor():
             self._alive = time.monotonic()
 

@@ -85,7 +85,7 @@ class Watchdogs:
         self._is_set = False
 
     def forget(self, node: int) -> None:
-        """Take note that a node, by position, was reset: its watchdog is its own again."""
+        """Note that a node, by position, was reset: its watchdog is its own again."""
         self._watch.forget(node)
 
     def take_rival(self) -> str:

@@ -161,7 +161,7 @@ class AxisStates:
         return "error", f"{axis.name}: {message.code:04X}h {text.name}. {text.cause} {text.remedy}"
 
     def forget_faults(self, axis: int) -> None:
-        """Take note that the faults of an axis were reset."""
+        """Note that the faults of an axis were reset."""
         self._replace(axis, faults=())
 
     # --- inside ---------------------------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ class AxisStates:
             self._replace(axis, mode=mode, inputs=switches, slow=values)
 
     def _try(self, drives: Drives, key: Key) -> Any:
-        """Return an object of every axis, None of one that the drive does not have."""
+        """Return an object of every axis, None if the drive does not have it."""
         if key in self._unreadable:
             return None
         try:

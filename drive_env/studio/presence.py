@@ -54,7 +54,7 @@ class Presence:
         self._last = time.monotonic()
 
     def beat(self, page: str, held: int = 0) -> None:
-        """Take note that a page is there, and which motion it holds, 0 for none."""
+        """Note that a page is there, and which motion it holds, 0 for none."""
         now = time.monotonic()
         with self._lock:
             self._beats[page] = self._last = now
@@ -94,7 +94,7 @@ class Presence:
                     motion.why = motion.why or "ended"
 
     def end_all(self, axes: Mask) -> None:
-        """Take note that axes are stopped: nothing of them goes on."""
+        """Note that axes are stopped: nothing of them goes on."""
         with self._lock:
             for number in [n for n, motion in self._motions.items() if np.any(motion.axes & axes)]:
                 motion = self._motions.pop(number)

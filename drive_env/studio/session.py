@@ -297,7 +297,7 @@ class Session:
         return () if self._states is None else self._states.scales
 
     def forget_faults(self, axis: int) -> None:
-        """Take note that the faults of an axis were reset."""
+        """Note that the faults of an axis were reset."""
         if self._states is not None:
             self._states.forget_faults(axis)
 

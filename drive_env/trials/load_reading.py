@@ -58,7 +58,7 @@ def falls(angle: Floats | float) -> Floats:
 
 
 def angle_of(left: Floats) -> Floats:
-    """Return the load angle [rad] of which `falls` is so much; nan where it never is."""
+    """Return the load angle [rad] at which `falls` has a value; nan if it never has."""
     share = np.asarray(left, float) / math.sqrt(2.0)
     inside = np.abs(share) <= 1.0
     return np.where(inside, np.arccos(np.where(inside, share, 0.0)) - 0.25 * math.pi, np.nan)

@@ -52,7 +52,7 @@ def borrowed(device: Device) -> tuple[ObjectName, ...]:
 
 
 def read_role(target: Target, role: Role) -> Integers:
-    """Return an object by its role, shape (num_axes,); 0 of a drive that has none such, which is as if it were unused.
+    """Return an object by its role, shape (num_axes,); 0 if the drive lacks it, which is as if it were unused.
 
     So a drive without a setting of the shaft's direction turns it nowhere, and one without flags aligns no encoder.
     """

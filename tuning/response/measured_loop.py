@@ -63,7 +63,7 @@ class MeasuredLoop:
         coherence: Of set-point with answer and with error, the lower of the two, 0...1.
         traced: Which frequencies come from an emulator's trace at the velocity loop's rate; no bus shows them.
         gains: Raw gains in force, shape (axes, count).
-        fits: What the linear model makes of each axis; None of the position loop.
+        fits: The fitted linear model of each axis; None for the position loop.
         peak_speed, peak_current: Of the shaking [rad/s], [A], shape (axes,).
         drive_time: Time that passed on the drives [s].
         notes: Of each axis, for people.

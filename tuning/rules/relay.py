@@ -227,7 +227,7 @@ def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside
 
 
 def fundamental(x: Floats) -> float:
-    """Return the frequency of the strongest line [Hz], nan of a signal that rests."""
+    """Return the frequency of the strongest line [Hz], nan for a signal that rests."""
     y = (x - x.mean()) * np.hanning(len(x))
     if not np.any(y):
         return math.nan

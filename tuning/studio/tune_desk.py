@@ -162,7 +162,7 @@ class TuneDesk:
         return self.session.is_emulated
 
     def touch(self) -> None:
-        """Take note that something has changed."""
+        """Note that something has changed."""
         with self._lock:
             self.version += 1
 

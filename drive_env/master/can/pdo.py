@@ -225,7 +225,7 @@ class PdoConfiguration:
         return RemotePdo(label, can_id, start, tuple(members))
 
     def _usual_identifier(self, direction: Direction, number: int, axis: int) -> int:
-        """Return the identifier of a PDO that has none: the node's, or a borrowed one; 0 of a fifth PDO of an axis."""
+        """Return the identifier of a PDO that has none: the node's, or a borrowed one; 0 for a fifth PDO of an axis."""
         usual = direction.identifiers
         if number < len(usual):
             return usual[number] + self._node

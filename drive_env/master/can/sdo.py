@@ -139,7 +139,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             raise BusError(several_answer(2, self._node))
 
     def _count_seconds(self, answers: list[bytes]) -> None:
-        """Take note of answers to transfers that had theirs, and forget them all."""
+        """Note answers to transfers that had theirs, and forget them all."""
         while answers:
             answer = answers.pop(0)
             if len(answer) == 8 and (answer[0] == _ABORT or answer[0] & 0xE0 in _INITIATE):
@@ -187,7 +187,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             ) from None
 
     def _take_for_answered(self) -> None:
-        """Take note that a transfer had its answer, unless that of the one before may be late."""
+        """Note that a transfer had its answer, unless that of the one before may be late."""
         if not self._has_retried:
             self._recent.append(self._object)
         self._has_retried = False

@@ -165,7 +165,7 @@ class EtherCatLink:
         return [one for one in self._master.take_emergencies() if one.node in self.nodes]
 
     def time_passes(self) -> bool | None:
-        """Look whether the clock of the first slave goes while no process data are exchanged; None of one without."""
+        """Return whether the first slave's clock goes while no process data are exchanged; None without a clock."""
         before = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
         time.sleep(TIME_LOOK)
         after = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)

@@ -200,7 +200,7 @@ class EtherCatProcessData:
         return (*self._layouts[INPUTS].entries, *self._beside) if self._ready else ()
 
     def outputs(self, played: Mapping[Entry, Integers]) -> ImageRows | None:
-        """Return rows to send; None of nothing."""
+        """Return rows to send; None without mapped objects."""
         return ImageRows(self, self._layouts[OUTPUTS], played) if played else None
 
     def samples(self) -> ImageSamples | None:

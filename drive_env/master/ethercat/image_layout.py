@@ -29,7 +29,7 @@ class ImageLayout(NamedTuple):
         pdo: Object that the sync manager is assigned.
         members: Objects of the axes and their places; one of the whole node stands for each axis.
         size: Length [bytes].
-        mapped: Mapping entries to be written; None of a ready-made image.
+        mapped: Mapping entries to be written; None for a ready-made image.
     """
 
     pdo: int

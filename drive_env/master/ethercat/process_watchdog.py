@@ -99,7 +99,7 @@ class ProcessWatchdog:
         self._data.is_silent = True
 
     def end(self) -> None:
-        """Take note that the watchdogs are given up; images may go on."""
+        """Note that the watchdogs are given up; images may go on."""
         self._time = math.inf
 
     def is_set(self, node: int) -> bool:
