@@ -41,7 +41,7 @@ class OscillationWatch(Observer):
     Args:
         where: Axes that are experimented on, shape (num_axes,).
         limit: Most current that is asked of each axis [A], shape (num_axes,).
-        noise: RMS of the current's samples at rest [A]: what is not clear of it is no oscillation.
+        noise: RMS of the current's samples at rest [A]: a swing within it is no oscillation.
 
     Attributes:
         limit: As given; it may be lowered.

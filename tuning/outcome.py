@@ -20,7 +20,7 @@ class Outcome(NamedTuple):
     gains: Raw integers in the order of the device's gain set, shape (num_axes, gains).
     drive_seconds: Time on the drive [s], (num_axes,).
     moves: Moves and other excitations, (num_axes,).
-    aborts: What had to be stopped, (num_axes,).
+    aborts: Trials and moves that had to be stopped, (num_axes,).
     violations: How often it left its limits, (num_axes,).
     notes: One text per axis, "" for none.
     accepted: Axes whose gains the tuner vouches for, (num_axes,); None is all.

@@ -94,7 +94,7 @@ def repeat(policy: Any, recording: EpisodeRecording, told: Callable[[float], Non
 
     Args:
         policy: What acts.
-        recording: What it is compared with.
+        recording: The recording to compare with.
         told: Called with the share that is done, episode by episode.
 
     Raises:

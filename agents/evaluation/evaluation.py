@@ -302,7 +302,7 @@ def _episodes(
         seeds: One for each environment.
         all_end: Whether every environment's episode ends with the first that does: beginning anew would move the
             others.
-        told: Is told how many steps are done, not more often than every TOLD.
+        told: Called with the number of steps done, not more often than every TOLD.
     """
     count = lanes.num_envs
     observation, begun = lanes.reset(seed=list(seeds))

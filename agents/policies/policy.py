@@ -166,7 +166,7 @@ class MlpPolicy:
             PolicyError: If observation or action is not a number, or the observation has another shape.
         """
         x = self._ends.enter(observation)
-        with np.errstate(over="ignore", invalid="ignore"):  # `leave` tells what comes of it
+        with np.errstate(over="ignore", invalid="ignore"):  # `leave` reports the consequence
             for weight, bias in self._hidden:
                 x = self._activation(x @ weight + bias)
             x = x @ self._last[0] + self._last[1]

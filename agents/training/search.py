@@ -165,7 +165,7 @@ class _Study:
         from optuna.storages.journal import JournalFileBackend
 
         self._base, self._folder, self._seed, self._episodes, self._told = base, folder, seed, episodes, told
-        optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
+        optuna.logging.set_verbosity(optuna.logging.ERROR)  # failures are reported in a line
         storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
         name = f"{base.environment} {base.algorithm}"
         self._study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)

@@ -97,7 +97,7 @@ def _train(run: TrainingRun, folder: Path, report: Report | None, resume: bool, 
             model, normaliser = checkpoint.load(path, env, trust=trust)
         else:
             model, normaliser = make_model(run, env)
-            agent_of(model, normaliser, run, configuration_of(lanes))  # what no bundle holds is told now
+            agent_of(model, normaliser, run, configuration_of(lanes))  # raises if no bundle can hold the model
             if run.hyperparameters.get("imitate"):
                 _imitate(run, model, lanes, report)
         folder.mkdir(parents=True, exist_ok=True)

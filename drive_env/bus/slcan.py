@@ -120,7 +120,7 @@ class Channel:
     def _unlock(self, line: bytes) -> bytes:
         if line[:1] != b"K" or self.wrong_token:
             return b""
-        # Compared in constant time: how long it takes tells nothing of how much of it was right.
+        # Compared in constant time, so that the duration does not show how many characters were right.
         if not secrets.compare_digest(line[1:], self._token):
             self.wrong_token = True
             return b""

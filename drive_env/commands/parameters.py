@@ -244,7 +244,7 @@ def _exchange(
         bus: The node.
         wanted: The parameters.
         axis: Of the node.
-        name: What they are from.
+        name: Their source.
         check: Raises for a drive that they are not meant for.
         store: Have the drive keep them.
         yes: Do not ask.

@@ -257,7 +257,7 @@ def _wait_for(
     import numpy as np
 
     rows = samples.none()
-    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # a wrong level is told before the wait
+    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # a wrong level is reported before the wait
     held = True  # a condition that holds from the start must end first
     for _ in range(max(1, round(wait / CHUNK))):
         chunk = samples.record(CHUNK)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 AUTO = "auto"  # as --token
-NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of what is not named as its option
+NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of fields with another option name
 NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then receives nothing
 ETHERCAT = ("ethercat", "ethercat-udp")
 TOKEN_BYTES = 12  # of chance: 16 characters

@@ -40,7 +40,7 @@ def open_ethercat(
         except BusConfigError as error:
             fail(str(error))
 
-    open_way().close()  # a mistake is told before a minute of compiling
+    open_way().close()  # a mistake is reported before a minute of compiling
     world = build(bus, not real_time)
     first = build(replace(bus, machines=bus.machines[:1], store=None), True)
     first.power_on()

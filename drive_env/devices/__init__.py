@@ -63,7 +63,7 @@ class EmergencyCode(NamedTuple):
     extra: tuple[int, ...]
 
     def of_axis(self, axis: int) -> EmergencyCode:
-        """Return it with the bytes that an axis of the node sends; one that tells no axis as it is."""
+        """Return it with the bytes that an axis of the node sends; unchanged if it has no byte of the axis."""
         return EmergencyCode(self.code, tuple(axis if byte == AXIS else byte for byte in self.extra))
 
     @property
@@ -134,7 +134,7 @@ class MasterHints(NamedTuple):
         timeout: Longest wait for an answer.
         timeouts: Index -> longest wait, of objects that take longer.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
-        commands: Index -> what it is, of the device's own objects that can be written but are no parameters.
+        commands: Index -> its name, of the device's own objects that can be written but are not parameters.
         addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be
             another one after its next reset, or mute.
     """

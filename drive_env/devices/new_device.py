@@ -95,7 +95,7 @@ class NewDevice(NamedTuple):
     Attributes:
         folder: The folder.
         fill_in: What a person must fill in or check.
-        modes: What became of the drive's modes of operation.
+        modes: The drive's modes of operation, and their support here.
         without_effect: Objects that are stored and have no effect here.
         repairs: What was put right in the EDS.
     """
@@ -309,7 +309,7 @@ class _Draft:
                 self._roles["current_limit"] = key
                 return
 
-    # --- what it has not ------------------------------------------------------------------------------------------
+    # --- missing objects ------------------------------------------------------------------------------------------
     def _free_block(self) -> int:
         used = {index for index, _ in self._types}
         for base in OWN_BLOCKS:

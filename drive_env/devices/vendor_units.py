@@ -62,7 +62,7 @@ class VendorUnits(NamedTuple):
         scale: Name of a role -> object of the dictionary, of what makes the scale of positions; empty: nothing does.
         increments: Units of position in a turn of the motor where they are known and no object has them, else 0.
         sources: Quantity -> where its unit stands; "" where it is the standard's.
-        notes: What stands in the file and is not taken: object, and why.
+        notes: Entries of the file that are not taken: object, and why.
     """
 
     velocity: str

@@ -27,7 +27,7 @@ class Context(NamedTuple):
     current_lsb: float  # [A] per LSB of the current loop
     rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
     velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
-    peak_current: Any = math.nan  # of the motor [A], where torques are told in its parts
+    peak_current: Any = math.nan  # of the motor [A], of which torques are parts
 
 
 class Unit(NamedTuple):

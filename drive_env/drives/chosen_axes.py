@@ -37,7 +37,7 @@ def chosen_parts(axes: Iterable[int], count: int, name: str) -> tuple[int, ...]:
     Args:
         axes: Their numbers, from 0.
         count: How many a module has.
-        name: What it is, for the message.
+        name: Their name, for the message.
 
     Raises:
         ValueError: For an axis that it does not have, or none at all.

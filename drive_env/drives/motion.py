@@ -222,7 +222,7 @@ def _shown_modes(drives: BasicDrives) -> Integers | None:
 
 def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
     """Return the drive's own mode that each mode of operation needs; empty of drives that have no such thing."""
-    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know what they are
+    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know their device
     return {} if device is None else device.mode_gate
 
 

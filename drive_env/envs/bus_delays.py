@@ -105,7 +105,7 @@ class Line(Bundle):
     last_arrival: Numbers
     arrivals: NumberMatrix  # of the last messages, (num_envs, depth)
     messages: Cube  # (num_envs, depth, width)
-    held: Matrix  # what is there now, (num_envs, width)
+    held: Matrix  # the arrived message, (num_envs, width)
 
     @property
     def is_there(self) -> bool:
@@ -113,7 +113,7 @@ class Line(Bundle):
         return bool(self.latency.any() or self.jitter.any())
 
     def reset(self, latency: Floats, jitter: Floats, first: NDArray[Any], where: Mask) -> None:
-        """Begin anew in the environments where the mask is true, with what is there before the first message."""
+        """Begin anew in the environments where the mask is true, with the message that stands before the first one."""
         lanes, width, depth = len(where), first[0].size, self.arrivals.shape[1]
         if self.held.shape[1] != width:
             self.replace(messages=np.zeros((lanes, depth, width)), held=np.zeros((lanes, width)))

@@ -491,7 +491,7 @@ class GainScheduling(VectorEnvironment):
         at_once = 1 if self._pictures is not None and self._pictures.is_looking else self._cycles
         traces = []
         with warnings.catch_warnings():
-            # A machine that leaves physics ends its environment; who steps it is told so by `info`.
+            # A machine that leaves physics ends its environment; `info` says so.
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             for begin in range(0, self._cycles, at_once):
                 part = {key: values[begin : begin + at_once] for key, values in play.items()}

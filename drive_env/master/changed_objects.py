@@ -50,7 +50,7 @@ class ChangedObjects:
             key: The object.
             data: What it gets.
             only_from: What it must have now, or else it is left alone.
-            before: What it gets back afterwards, if not what it has now.
+            before: The value that it gets back afterwards, by default its present one.
 
         Raises:
             NoWatchdogError: If the node takes them and has others.

@@ -177,7 +177,7 @@ class BlockUpload:
             self._block_size = _checked_size(data[2])
             self._sent, self.is_sending = 0, True
             return None
-        checksum = crc(self._content)  # also for who has none: python-canopen looks at it all the same
+        checksum = crc(self._content)  # also for clients without one: python-canopen looks at it all the same
         unused = self._done - len(self._content)
         return bytes((UPLOAD_RESPONSE | unused << 2 | END,)) + checksum.to_bytes(2, "little") + bytes(5)
 

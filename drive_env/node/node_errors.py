@@ -1,7 +1,7 @@
 """A node's errors on any fieldbus: error register (1001h), history (1003h), emergencies, reactions.
 
 An emergency is an event here: code, error register and additional bytes. How it travels, and when it may, is the
-fieldbus' own, and so is what becomes of the node's state.
+fieldbus' own, and so is the change of the node's state.
 """
 
 from __future__ import annotations

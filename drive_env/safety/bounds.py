@@ -166,7 +166,7 @@ def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors:
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
     braking = _rate(drives, QUICK_STOP_DECELERATION, rotor)
-    # What a revolution counts may be mistaken: a speed in rpm is told by positions, too.
+    # The scale of a revolution may be mistaken: a speed in rpm is checked by positions, too.
     by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
     return Bounds(

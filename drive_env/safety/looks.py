@@ -90,7 +90,7 @@ class Looks:
         """Note the objects that come with every SYNC; the other watched ones are read."""
         self._unsampled = [entry for entry in self.watched() if entry not in chosen]
         keys = [(entry.index, entry.sub) for entry in self._unsampled]
-        if DEMAND in keys and POSITION not in keys:  # a following error is told by both of a moment
+        if DEMAND in keys and POSITION not in keys:  # a following error needs both of the same moment
             self._unsampled.insert(0, self._known.find(POSITION))
 
     def with_unsampled(self, rows: Mapping[Key, Integers]) -> Mapping[Key, Integers]:

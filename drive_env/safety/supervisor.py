@@ -60,7 +60,7 @@ class Supervisor:
         sys.setswitchinterval(self._interval)
 
     def _run(self) -> None:
-        told = ""  # a bus that is gone is told once, not with every turn
+        told = ""  # a bus that is gone is reported once, not with every turn
         while not self._ended.is_set():
             begun = time.monotonic()
             try:

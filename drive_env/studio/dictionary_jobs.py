@@ -48,7 +48,7 @@ AREAS = {
 
 
 class ShownValue(NamedTuple):
-    """A value as it is shown: raw, None where it cannot be read, and as text with its unit."""
+    """A value for display: raw, None where it cannot be read, and as text with its unit."""
 
     raw: int | str | None
     text: str

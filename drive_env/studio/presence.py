@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 
 HOLD = 0.5  # s without a beat after which what a page holds is stopped
-ASLEEP = 2.0  # s without a beat after which what a page has set in motion for as long as it is there is stopped
+ASLEEP = 2.0  # s without a beat after which a page's motions that last as long as it is there are stopped
 ABANDONED = 5.0  # s without any page after which an axis that is enabled is stopped and disabled
 
 

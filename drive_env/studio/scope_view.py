@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 MOST_CHANNELS = 8
 WINDOWS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0)  # s
 MODES = {"roll": "rolling", "auto": "auto", "normal": "normal", "single": "single"}
-AUTO_WAIT = 1.0  # s without a trigger after which auto shows what there is
+AUTO_WAIT = 1.0  # s without a trigger after which auto shows the samples there are
 STEPS = 65_000  # of the integers that a value becomes on its way to the page
 
 

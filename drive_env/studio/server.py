@@ -251,7 +251,7 @@ def serve_studio(
 
     Args:
         session: The drives; they are opened here.
-        pages: What there is to see.
+        pages: The pages.
         sock: Listens already.
         terms: How.
         ready: Called before the first request is served.

@@ -100,7 +100,7 @@ class Session:
 
     Args:
         open_drives: Opens the drives, in the thread that will use them.
-        title: What they are, for people.
+        title: Their name, for people.
         description: Of the device.
         address: How drives of a bus were opened: interface, channel, nodes, bitrate; empty for emulated ones.
 
@@ -176,7 +176,7 @@ class Session:
         Args:
             function: What to do; it may let time pass, and is ended by an exception when the job is stopped.
             title: What it does, in a few words: "Move axis 0".
-            page: Who wants it; what moves by it stops when that page is gone. "" for no page.
+            page: Who wants it: its motion stops when that page is gone. "" for no page.
             paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
             quiet: Whether pages do not show it: one of many that only read.
 
@@ -432,7 +432,7 @@ class Session:
                 self.say("error", told)
 
     def _tell_stop(self, error: SafetyError) -> None:
-        """Say why the envelope has stopped the drives, unless that was asked for a moment ago, and is told."""
+        """Report why the envelope has stopped the drives, unless a requested stop was reported a moment ago."""
         if time.monotonic() - self._told_at > STOP_WAIT or not str(error).startswith(self._told_reason):
             self.say("error", sentence(error))
 

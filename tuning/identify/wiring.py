@@ -32,7 +32,7 @@ FINDINGS = {
     Role.HALL_POLARITY: "hall levels inverted",
     Role.HALL_DIRECTION: "halls in reverse order",
 }
-SETTLED = 0.002  # s after which a position is told in the new direction
+SETTLED = 0.002  # s after which a position is read in the new direction
 
 LEAST_HALL_TURN = 2.6  # electrical rad of the field: two edges at least, from wherever it begins
 HALL_SLACK = 0.5  # by which their way may differ from the field's: a sector of three

@@ -243,7 +243,7 @@ def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
 
 
 def switch_off(drives: Drives, where: Mask) -> None:
-    """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by who wants."""
+    """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by the caller."""
     fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     motion.disable(drives, where & ~fault)
 

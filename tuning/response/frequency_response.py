@@ -114,7 +114,7 @@ def measure(
         target: The axes.
         loop: "velocity", in csv, or "position", in csp.
         where: Axes that are measured; all by default. The others get nan.
-        signal: What it is shaken with.
+        signal: The excitation.
         traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
         confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
         softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;

@@ -48,7 +48,7 @@ WIDEST = {
 # cannot tell it from the velocity filter, and both get lost.
 EXPECTED_DELAY = 50e-6
 # Share of what dead time may add to the winding's resistance that is expected, and its deviation: currents that swing
-# through zero seldom see all of it, and it is told from the lag of the velocity filter by this alone.
+# through zero seldom see all of it, and this alone distinguishes it from the lag of the velocity filter.
 EXPECTED_LOSS, LOSS_SPREAD = 0.5, 0.4
 LEVEL = 0.03  # by which a resonance may move with the strength of the shaking, unless noise explains more
 DISTORTED = 0.13  # share by which passes may differ beyond noise
@@ -175,7 +175,7 @@ def fit_plant(
 
 def _weight(seen: Complex, spread: Floats) -> Floats:
     size = np.abs(seen)
-    # In the valley of an anti-resonance what is not linear, small elsewhere, is all that is left.
+    # In the valley of an anti-resonance the non-linear part, small elsewhere, is all that is left.
     around = maximum_filter1d(size, NEIGHBOURS)
     return np.asarray(1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2))
 
@@ -247,7 +247,7 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
     passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
     plant, quiet = found.model.plant, spread <= np.median(spread)
     if plant.is_elastic:
-        # A pair that lies close together is told by the few lines about it; without these the fit takes any other one.
+        # Only the few lines about a pair that lies close together show it; without these the fit takes any other one.
         quiet |= (loop.f > plant.anti_resonance / ABOUT) & (loop.f < plant.resonance * ABOUT)
     fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
     return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - p))

@@ -72,7 +72,7 @@ class Pool(Protocol):
 
         Args:
             function: Of a module.
-            items: What it is called with.
+            items: Its arguments.
             say: Called with what is waited for, "" when the work goes on; from any thread.
             fits: Whether a result has the form of what is computed of an item; one from elsewhere that has not is
                 refused.
@@ -256,7 +256,7 @@ class _Dask:
 
     @contextmanager
     def _told_of_no_workers(self, say: Say) -> Iterator[None]:
-        """Say it if the last worker goes: the work waits for another one, for ever if need be."""
+        """Report if the last worker goes: the work waits for another one, for ever if need be."""
         ended = threading.Event()
 
         def watch() -> None:

@@ -206,7 +206,7 @@ def run(
     left = shards(experiment, threads, width=width, done=done)
     report("compiling", 0.0)
     if left:
-        # Of workers as well: they find the kernels compiled, and what there is to warn of is said once and here.
+        # Of workers as well: they find the kernels compiled, and warnings come once and here.
         _compile(experiment)
     started = time.perf_counter()
     with warnings.catch_warnings():

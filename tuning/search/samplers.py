@@ -84,7 +84,7 @@ def new_proposer(
         first: Points that are proposed before all others.
         generation: How many points are asked for at a time: the population of CMA-ES, if it is 4 or more.
         journal: File in which Optuna's studies are kept, and from which one that was broken off goes on.
-        study: What the journal calls the study, and what it is of: one of something else is refused.
+        study: The study's name in the journal, and its subject: a study of another subject is refused.
 
     Raises:
         ValueError: For an unknown sampler, one that has one objective only, or one that lacks a package.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEPT, STOPPED, FRAGILE, FRONT = "#0072b2", "#d55e00", "#cc79a7", "black"
-# What each objective is told as, less is better; the search itself knows the first three as logarithms.
+# The title of each objective, less is better; the search itself knows the first three as logarithms.
 TITLES = {COST: "J", "speed": "settles [ms]", "robustness": "worst J over J", "current": "ripple [%]"}
 MEANINGS = {
     COST: "J by measured terms",

@@ -59,7 +59,7 @@ class TunePanel:
         visitor: The page.
 
     Attributes:
-        device: What they are.
+        device: The drives' device.
     """
 
     def __init__(self, session: Session, visitor: Visitor) -> None:
@@ -79,7 +79,7 @@ class TunePanel:
 
     @property
     def motor(self) -> Any:
-        """The motor that is turned, as far as it is known."""
+        """The emulated machine's motor, else the one entered, else the usual one of the device."""
         made = self.session.glimpse(lambda machine: machine.drives.motor)
         return made or find_motor(self.desk.entries.motor or self.device.default_motor)
 

@@ -223,7 +223,7 @@ class EtherCatLink:
         self._alive()
         if self._lockstep or time.monotonic() - self.process.exchanged_at <= FACTORY / 3.0:
             return
-        # Who has the images may be waiting for this mailbox; the other of the two threads must not wait for them.
+        # The thread that has the images may be waiting for this mailbox; the other one must not wait for them.
         if self.process.turn.acquire(blocking=False):
             try:
                 self.process.exchange(is_cycle=False)
