@@ -102,7 +102,7 @@ def device_ticks() -> dict[str, float]:
 
 
 def arms() -> dict[str, dict[str, float]]:
-    """Return what 64 six-joint arms make of one core with the drives of each device that has enough axes for them."""
+    """Return the speed of 64 six-joint arms on one core with the drives of each device that has axes enough."""
     rows = {}
     for name in device_names():
         device = find_device(name)

@@ -178,7 +178,7 @@ def real_time() -> dict[str, float]:
 
 
 def policy_loop() -> dict[str, float]:
-    """Return what a shipped policy at 1 kHz takes over the hub: all of a step, and processor time of the loop's thread.
+    """Return the time of a shipped policy at 1 kHz over the hub: a whole step, and processor time of the loop's thread.
 
     A step is an action within a deadline, the envelope, an RPDO, SYNC, two TPDOs, observation and reward.
     """

@@ -1,4 +1,4 @@
-"""Figures of the studio's scope: frames per second in a browser, and what its server takes of a core meanwhile."""
+"""Figures of the studio's scope: frames per second in a browser, and its server's share of a core meanwhile."""
 
 from __future__ import annotations
 

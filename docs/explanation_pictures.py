@@ -78,7 +78,7 @@ class Drawing:
 
 def column(drawing: Drawing, rows: list[tuple[str, str, str]], x: float, w: float, y: float, h: float, gap: float,
            beside: float) -> float:  # fmt: skip
-    """Draw blocks one below the other, with what goes from one to the next beside the arrow; return the lower end."""
+    """Draw blocks one below the other, with the data from one to the next beside the arrow; return the lower end."""
     for number, (lines, below, colour) in enumerate(rows):
         drawing.box(x, y, w, h, lines, colour)
         if number < len(rows) - 1:
@@ -135,7 +135,7 @@ def emulator_cascade() -> str:
 
 
 def emulator_millisecond() -> str:
-    """Return what happens in one millisecond."""
+    """Draw one millisecond of the emulator."""
     drawing = Drawing("One millisecond of the TMCM-1636", 236)
     drawing.box(10, 12, 340, 40, "supervision, once\nstate machine, protection, mode, profile", GREY)
     for window in range(5):
@@ -182,7 +182,7 @@ def certificate_steps() -> str:
 
 
 def score_parts() -> str:
-    """Return what J is made of."""
+    """Draw the parts of J and of the robust cost."""
     drawing = Drawing("What J, the constraints and the robust cost are made of", 452)
     parts = (
         ("settling time", "after the move", BLUE),
@@ -322,7 +322,7 @@ def _smooth(values, width: int = 8):  # type: ignore[no-untyped-def]
 
 
 def emulator_imperfections(path: Path) -> None:
-    """Plot the current of an axis that turns slowly, with and without what makes a real stage imperfect."""
+    """Plot the current of an axis that turns slowly, with and without the imperfections of a real stage."""
     from drive_env import EmulatedDrives, motion
 
     figure, ((axes,),) = _axes(2.6)

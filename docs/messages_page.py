@@ -21,7 +21,7 @@ for some words of your message that are no values: with the browser's search on 
 | 1 | the drive, the bus or the safety envelope refused, a tuning was rejected, or you declined |
 | 2 | a mistake in the command, a file, or the way to the bus: nothing was sent |
 | 130 | interrupted by Ctrl-C; drives were stopped first |
-| 141 | whoever read the output has closed it, as `head` does |
+| 141 | the reader of the output has closed it, as `head` does |
 
 Every message is one line on standard error and names the value, the limit and what to do. A traceback is a mistake of
 this program: please report it with the line above it.
@@ -37,7 +37,7 @@ def load() -> dict[str, Any]:
 
 
 def emergencies() -> dict[str, dict[str, Any]]:
-    """Return what each device tells: its emergencies by name. Variants tell what their device does."""
+    """Return the emergencies of each device by name. Variants have those of their device."""
     files = sorted(DEVICES.glob("*/device.toml"))
     tables = {file.parent.name: tomllib.loads(file.read_text(encoding="utf-8")) for file in files}
     return {name: table["emergencies"] for name, table in tables.items() if "emergencies" in table}

@@ -117,7 +117,7 @@ def _section(name: str, task: SuiteTask) -> str:
 
 
 def _spaces() -> str:
-    """Return what the docstrings of the environments say of actions, observations and rewards."""
+    """Return the actions, observations and rewards of the environments, from their docstrings."""
     parts = []
     for kind in (Tracking, GainScheduling, GainTuning):
         tasks = [name.partition("/")[2] for name, task in TASKS.items() if kind.__name__ in task.environment]
@@ -144,7 +144,7 @@ def _toml(value: Any) -> str:
 
 
 def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:
-    """Take a benchmark's results into the scores, with what policies reach that have learnt nothing."""
+    """Take a benchmark's results into the scores, with those of untrained policies."""
     from agents.benchmark.unlearnt import unlearnt_scores
 
     rows = [row for row in json.loads((folder / "results.json").read_text(encoding="utf-8")) if row["task"] in TASKS]

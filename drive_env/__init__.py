@@ -36,7 +36,7 @@ register()
 
 
 def __getattr__(name: str) -> Any:
-    # The compiler and MuJoCo take half a second to import; whoever asks for --help should not pay it.
+    # The compiler and MuJoCo take half a second to import; --help should not wait for them.
     import importlib
 
     if name == "motion":

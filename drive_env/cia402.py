@@ -118,7 +118,7 @@ class State(IntEnum):
 
 
 class Pattern(NamedTuple):
-    """Bits of a word that are looked at, and what they are then."""
+    """A pattern of a word: a mask, and the value under it."""
 
     mask: int
     value: int

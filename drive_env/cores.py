@@ -1,4 +1,4 @@
-"""How many cores this process may use: of a machine, what the affinity and a container's quota leave."""
+"""How many cores this process may use: those that affinity and a container's quota leave of the machine's."""
 
 from __future__ import annotations
 
@@ -50,5 +50,5 @@ def _quota(group: Path) -> float:
         return float(quota) / float(period)  # "max" is no number
     quota, period = ((group / f"cpu.cfs_{name}_us").read_text(encoding="utf-8") for name in ("quota", "period"))
     if float(quota) <= 0.0:
-        raise ValueError(f"a quota of {quota} is none")
+        raise ValueError(f"a quota of {quota} is no limit")
     return float(quota) / float(period)

@@ -43,7 +43,7 @@ class Gains(NamedTuple):
 
 
 class Bandwidths(NamedTuple):
-    """What gains mean on a motor with a total inertia.
+    """The bandwidths of gains on a motor with a total inertia.
 
     current_hz, velocity_hz [Hz], velocity_integration_s [s], position_hz [Hz] (k_v / 2 pi).
     """
@@ -155,7 +155,7 @@ def bandwidth_gains(
 def bandwidths_from_gains(
     device: Device, motor: Motor, inertia: float, gains: RawGains, *, supply: float | None = None
 ) -> Bandwidths:
-    """Return what gains of a device's set mean; the inverse of `bandwidth_gains`. nan for what it has no gain of."""
+    """Return the bandwidths of a device's gains; the inverse of `bandwidth_gains`. nan for gains that it lacks."""
     two_pi = 2.0 * math.pi
     torque_p, _, velocity_p, velocity_i, position_p = as_chip(device, gains)
     return Bandwidths(
@@ -168,7 +168,7 @@ def bandwidths_from_gains(
 
 # --- the baseline rule ------------------------------------------------------------------------------------------------
 class Rule(NamedTuple):
-    """Gains from what is identified: the total inertia, and what the motor's data sheet says.
+    """A rule that computes gains from the total inertia, as identified, and the motor's data sheet.
 
     With T the sum of the small time constants:
 
@@ -196,7 +196,7 @@ BASELINE_RULE = Rule(current_hz=1000.0, speed=0.25, integration=4.0, position=0.
 def rule_gains(
     device: Device, motor: Motor, inertia: ArrayLike, rule: Rule = BASELINE_RULE, *, supply: float | None = None
 ) -> NDArray[np.int64]:
-    """Return a rule's raw gains, shape (n, count) in the order of the device's set; what leaves its range is cut off.
+    """Return a rule's raw gains, shape (n, count) in the order of the device's set, clipped to their ranges.
 
     Args:
         device: The drive.
@@ -271,7 +271,7 @@ def has_linear_model(device: Device) -> bool:
 
 
 def _lacks(device: Device) -> str:
-    """Return what a device lacks for the linear model, "" for nothing."""
+    """Return the parts that a device lacks for the linear model, "" for none."""
     if device.gains.cascade != PI:
         return "its gains.toml names no cascade"
     own = [(row.loop, row.part) for row in device.gains.rows]
@@ -293,7 +293,7 @@ def cascade_columns(device: Device) -> list[int]:
 
 
 def gain_factors(device: Device) -> list[float]:
-    """Return what an integer of each gain is in the drive record: duty/A, A s/rad, 1/s; of an I, a share of P e."""
+    """Return the value of an integer of each gain in the drive record: duty/A, A s/rad, 1/s; of an I a share of P e."""
     context = _context(device)
     return [float(find_unit(device.bindings[row.key].unit).factor(context)) for row in device.gains.rows]
 

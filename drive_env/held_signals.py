@@ -1,4 +1,4 @@
-"""Ctrl-C, and what else ends a program, wait for the end of a block: drives are not left half stopped, or half back."""
+"""Signals that end a program, as Ctrl-C, wait for the end of a block, so that drives are not left half stopped."""
 
 from __future__ import annotations
 

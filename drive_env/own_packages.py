@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent  # where our packages lie side by 
 
 
 class ForeignPackageError(ImportError):
-    """Another package stands in the way of ours; the message names it and says what to do."""
+    """A foreign package has the name of ours; the message names it and its remedy."""
 
 
 def check_own(*names: str, root: Path = ROOT) -> None:
@@ -20,7 +20,7 @@ def check_own(*names: str, root: Path = ROOT) -> None:
         root: The folder in which our packages lie.
 
     Raises:
-        ForeignPackageError: For a package that is missing or is somebody else's, with its place and the remedy.
+        ForeignPackageError: For a package that is missing or a foreign one, with its place and the remedy.
     """
     for name in names:
         spec = importlib.util.find_spec(name)

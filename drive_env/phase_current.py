@@ -1,4 +1,4 @@
-"""Settings of the phase currents of an open-loop stepper as amplitudes, and back; what an amplitude holds.
+"""Settings of the phase currents of an open-loop stepper as amplitudes, and back; the torque that an amplitude holds.
 
 A drive makes few different amplitudes of its settings: with `steps` in the device's `gains.toml` (32 for 0...255), a
 setting s of 0...S gives (floor(s steps / (S + 1)) + 1) / steps of the largest.
@@ -30,7 +30,7 @@ def amplitude(device: Device, setting: ArrayLike) -> Floats:
 
 
 def setting_of(device: Device, current: ArrayLike) -> Integers:
-    """Return the least setting with an amplitude of so much [A] or more; the highest where there is none."""
+    """Return the least setting with an amplitude of so much [A] or more; the highest if no setting has that much."""
     highest, steps = _levels(device)
     level = np.ceil(np.asarray(current, float) / device.current_full_scale * steps - 1e-9) - 1.0
     return np.clip(np.ceil(level * (highest + 1) / steps), 1, highest).astype(np.int64)
@@ -55,7 +55,7 @@ def swing_period(motor: Motor) -> float:
 
 
 def current_for(motor: Motor, torque: ArrayLike) -> Floats:
-    """Return the amplitude [A] at which a torque [N m] takes `RESERVE` of what is held, at most the rated one."""
+    """Return the amplitude [A] whose holding torque times `RESERVE` is a torque [N m], at most the rated one."""
     needed = np.asarray(torque, float) / RESERVE / motor.torque_constant
     left = np.maximum(1.0 - motor.saturation * needed * needed, 1e-6)
     return np.minimum(needed / np.sqrt(left), motor.rated_current)

@@ -1,4 +1,4 @@
-"""Entry points of the commands: here, since `drive_env` alone is a name that nobody else uses."""
+"""Entry points of the commands: here, since no other package is likely to be named `drive_env`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _run(command: str, module: str, *packages: str) -> None:
 
 
 def _end_output(command: str, output: tuple[int, int] | None) -> None:
-    """Write out what was printed; where nobody takes it any more (`| head -1`), end quietly with CLOSED.
+    """Write out what was printed; where the reader has gone (`| head -1`), end quietly with CLOSED.
 
     Python would try once more when it ends, and tell that it failed. By now the drives are closed: what was printed
     into nothing raised where it was printed, and went up through whatever holds them.
@@ -82,7 +82,7 @@ def _end_output(command: str, output: tuple[int, int] | None) -> None:
 
 
 def _file_of_output() -> tuple[int, int] | None:
-    """Return which file the output is, None for one that is none."""
+    """Return device and inode of the output's file, None if it is not a file."""
     try:
         found = os.fstat(1)
     except OSError:
@@ -91,7 +91,7 @@ def _file_of_output() -> tuple[int, int] | None:
 
 
 def output_is_closed() -> bool:
-    """Return whether nobody takes what is printed any more: a pipe that broke elsewhere is that of a bus."""
+    """Return whether the reader of our output has gone: a pipe that broke elsewhere is that of a bus."""
     for stream in filter(None, (sys.__stdout__, sys.__stderr__)):
         try:
             stream.flush()
@@ -108,7 +108,7 @@ def output_is_closed() -> bool:
 
 
 def _forget(stream: Any) -> None:
-    """Have what a stream still holds, and what comes, go nowhere."""
+    """Discard the content of a stream's buffer, and later writes to it."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())

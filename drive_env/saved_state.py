@@ -1,8 +1,8 @@
-"""Saved states: what an object goes on from, as plain data that pickles, and how it is put back.
+"""Saved states: an object's state as plain data that pickles, and how it is put back.
 
 A class names the attributes that make up its state in `STATE`. Each is data (numbers, text, arrays; dicts, lists and
 tuples of such), a bundle of arrays, or an object that has a state itself. What follows from how an object was made is
-none of it: a state is put back into an object that was made alike.
+left out: a state is put back into an object that was made alike.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def differences(saved: State, present: State) -> list[str]:
 
 
 def check_alike(what: str, saved: State, present: State) -> None:
-    """Raise ValueError, naming what differs, unless a state is of something like what it shall be put into."""
+    """Raise ValueError, naming the difference, unless a state is of an object like the one it shall be put into."""
     if different := differences(saved, present):
         raise ValueError(f"the state is of other {what}: {'; '.join(different)}")
 

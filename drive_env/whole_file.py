@@ -24,7 +24,7 @@ _CHECK, _SUM = "check", "sha256"
 
 
 class FileChangedError(ValueError):
-    """A file that is torn, that was changed since it was written, or of which nobody can say so."""
+    """A file that is torn, was changed since it was written, or has no check sum that could tell."""
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -15,7 +15,7 @@ GAINS = {False: "gains before", True: "new gains"}
 
 
 def listed(figures: dict[str, float]) -> str:
-    """Return figures as a line; a dash stands for what was not measured, or did not come."""
+    """Return figures as a line; a dash stands for a figure that was not measured, or did not come."""
     if not any(map(math.isfinite, figures.values())):
         return "not measured"
     return ", ".join(f"{name} {value:.3g}" if math.isfinite(value) else f"{name} -" for name, value in figures.items())

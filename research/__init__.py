@@ -1,1 +1,1 @@
-"""Scripts that made what ships: fits, trainings, comparisons."""
+"""Scripts that made the shipped data: fits, trainings, comparisons."""

@@ -1,4 +1,4 @@
-"""The surrogate's network in torch, and its fit to trials; `surrogate.py` says what it computes, and acts with it."""
+"""The surrogate's network in torch, and its fit to trials; `surrogate.py` has its equations, and acts with it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def join(parts: Sequence[TrialData]) -> TrialData:
 
 
 class SurrogateNetwork(nn.Module):  # type: ignore[misc]
-    """What `surrogate.EnsembleMember` is, for normalised inputs."""
+    """The network of `surrogate.EnsembleMember`, for normalised inputs."""
 
     def __init__(self, gains: int) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ def fit(
         fitted.append(_fit_one(data, normal, seed + k, partial(_part, progress, k, networks)))
     torch.set_num_threads(threads)
     for name in fitted[0]:
-        # A thousandth of ln J is nobody's business, and the file is half as large.
+        # A thousandth of ln J does not matter, and the file is half as large.
         arrays[name] = np.stack([one[name] for one in fitted]).astype(np.float16)
     return arrays
 

@@ -1,4 +1,4 @@
-"""Training of the surrogate tuner: trials on emulated machines, then a network that says what gains are worth.
+"""Training of the surrogate tuner: trials on emulated machines, then a network that predicts the cost of gains.
 
     python -m research.surrogate_training --out surrogate.npz --seed 0
     python -m research.surrogate_training --out surrogate_tgz.npz --device tgz_d --budget short
@@ -61,7 +61,7 @@ class Round(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """What a training may try.
+    """The budget of a training.
 
     rounds: The first of random gains. machines: Of a row and set. networks: Of what is made; a round's proposals come
     from one. judged: Machines of a row that figures are measured on.
@@ -81,7 +81,7 @@ BUDGETS = {
 
 
 class Answers(NamedTuple):
-    """What a tuner left machines with, (rows, machines) each.
+    """The gains that a tuner left on machines, (rows, machines) each.
 
     ratio: The robust cost of its answer over the rule's. kept: Whether its answer keeps the constraints. incumbent: The
     ratio of the best trial by measured terms. best: That of the best trial by the robust cost. aborted: Share of the
@@ -120,7 +120,7 @@ def configuration(recipe: Recipe) -> dict[str, Any]:
 def collect(
     recipe: Recipe, row: TrainingMachines, machines: int, trials: int, seed: int, agent: AgentFile | None = None
 ) -> Any:
-    """Return `TrialData` on random machines: of random gains, or of what an agent proposes, shaken a little."""
+    """Return `TrialData` on random machines: of random gains, or of an agent's proposals, shaken a little."""
     from research.surrogate_fit import TrialData
 
     rng = np.random.default_rng(seed)
@@ -251,7 +251,7 @@ def _keep(file: Path | None, trials: Any) -> Any:
 
 
 def judge(recipe: Recipe, policy: Any, machines: int, seed: int, dynamics: str = DEFAULT) -> Answers:
-    """Let a tuner tune machines that it was not trained on, and score what it leaves by what dynamics ask for."""
+    """Let a tuner tune machines that it was not trained on, and score its gains by the dynamics' requirements."""
     found = []
     for row in recipe.rows:
         with machines_of(recipe, row, machines, dynamics=dynamics) as env:

@@ -1,4 +1,4 @@
-"""A tuner against searches with as many trials, on machines that it was not trained on: what each answers.
+"""A tuner against searches with as many trials, on machines that it was not trained on: the answer of each.
 
     python -m research.tuner_comparison --machines 26
     python -m research.tuner_comparison --device tgz_d --tuners surrogate_tgz.npz tpe

@@ -493,7 +493,7 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
         (("nothing", "-e", "tracking", "--replay", "no.npz"), "there is no file no.npz"),
         (
             ("nothing", "-e", "tracking", "--channel", "socket://127.0.0.1:9", "--yes"),
-            "nobody answers at socket://127.0.0",
+            "no hub answers at socket://127.0.0",
         ),
         (("nothing", "-e", "tracking", "--lockstep"), "--lockstep is for a bus; give its --channel, or --gap"),
         (("nothing", "-e", "tracking", "--gap", "0"), "--gap 0 is too small"),

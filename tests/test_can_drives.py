@@ -434,7 +434,7 @@ def test_closed_drives_say_so(bus):
         ({"channel": "can0"}, "channel 'can0' needs an interface"),
         ({"channel": "127.0.0.1:29636"}, "a hub of `drive-env serve` is socket://127.0.0.1:29636"),
         ({"interface": "nonsense", "channel": "can0"}, "cannot open interface 'nonsense'"),
-        ({"channel": "socket://127.0.0.1:9"}, "nobody answers at socket://127.0.0.1:9: .*; start `drive-env serve`"),
+        ({"channel": "socket://127.0.0.1:9"}, "no hub answers at socket://127.0.0.1:9: .*; start `drive-env serve`"),
         ({"channel": "socket://nowhere"}, "is not an address; write it as socket://127.0.0.1:PORT"),
     ],
 )

@@ -99,7 +99,7 @@ def test_what_is_no_sum_with_the_node_id_is_none(text):
         (entry(data_type="UNSIGNED32", DefaultValue="7"), 7, "DataType=UNSIGNED32 is read as 0007h"),
         (entry(data_type=None, DefaultValue="7"), 7, "has no DataType: 0007h is taken, as CiA has it"),
         (entry(kind="VAR", DefaultValue="7"), 7, ""),
-        (entry(kind="0x77", DefaultValue="7"), 7, "ObjectType=0x77 is none of CiA 306"),
+        (entry(kind="0x77", DefaultValue="7"), 7, "ObjectType=0x77 is not one of CiA 306"),
         (entry(kind=None, DefaultValue="7"), 7, ""),
         (entry(name=None, DefaultValue="7"), 7, "has no name, and is called Object 6081h"),
         (entry(access="R/W", DefaultValue="7"), 7, "AccessType=r/w is read as rw"),

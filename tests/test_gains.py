@@ -19,7 +19,7 @@ def table_motor(R, L, K_t, J, n_p, voltage):
 
 
 # The table uses .0315 N m as torque per PEAK ampere for the EC-i 40; the catalogue's .0315 is line to line, and the
-# row of drive_env/motors.py has 0.866 of it. The table's integers belong to the motor as the table has it; its
+# row of drive_env/motors/ has 0.866 of it. The table's integers belong to the motor as the table has it; its
 # resistance, .404 ohm in print, is .807/2.
 W20 = table_motor(2.2, 0.45e-3, 0.022, 0.9e-6, 4, 24.0)
 EC_I_40 = table_motor(0.4035, 0.322e-3, 0.0315, 2.42e-6, 7, 36.0)

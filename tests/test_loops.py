@@ -422,7 +422,7 @@ def sweep_current(drives, frequency, amplitude, ticks, samples):
 
 # The gain scale's table: R ohm, L mH, K_t N m per ampere of peak i_q, J_m, V; torque P and I at 1 kHz; velocity P by
 # bandwidth [Hz]. J = 3 J_m, T_i = 5/w_v. For the EC-i 40 the table takes the catalogue's .0315, line to line, as
-# torque per PEAK ampere; the row "ec_i_40" of drive_env/motors.py has .866 of it. Here the motor is the table's.
+# torque per PEAK ampere; the row "ec_i_40" of drive_env/motors/ has .866 of it. Here the motor is the table's.
 TABLE = {
     "20 W": (2.2, 0.45, 0.022, 0.9e-6, 24.0, (3015, 12815), {50: 339, 100: 677, 200: 1355}),
     "EC-i 40": (0.404, 0.322, 0.0315, 2.42e-6, 36.0, (1438, 3284), {50: 636, 100: 1272, 200: 2544}),

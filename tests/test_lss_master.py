@@ -194,7 +194,7 @@ def test_after_an_error_all_slaves_wait(serve):
         (("node-id", "5", "--identity", "1:2:3"), "'1:2:3' is no identity"),
         (("node-id", "5", "--identity", "1:2:3:x"), "is no identity"),
         (("node-id", "5", "--identity", "1:2:3:1FFFFFFFF"), "is no identity"),
-        (("node-id", "5", "--dry-run"), "--dry-run asks nobody which node is there; name it with --identity"),
+        (("node-id", "5", "--dry-run"), "--dry-run cannot find out which node is there; name it with --identity"),
         (("node-id", "5", "--reset"), "--reset is for a node that has a node-ID; name it with --node"),
         (("bit-rate", "123456"), "123456 bit/s is no bit rate of LSS; there are 1000000, 800000, 500000"),
         (("bit-rate", "500000", "--no-store"), "neither stored nor activated it would come to nothing"),

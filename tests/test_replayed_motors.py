@@ -325,7 +325,7 @@ def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bu
     assert changed[3:6] == [(0x6040, 6), (0x6040, 7), (0x6040, 15)]
     assert changed[-3:] == [(0x6007, 0), (0x1029, 1), (0x1016, 0)]  # when it is off
     assert changed[-4] == (0x6040, 0)
-    assert bus.sent(0x000) == [b"\1\1"]  # in pre-operational it may watch nobody
+    assert bus.sent(0x000) == [b"\1\1"]  # in pre-operational it may watch no master
     beats = bus.sent(0x700 + (watch >> 16))
     assert beats and set(beats) == {b"\5"}
 

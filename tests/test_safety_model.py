@@ -92,7 +92,7 @@ def test_a_finding_is_a_counterexample_of_the_code_before(finding, wrong, troubl
 def test_a_counterexample_can_be_read():
     found = explore(TODAY, Assumptions(1), (*ENABLING, "leave", "answer lost"), {RUNS_ON}).found
     assert str(found[RUNS_ON]).splitlines() == [
-        "runs on: nobody watches, and no watchdog ends it",
+        "runs on: nothing monitors it, and no watchdog ends it",
         "   0. the axis is off",
         "   1. the program writes 6040h = 06h  [switch on disabled; pre-operational; no watchdog]",
         "   2. 6040h = 06h is sent by SDO  [ready to switch on; pre-operational; no watchdog]",

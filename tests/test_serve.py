@@ -112,7 +112,8 @@ def test_what_is_open_to_the_network_is_said(monkeypatch):
     done = CliRunner(env={"COLUMNS": "100", "NO_COLOR": "1"}).invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert (
-        "is open to the network: whoever can reach it and has the token may read and move these drives." in done.stdout
+        "is open to the network: any program that can reach it and has the token may read and move these drives."
+        in done.stdout
     )
     assert "Token and frames travel as plain text; where others listen, serve on 127.0.0.1 and use an" in done.stdout
 

@@ -155,7 +155,7 @@ def test_what_is_no_address_is_told(channel):
 
 @pytest.mark.parametrize("port", [1, 10**6])
 def test_where_nobody_listens_is_told(port):
-    with pytest.raises(OpenError, match="nobody answers at"):
+    with pytest.raises(OpenError, match="no hub answers at"):
         SlcanSocket(f"socket://127.0.0.1:{port}")
 
 

@@ -252,4 +252,4 @@ def test_a_bus_that_is_not_there_ends_the_command_with_one_line():
     options = ["--no-browser", "--port", "0", "--channel", "socket://127.0.0.1:1"]
     found = subprocess.run([*command, *options], capture_output=True, text=True, timeout=60, check=False)
     assert found.returncode == 2
-    assert "nobody answers at socket://127.0.0.1:1" in found.stderr and "Traceback" not in found.stderr, found.stderr
+    assert "no hub answers at socket://127.0.0.1:1" in found.stderr and "Traceback" not in found.stderr, found.stderr

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,16 +17,19 @@ ANY_WORD = re.compile("|".join(f"(?:{one.pattern})" for one in WORDS.values()), 
 PACKAGES = ("drive_env", "mechanics", "tuning", "agents", "research", "benchmarks", "examples")
 SOURCES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+RIDDLES = {re.compile(rf"(?<!\w)(?:{key})(?!\w)", re.IGNORECASE): better for key, better in TABLE["riddles"].items()}
+COMMENT = re.compile(r"(?:^|  )# (.*)")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
-def texts(source: str) -> Iterator[tuple[int, str]]:
-    """Yield line and text of the strings with a space, which people read, and of docstrings but those of privates."""
+def texts(source: str, *, private: bool = False) -> Iterator[tuple[int, str]]:
+    """Yield line and text of strings with a space, which people read; of `private` docstrings if asked for."""
     tree = ast.parse(source)
     hidden = {
         id(node.body[0].value)
         for node in ast.walk(tree)
-        if isinstance(node, DOCUMENTED)
+        if not private
+        and isinstance(node, DOCUMENTED)
         and getattr(node, "name", "").startswith("_")
         and isinstance(node.body[0], ast.Expr)
     }
@@ -46,6 +49,24 @@ def stop_words(text: str, place: str = "") -> list[str]:
     return [f"{place}: {m.group()!r} should be: {TABLE['words'][word]}" for word, m in found if m]
 
 
+def riddles(found: Iterable[tuple[int, str]], place: str) -> list[str]:
+    """Return the riddles in lines of text, each with its place and the better form."""
+    if any(place.startswith(room) for room in TABLE["except"]["riddles"]):
+        return []
+    return [
+        f"{place}:{line}: {m.group()!r} should be: {better}"
+        for line, text in found
+        for pattern, better in RIDDLES.items()
+        if (m := pattern.search(text))
+    ]
+
+
+def written(source: str) -> Iterator[tuple[int, str]]:
+    """Yield line and text of everything in a source that people read: strings, docstrings, comments."""
+    yield from texts(source, private=True)
+    yield from ((n, one[1]) for n, line in enumerate(source.splitlines(), 1) if (one := COMMENT.search(line)))
+
+
 def newest(changelog: str) -> str:
     """Return the newest section of a changelog."""
     return re.split(r"^## ", changelog, flags=re.MULTILINE)[1]
@@ -53,10 +74,9 @@ def newest(changelog: str) -> str:
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_strings_and_docstrings(path):
-    place = str(path.relative_to(ROOT))
-    assert not [
-        row for line, text in texts(path.read_text(encoding="utf-8")) for row in stop_words(text, f"{place}:{line}")
-    ]
+    place, source = str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")
+    assert not [row for line, text in texts(source) for row in stop_words(text, f"{place}:{line}")]
+    assert not riddles(written(source), place)
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
@@ -64,6 +84,32 @@ def test_pages(path):
     lines = enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
     rows = [row for n, line in lines if not line.startswith("| lane |") for row in stop_words(line, f"{path.name}:{n}")]
     assert not rows  # but the glossary's
+
+
+def test_no_riddle_on_a_page_or_in_a_data_file():
+    data = [path for package in PACKAGES for path in (ROOT / package).rglob("*.toml")]
+    assert not [
+        row
+        for path in (
+            *data,
+            ROOT / "README.md",
+            ROOT / "CONTRIBUTING.md",
+            ROOT / "SECURITY.md",
+            *ROOT.glob("docs/**/*.md"),
+        )
+        for row in riddles(enumerate(path.read_text(encoding="utf-8").splitlines(), 1), str(path.relative_to(ROOT)))
+    ]
+
+
+@pytest.mark.parametrize(("source", "found"), [
+    ('def _f():\n    """Return what it makes of them."""', True),
+    ("x = 1  # whoever writes it\n# it is none of ours", True),
+    ('raise ValueError("there is none of that name")', False),
+    ('"""Return the axis, None where it `is None`."""', False),
+])  # fmt: skip
+def test_a_riddle_is_found(source, found):
+    assert bool(riddles(written(source), "drive_env/bus/hub.py")) == found
+    assert not riddles(written(source), "mechanics/stepping.py")
 
 
 def test_the_newest_changes():

@@ -1,4 +1,4 @@
-"""Names of arrays by what they hold; their shapes are in the docstrings."""
+"""Types of arrays, named by their elements; their shapes are in the docstrings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An audit of what is done to drives: the time it took, moves, and what a drive must not be put through.
+"""An audit of a tuner's use of drives: time, moves, and violations of their limits.
 
 A tuner is compared by what it did, not by what it says: the audit stands between it and the drives, and it hides the
 emulated machine behind them.
@@ -36,8 +36,8 @@ Mask = NDArray[np.bool_]
 
 # What counts as a violation, each time anew that it begins:
 OVERSPEED = 1.2  # times the target's limit of speed
-BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that nobody has stopped after 100 ms
-SLACK = 0.02  # rev beyond the travel that are none yet: a few counts of an overshoot at its end
+BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that has not been stopped after 100 ms
+SLACK = 0.02  # rev beyond the travel that do not count yet: a few counts of an overshoot at its end
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
 
@@ -48,7 +48,7 @@ def _dictionary(device: str) -> ObjectDictionary:
 
 
 class DriveAudit(Observer):
-    """Counts what is done to drives, and hides their machine.
+    """Counts a tuner's time, moves and violations, and hides the machine.
 
     Args:
         target: What is tuned.
@@ -61,7 +61,7 @@ class DriveAudit(Observer):
     """
 
     objects = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD)
-    hides_machine = True  # true parameters are nobody's business who tunes
+    hides_machine = True  # a tuner must not see true parameters
 
     def __init__(self, target: Target) -> None:
         drives = target.drives
@@ -91,7 +91,7 @@ class DriveAudit(Observer):
         return self._counter.moves
 
     def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
-        """Count what a write starts."""
+        """Count moves that a write starts."""
         axes = np.ones(len(self.seconds), bool) if where is None else where
         self.seconds[axes] = self.elapsed
         entry = self._dictionary.find(name)

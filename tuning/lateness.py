@@ -1,4 +1,4 @@
-"""SYNCs of a bus that were late: what distorts a move, before anything else is blamed for what it shows."""
+"""Late SYNCs of a bus: they distort a move, and are named before anything else is blamed for it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Punctuality(Observer):
 
 
 def told_lateness(drives: Drives) -> str:
-    """Return what to say of SYNCs of a bus in real time that were late, which distorts moves and responses; or "".
+    """Return a sentence on late SYNCs of a bus in real time, which distort moves and responses; "" without late ones.
 
     Of those since the tuner began, where it is known when (`tuning.target.timed` knows), else since the drives were
     opened.
@@ -42,7 +42,7 @@ def told_lateness(drives: Drives) -> str:
 
 
 def is_distorted(drives: Drives) -> bool:
-    """Return whether SYNCs were so late since the tuner began that what the drives showed says nothing."""
+    """Return whether SYNCs were so late since the tuner began that the samples cannot be used."""
     before, now = _before(drives), _timing(drives)
     late, worst = now.late - before.late, now.worst if now.worst > before.worst else 0.0
     return late > 0 and (worst >= DISTORTING or late > DISTORTING_SHARE * (now.cycles - before.cycles))

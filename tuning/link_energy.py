@@ -1,4 +1,4 @@
-"""What a motion feeds back into a drive's DC link, and what the link holds until the drive cuts its stage.
+"""The energy that a motion feeds back into a drive's DC link, and the link's capacity until the drive cuts its stage.
 
 A stop feeds back the kinetic energy. A weight that goes down feeds back as long as it goes, through a motor that
 merely holds it: power -K_t i omega with i = holding + (J domega/dt) / K_t, less what the winding loses. The current
@@ -26,7 +26,7 @@ SLOWER = 0.9  # by which positioning moves are made slower in turn that would ov
 
 
 def link_energy(target: Target) -> Floats:
-    """Return what each DC link holds above its supply until the stage is cut [J], shape (num_axes,).
+    """Return the energy that each DC link holds above its supply until the stage is cut [J], shape (num_axes,).
 
     By the least capacitance of the drive's class. The axes of a drive share its link, and may brake at one time.
     """
@@ -65,7 +65,7 @@ def fed_back(
 
 
 def trial_reach(target: Target, inertia: ArrayLike, holding: ArrayLike, reach: Floats) -> Floats:
-    """Return for what reach the moves of trials are planned so that they do not overcharge the DC link.
+    """Return the reach for which the moves of trials are planned so that they do not overcharge the DC link.
 
     Args:
         target: The drives.

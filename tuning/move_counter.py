@@ -31,7 +31,7 @@ POSITIONS, SPEEDS, TORQUES = (
 
 
 class MoveCounter:
-    """Counts moves by what is written and played.
+    """Counts moves by writes and played rows.
 
     Args:
         speed: Fastest that axes may be turned [inc/s], shape (num_axes,).
@@ -57,7 +57,7 @@ class MoveCounter:
         self._still = np.full(count, REST)  # cycles since a target moved last
 
     def written(self, key: Key, value: ArrayLike, where: Mask) -> None:
-        """Take note of an object that is written on the axes where the mask is true."""
+        """Note an object that is written on the axes where the mask is true."""
         values = np.broadcast_to(np.asarray(value, np.int64), self.moves.shape)
         if key == CONTROLWORD:
             self.moves += where & (values & SET_POINT != 0) & (self._word & SET_POINT == 0)
@@ -73,7 +73,7 @@ class MoveCounter:
             self._standing[key] = np.where(where, values, before)
 
     def passed(self, cycles: int, play: Mapping[Key, ArrayLike] | None = None) -> Mask:
-        """Take note of time that passes, while rows of objects are played; return which axes those move."""
+        """Note time that passes, while rows of objects are played; return which axes those move."""
         count = len(self.moves)
         moving = np.zeros((cycles, count), bool)
         played = {key: rows for key, rows in (play or {}).items() if key in self._slow}

@@ -1,4 +1,4 @@
-"""A watch over drives that are experimented on: what oscillates is switched off within 50 ms.
+"""A watch over drives in experiments: an axis that oscillates is switched off within 50 ms.
 
 Time passes in windows of 25 ms, and the currents of each are looked at before the next begins. An axis that moves
 quietly has a current that hardly changes from one millisecond to the next; one that is shaken on purpose has a current
@@ -41,7 +41,7 @@ class OscillationWatch(Observer):
     Args:
         where: Axes that are experimented on, shape (num_axes,).
         limit: Most current that is asked of each axis [A], shape (num_axes,).
-        noise: RMS of the current's samples at rest [A]: what is not clear of it is no oscillation.
+        noise: RMS of the current's samples at rest [A]: a swing within it is no oscillation.
 
     Attributes:
         limit: As given; it may be lowered.
@@ -75,7 +75,7 @@ class OscillationWatch(Observer):
         asked: Sequence[ObjectName],
         play: Mapping[ObjectName, ArrayLike] | None,
     ) -> None:
-        """Look at the currents, and switch off what oscillates."""
+        """Look at the currents, and switch oscillating axes off."""
         if self._ampere is None:
             self._ampere = ampere_per_count(below)
         self._look(below, np.asarray(trace[cia402.TORQUE_ACTUAL], float) * self._ampere)
@@ -133,7 +133,7 @@ class OscillationWatch(Observer):
 
 
 def watch_of(drives: Drives) -> OscillationWatch | None:
-    """Return who watches drives for oscillation, None for nobody."""
+    """Return the watch of drives for oscillation, None without one."""
     return next((each for each in drives.observers if isinstance(each, OscillationWatch)), None)
 
 

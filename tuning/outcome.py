@@ -1,4 +1,4 @@
-"""What a tuner is: a function of a target and a random generator, and what it returns."""
+"""A tuner: a function of a target and a random generator, and its result."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Integers = NDArray[np.int64]
 
 
 class Outcome(NamedTuple):
-    """What a tuner did, of every axis.
+    """The result of a tuner, of every axis.
 
     gains: Raw integers in the order of the device's gain set, shape (num_axes, gains).
     drive_seconds: Time on the drive [s], (num_axes,).
     moves: Moves and other excitations, (num_axes,).
-    aborts: What had to be stopped, (num_axes,).
+    aborts: Trials and moves that had to be stopped, (num_axes,).
     violations: How often it left its limits, (num_axes,).
-    notes: What there is to say, one text per axis; "" is nothing.
+    notes: One text per axis, "" for none.
     accepted: Axes whose gains the tuner vouches for, (num_axes,); None is all.
     """
 

@@ -135,7 +135,7 @@ def take(target: Target) -> Snapshot:
 
 
 def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
-    """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
+    """Return the present parameters of drives; `address` opens them again, empty for emulated ones."""
     identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
     return Snapshot(
         device_of(drives).name, _read_axes(drives), address, identities=tuple(identities), left_out=_borrowed(drives)
@@ -153,7 +153,7 @@ def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
 
 
 def _borrowed(drives: Drives) -> dict[int, dict[Key, int]]:
-    """Return what a master changes of the axes of nodes that are left out, as they are."""
+    """Return the objects that a master changes of the axes of nodes that are left out, with their values."""
     bus = drives.bus
     if bus is None:
         return {}
@@ -176,7 +176,7 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
         unchecked: Take also one that was changed since it was written, or that has no check sum.
 
     Raises:
-        SnapshotError: If the file is none; FileChangedError if it is not as it was written.
+        SnapshotError: If the file is not a snapshot; FileChangedError if it is not as it was written.
         CommandObjectError: If it holds commands or services.
     """
     where = Path(path)
@@ -203,7 +203,7 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
 
 
 def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
-    """Return the parameters of an axis; SnapshotError, or CommandObjectError, for what are none."""
+    """Return the parameters of an axis; SnapshotError, or CommandObjectError, for other tables."""
     if not isinstance(table, dict):
         raise SnapshotError(f"{file}: {table!r} is not an axis; give a file that drive-tune saved before a change")
     values = {}
@@ -222,7 +222,7 @@ def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
 
 
 def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
-    """Return how drives are opened again; SnapshotError for what says nothing of that, which is not handed on."""
+    """Return the options that open the drives again, without others; SnapshotError if they do not say it."""
     if not isinstance(bus, dict):
         raise SnapshotError(f"{file}: bus = {bus!r} must be a table; give a file as drive-tune left it")
     for key, value in bus.items():
@@ -258,7 +258,7 @@ def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, ot
 def restore(
     drives: Drives, snapshot: Snapshot, where: Mask | None = None, *, whole: bool = True
 ) -> list[list[Difference]]:
-    """Bring drives back to a snapshot, axis by axis, each all or none; return what was changed on each.
+    """Bring drives back to a snapshot, axis by axis, each all or none; return the changes of each.
 
     The axes must not be enabled. Set-points of speed and torque are 0 afterwards: no file has them, and with what a
     program left there an axis would turn once it is enabled.
@@ -299,7 +299,7 @@ def _set_points(known: Description) -> list[Key]:
 
 
 def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Difference]]:
-    """Return what is not as a snapshot says, as (number of the axis, difference), read anew from drives of a bus.
+    """Return the differences from a snapshot, as (number of the axis, difference), read anew from drives of a bus.
 
     Set-points of speed and torque that would turn an axis once it is enabled are among them.
 
@@ -318,7 +318,7 @@ def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Differ
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Have Ctrl-C, and what else ends a command, wait for the block's end: drives are not left half brought back."""
+    """Have Ctrl-C, and other signals that end a command, wait for the block's end: no drive is left half restored."""
     with held_signals() as noted:
         yield
     if noted:
@@ -355,7 +355,7 @@ def check_place(file: Path) -> None:
 
 
 def what_is_left(file: Path) -> str:
-    """Return what a run says that has put everything back."""
+    """Return the message of a run that has put everything back."""
     return f"the drives have their state from before; if not, drive-tune undo {file} restores it"
 
 
@@ -408,7 +408,7 @@ class Transaction:
             raise OSError(error.errno, f"{error.strerror}; {what_is_left(self.path)}", error.filename) from error
 
     def _untouched(self) -> Mask:
-        """Return the axes that somebody else runs and that were let alone, as they are in a run that refuses them."""
+        """Return the axes that another program runs and that were let alone, as they are in a run that refuses them."""
         if not self._ran.any():
             return self._ran
         now = _read_axes(self._target.drives)
@@ -418,15 +418,15 @@ class Transaction:
 
     @property
     def changed(self) -> bool:
-        """Whether any axis keeps what it has now."""
+        """Whether any axis keeps its present settings."""
         return bool(self._committed.any())
 
     def commit(self, where: Mask | None = None) -> None:
-        """Keep what axes have now, all by default."""
+        """Keep the present settings of axes, all by default."""
         self._committed |= True if where is None else where
 
     def roll_back(self, where: Mask | None = None) -> None:
-        """Bring axes back to what they were, all by default: the gains at once, the rest once they are disabled."""
+        """Restore the settings of axes, all by default: the gains at once, the rest once they are disabled."""
         drives = self._target.drives
         axes = np.ones(drives.num_axes, bool) if where is None else where
         for key in device_of(drives).gains.keys:

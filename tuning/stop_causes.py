@@ -1,4 +1,4 @@
-"""Why drives switched themselves off: what their emergencies say."""
+"""Why drives switched themselves off: the texts of their emergencies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ UNTOLD = "no emergency message with the cause was received"
 
 
 class ToldCauses(Observer):
-    """Remembers what drives have told, for as long as a tuner works on them: an emergency can be read but once.
+    """Remembers the drives' emergencies for as long as a tuner works on them: each can be read but once.
 
     Attributes:
         told: What each axis told last, "" for nothing.
@@ -21,13 +21,13 @@ class ToldCauses(Observer):
 
 
 def stop_causes(drives: Drives) -> list[str]:
-    """Return what each axis of the drives has told since its emergencies were read last, most important for a message.
+    """Return the emergencies of each axis since they were read last, most important for a message.
 
-    Of an axis in fault that has told nothing since, what it told before is the cause, where somebody remembers it
+    An axis in fault without new emergencies has those from before as its cause, where they are remembered
     (`tuning.target.timed` does).
 
     Returns:
-        A text for each axis: "undervoltage (3220h), ..." in the order of the emergencies, or that there was none.
+        A text for each axis: "undervoltage (3220h), ..." in the order of the emergencies, or that it has sent none.
     """
     told, remembered = told_causes(drives), _remembered(drives)
     if remembered is not None and any(before and not now for now, before in zip(told, remembered.told, strict=True)):
@@ -37,7 +37,7 @@ def stop_causes(drives: Drives) -> list[str]:
 
 
 def told_causes(drives: Drives) -> list[str]:
-    """Return what each axis has told since its emergencies were read last, "" for an axis that has told nothing."""
+    """Return the emergencies of each axis since they were read last, "" for an axis without one."""
     told: list[dict[str, None]] = [{} for _ in range(drives.num_axes)]
     for message in drives.emergencies():
         if message.code:

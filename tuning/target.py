@@ -52,7 +52,7 @@ CATCHING_UP = 3.0
 
 @dataclass(frozen=True)
 class Target:
-    """Drives to tune, and what the user knows of them.
+    """Drives to tune, and the user's knowledge of them.
 
     Attributes:
         drives: `EmulatedDrives` or `CanDrives`.
@@ -115,7 +115,7 @@ class Target:
 
     @property
     def axis_numbers(self) -> tuple[int, ...]:
-        """What results call each axis: of chosen axes their number among all."""
+        """Each axis' number in results: of chosen axes their number among all."""
         return tuple(map(int, self.drives.axis_numbers))
 
     def together(self, where: Mask) -> Mask:
@@ -126,7 +126,7 @@ class Target:
         return np.asarray(np.repeat(where.reshape(-1, lanes).any(axis=1), lanes))
 
     def slowest(self, inertia: Floats) -> Floats:
-        """Return the inertia [kg*m^2] by which axes move, (num_axes,): what pulls at one thing goes as its slowest end.
+        """Return the inertia [kg*m^2] by which axes move, (num_axes,): axes that pull at one thing move as the slowest.
 
         Ends that went different ways would strain what they pull at.
         """
@@ -377,7 +377,7 @@ def of_bus(
 
 
 def check_coupling(axes: str) -> None:
-    """Raise ValueError for a word that is none of `AXES`."""
+    """Raise ValueError for a word that is not one of `AXES`."""
     if axes not in AXES:
         raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
 
@@ -399,7 +399,7 @@ def timed(target: Target) -> Iterator[tuple[Target, DriveTime]]:
 
 
 class DriveTime(Observer):
-    """Counts the time that passes on drives: what a tuner costs on hardware.
+    """Counts the time that passes on drives: the cost of a tuner on hardware.
 
     Attributes:
         seconds: Time that passed so far [s].
@@ -442,7 +442,7 @@ def _limits(
 def address_of(
     interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what opens these drives again; what a file cannot hold, such as an open bus, is left out."""
+    """Return the options that open these drives again, without those that a file cannot hold, such as an open bus."""
     from drive_env.master.can.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE
 
     found = {

@@ -55,7 +55,7 @@ def as_value(where: str, value: Any, kind: str) -> Any:
 
 
 def kind_of(value: Any) -> str:
-    """Return what a TOML value is, in words."""
+    """Return the kind of a TOML value, in words."""
     names = {bool: "a truth value", int: "a whole number", float: "a number with a fraction", str: "a text",
              list: "an array", dict: "a table"}  # fmt: skip
     return names.get(type(value), f"a {type(value).__name__}")

@@ -1,4 +1,4 @@
-"""What a command that changes drives of a bus says at its end: what is changed still, and the line that restores it.
+"""The last lines of a command that changes drives of a bus: the changes that are left, and the line that restores.
 
 It is not what the run believes: the drives are opened anew, once the run has closed them, and compared with the file.
 """
@@ -21,7 +21,7 @@ from tuning.target import LOCKSTEP_PATIENCE
 
 @contextmanager
 def way_back(file: Path | None, program: str) -> Iterator[None]:
-    """Say on stderr, if a block that changes drives fails, what is changed still and the line that restores it.
+    """Print on stderr, if a block that changes drives fails, the changes that are left and the line that restores.
 
     Args:
         file: The file with the state before, which the block writes before it changes anything; None for emulated
@@ -40,7 +40,7 @@ def way_back(file: Path | None, program: str) -> Iterator[None]:
 
 
 def what_is_changed(file: Path) -> str:
-    """Return what drives of a bus, asked anew, have other than a file with their state before says, and the way back.
+    """Ask drives of a bus anew; return a message of the differences from a file of the state before.
 
     A node that is silent is not woken: it may be stopping by itself (docs/safety.md).
     """
@@ -65,7 +65,7 @@ TOLD = 5  # differences that a line names
 
 
 def read_anew(snapshot: Snapshot) -> list[tuple[int, Difference]]:
-    """Return what the drives of a snapshot have other than it says, as `differences`; raise if they do not answer."""
+    """Read the drives of a snapshot anew; return their `differences`; raise if they do not answer."""
     address = {name: value for name, value in snapshot.bus.items() if name != "axes"}
     if address.get("pace") == "lockstep":
         address["timeout"] = LOCKSTEP_PATIENCE

@@ -1,4 +1,4 @@
-"""What a benchmark's rows say together: `results.json`, `results.md`, and learning curves of each task."""
+"""The report of a benchmark's rows: `results.json`, `results.md`, and learning curves of each task."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Standing:
         seeds: Of trainings.
         score: Interquartile mean over seeds and episodes.
         mean: Of all scores: what the middle half hides, rare failures, is in it.
-        improvement: Probability that it is better than the expert in an episode; None of the expert.
+        improvement: Probability that it is better than the expert in an episode; None for the expert.
         ended_early: Share of the episodes that a fall or a trip ended.
         steps: Of a training.
         cpu_minutes: Of a training, mean over the seeds.
@@ -105,7 +105,7 @@ def _scores(rows: Sequence[Row]) -> Floats:
 
 
 def write_report(folder: Path) -> str:
-    """Write results.json, results.md and the curves of what the folder holds, and return the text."""
+    """Write results.json, results.md and the curves of the folder's rows, and return the text."""
     rows = read_rows(folder)
     table = standings(rows)
     for task, policies in rows.items():
@@ -164,7 +164,7 @@ def _curves(policies: Mapping[str, Sequence[Row]]) -> list[str]:
 
 
 def _draw(folder: Path, task: str, policies: Mapping[str, Sequence[Row]]) -> None:
-    """Draw what episodes of the trainings reached: the interquartile mean over seeds, and all of them behind it."""
+    """Draw the episodes of the trainings: the interquartile mean over seeds, and all of them behind it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

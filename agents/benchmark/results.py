@@ -33,9 +33,9 @@ class Row:
         task: Name of the task.
         policy: Name of the algorithm, of the baseline, or of the submitted policy.
         kind: TRAINED, SUBMITTED or BASELINE.
-        seed: Of the training; 0 of what was not trained here.
+        seed: Of the training; 0 for a row that was not trained here.
         opened: What names the policy for `open_policy`: a file beside the row, a Python function or a baseline.
-        policy_sha256: Of that file, or of the function's; "" of a baseline, which is of the package's sources.
+        policy_sha256: Of that file, or of the function's; "" for a baseline, which is in the package's sources.
         seeds: Of the first and of the last episode.
         scores: Of the episodes: the sum of rewards over the horizon, 0...1.
         ended_early: Episodes that a fall or a trip ended.

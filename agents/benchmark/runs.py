@@ -167,7 +167,7 @@ def _each(
 
 
 def _made(run: BenchmarkRun, tell: Callable[[float], None] = lambda share: None) -> _Done:
-    """Train what is to be trained, and judge it."""
+    """Train a row's agent, and judge it."""
     from agents.policies.policy import policy_of
 
     files: dict[str, bytes] = {}
@@ -212,12 +212,12 @@ def judge(policy: Any, task: str, episodes: int) -> tuple[list[float], int]:
 
 
 def _is_of(run: BenchmarkRun, found: Any) -> bool:
-    """Return whether something is what `_made` returns of a run."""
+    """Return whether an answer is a result of `_made` for a run."""
     return isinstance(found, _Done) and found.row.task == run.task and len(found.row.scores) == run.episodes
 
 
 class RowCheck(NamedTuple):
-    """What came of a row's episodes when they were run again."""
+    """The result of running a row's episodes again."""
 
     holds: bool
     says: str

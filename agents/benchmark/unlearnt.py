@@ -22,7 +22,7 @@ SETS = ((-0.575, -1.0, 0.05), (-0.41, -0.83, 0.06), (-0.49, -0.78, 0.17), (-0.45
 CORNERS = (-2.0 / 3.0, 0.0, 2.0 / 3.0)  # of a tuning's actions, of which each entry is a gain of its own
 
 # Action of every entry from the errors of position and speed, shape (machines, entries), and a generator. In a tuning
-# there are none: position is +1 and -1 in turn.
+# these errors do not exist: position is +1 and -1 in turn.
 Plain = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 

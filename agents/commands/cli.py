@@ -1,4 +1,4 @@
-"""The command `drive-agent`: it only puts together what lies in `commands`, one file per command."""
+"""The command `drive-agent`: it assembles the commands of this folder, one file per command."""
 
 from __future__ import annotations
 

@@ -192,7 +192,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Run:
-    """What is evaluated, wherever: a policy in its environment, by so many episodes."""
+    """An evaluation, on an emulator or a bus: a policy in its environment, by so many episodes."""
 
     loaded: LoadedPolicy
     configuration: dict[str, Any]
@@ -265,7 +265,7 @@ def opened_for(
     otherwise: str | None = None,
     trust: bool = False,
 ) -> tuple[Any, dict[str, Any]]:
-    """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
+    """Return the policy, its environment filled in (`otherwise` if it names none), and the environment's options."""
     import tomllib
 
     from agents.policies.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
@@ -307,7 +307,7 @@ def opened_for(
 
 
 def _against(run: _Run, against: str, found: Evaluation) -> list[str]:
-    """Return the gap of what was found to the emulator, or to an earlier report."""
+    """Return the gap between the results and the emulator's, or an earlier report's."""
     from agents.evaluation import gap
     from agents.evaluation.evaluation import Evaluation
 
@@ -357,7 +357,7 @@ def _on_emulator(run: _Run) -> Evaluation:
 
 
 def _as_on_a_bus(run: _Run) -> Evaluation:
-    """Evaluate on an emulated machine that the environment does not see, as it does not see what is on a bus."""
+    """Evaluate on an emulated machine that is hidden from the environment, as on a bus."""
     from agents.evaluation.evaluation import GivenDrives, as_on_a_bus
     from agents.training.tasks import make_environments
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -414,7 +414,7 @@ def _recording(path: Path) -> Any:
 
 
 def _replay(loaded: Any, configuration: dict[str, Any], path: Path, recording: Any, json: bool) -> None:
-    """Print what the policy would have done in recorded episodes, or the emulator's deviation from a recorded move."""
+    """Print the policy's actions in recorded episodes, or the emulator's deviation from a recorded move."""
     if recording is None:
         _replay_move(configuration, path, json)
         return
@@ -455,7 +455,7 @@ def _replay_move(configuration: dict[str, Any], path: Path, json: bool) -> None:
 
 
 def _guard(environment: str, stall: float | None, saturation: float | None) -> Any:
-    """Return the limits of a policy on given drives: the environment's own, but what the user says."""
+    """Return the limits of a policy on given drives: the environment's own, unless the user gives others."""
     from dataclasses import replace
 
     from agents.policies.guard import LIMITS
@@ -523,7 +523,7 @@ def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
 
 
 def _tell_card(text: str, json: bool) -> None:
-    """Print how an agent was trained and what it reaches."""
+    """Print an agent's training and figures."""
     from agents.policies.open_policy import described_checkpoint, is_checkpoint, open_policy
 
     loaded = described_checkpoint(text) if is_checkpoint(text) else open_policy(text)
@@ -548,5 +548,5 @@ def _lines(table: Mapping[str, Any], indent: str = "") -> Iterator[str]:
 
 
 def _printable(text: str) -> str:
-    """Return a text of somebody's file without what would act on the terminal."""
+    """Return a text of a foreign file without characters that act on the terminal."""
     return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

@@ -1,4 +1,4 @@
-"""`drive-agent margins`: what a policy does to the loops it acts in, and an agent that keeps margins."""
+"""`drive-agent margins`: the sensitivity of loops with a policy in them, and an agent that keeps margins."""
 
 from __future__ import annotations
 

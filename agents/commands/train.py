@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from agents.training.training_run import Progress, Report
 
 EPISODES = 64  # for the card
-LINES = 10  # of progress where nobody watches a terminal
+LINES = 10  # of progress, where the output is not a terminal
 
 
 def train(
@@ -112,7 +112,7 @@ def given_options(context: typer.Context) -> list[str]:
 
 
 def judged(bundle: AgentFile) -> tuple[AgentFile, Evaluation]:
-    """Return an agent with what it reaches on its card, and its evaluation on emulated machines."""
+    """Return an agent with its figures on its card, and its evaluation on emulated machines."""
     from agents.evaluation.evaluation import evaluate
     from agents.policies.policy import policy_of
     from agents.training.train import with_figures

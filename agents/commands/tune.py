@@ -167,7 +167,7 @@ def _emulated_node(
 
 
 def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
-    """Print the checks and what a run would do; the drive is only read. Return whether a run would start."""
+    """Print the checks and the plan of a run; the drive is only read. Return whether a run would start."""
     from agents.tuner.rehearsal import rehearse
 
     found = rehearse(target, keep=keep)
@@ -304,7 +304,7 @@ def _print(done: TunerRun, refused: list[str]) -> None:
 
 
 def _answer(done: TunerRun) -> str:
-    """Return which trial the agent chooses, and why where another one measured better; "" if it is none of them."""
+    """Return which trial the agent chooses, and why if another one measured better; "" if it chooses no trial."""
     from agents.tuner.tune_target import best_good
 
     after = tuple(done.result.axes[0].after)

@@ -1,1 +1,1 @@
-"""Episodes of a policy, and what they say."""
+"""Episodes of a policy, and their evaluation."""

@@ -1,4 +1,4 @@
-"""Recorded episodes in a file, and what a policy would have done in them: the same, if it is the same policy."""
+"""Recorded episodes in a file, and a policy's actions in them: the same, if it is the same policy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class EpisodeRecording(NamedTuple):
 
 
 class Repeated(NamedTuple):
-    """What a policy does with recorded observations: largest and RMS difference from the recorded actions."""
+    """A policy's actions on recorded observations: largest and RMS difference from the recorded actions."""
 
     largest: float
     rms: float
@@ -64,10 +64,10 @@ def ends_of(episodes: Sequence[Episode]) -> tuple[NDArray[np.bool_], NDArray[np.
 
 
 def load(path: Path) -> EpisodeRecording:
-    """Read what `save` wrote.
+    """Read a recording of `save`.
 
     Raises:
-        ValueError: If the file is none.
+        ValueError: If the file is not a recording.
     """
     try:
         stored = read_arrays(path)
@@ -94,13 +94,13 @@ def repeat(policy: Any, recording: EpisodeRecording, told: Callable[[float], Non
 
     Args:
         policy: What acts.
-        recording: What it is compared with.
+        recording: The recording to compare with.
         told: Called with the share that is done, episode by episode.
 
     Raises:
         PolicyStoppedError: If the policy fails on what was recorded, or gives another number of actions.
     """
-    unused = np.zeros(recording.actions[0].shape[1])  # nobody looks at it: what sticks does so in the recording, too
+    unused = np.zeros(recording.actions[0].shape[1])  # never used: a policy that sticks does so in the recording, too
     watched = GuardedPolicy(policy, unused, unused, 0.0, PATIENT)
     largest, squares, count = 0.0, 0.0, 0
     try:

@@ -97,7 +97,7 @@ class Evaluation:
         """Read a report.
 
         Raises:
-            ValueError: If the file is none.
+            ValueError: If the file is not a report.
         """
         try:
             table = read_json(path)
@@ -167,7 +167,7 @@ def evaluate(
 
     Raises:
         PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
-        ValueError: For a configuration that is none.
+        ValueError: For an invalid configuration.
     """
     environment = environment_name(environment)
     options = dict(configuration or {})
@@ -302,7 +302,7 @@ def _episodes(
         seeds: One for each environment.
         all_end: Whether every environment's episode ends with the first that does: beginning anew would move the
             others.
-        told: Is told how many steps are done, not more often than every TOLD.
+        told: Called with the number of steps done, not more often than every TOLD.
     """
     count = lanes.num_envs
     observation, begun = lanes.reset(seed=list(seeds))
@@ -376,7 +376,7 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
 
     Args:
         gains: The answers, (environments, axes, count).
-        trials: What was told of every trial of all environments, by the names of TRIAL_OF.
+        trials: The info of every trial of all environments, by the names of TRIAL_OF.
         last: What the environment told in the last step of each environment; changed.
     """
     for lane, told in enumerate(last):
@@ -389,7 +389,7 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
 
 
 def _seen(observation: Any) -> Any:
-    """Return what a policy sees: of a dict its `observation`; a copy, since it is kept."""
+    """Return the policy's part of an observation: of a dict its `observation`; a copy, since it is kept."""
     return np.array(observation["observation"] if isinstance(observation, dict) else observation)
 
 

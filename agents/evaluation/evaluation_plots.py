@@ -11,7 +11,7 @@ from agents.evaluation.evaluation import Evaluation
 from drive_env.whole_file import write_picture
 
 BINS = 20
-# Environment -> entry of the observation that is drawn over time, and what it is; None draws the reward.
+# Environment -> entry of the observation that is drawn over time, and its title; None draws the reward.
 TRACES: dict[str, tuple[int, str]] = {
     "ServoDrive/Tracking-v0": (0, "reference - position of axis 0 [of the amplitude]"),
     "ServoDrive/GainScheduling-v0": (0, "error of axis 0 [of its scale]"),

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 class Written(NamedTuple):
-    """A policy as its user wrote it, with the content of its file: whoever opens it needs no disk of ours.
+    """A policy as its user wrote it, with the content of its file, so that it can be opened on another machine.
 
     Attributes:
         text: What names it.
-        content: Of the file that the text is, None if it is none.
-        source: Hash of the file of the Python function that the text is, "" if it is none: it is not sent, and who
-            opens it must have the same.
+        content: Of the file that the text names, None if it names none.
+        source: Hash of the file of the Python function that the text names, "" for other texts: it is not sent, and the
+            machine that opens it must have the same.
         trust: As `open_policy` takes it.
     """
 
@@ -37,13 +37,13 @@ class Written(NamedTuple):
 
     @classmethod
     def of(cls, text: str, trust: bool) -> Written:
-        """Return what a text names."""
+        """Read the policy that a text names."""
         content = read_bytes(text, MOST_ARRAYS) if names_a_file(text) else None
         return cls(text, content, trust, source_of(text) if content is None else "")
 
     @property
     def sha256(self) -> str:
-        """Hash of its file, or of the file of its function; "" of what the package has."""
+        """Hash of its file, or of the file of its function; "" for a policy of the package."""
         return self.source if self.content is None else hashlib.sha256(self.content).hexdigest()
 
     def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:
@@ -94,7 +94,7 @@ def evaluate_elsewhere(
     seed: int,
     told: Callable[[float], None] = lambda share: None,
 ) -> Evaluation:
-    """Run episodes on emulated machines and return what they say, as `evaluate` does, wherever the pool runs them."""
+    """Run episodes on emulated machines and return the evaluation, as `evaluate` does, wherever the pool runs them."""
     environment, options = environment_name(environment), taken_options(configuration)
     at_once = environments_for(episodes)
     rounds = [

@@ -1,4 +1,4 @@
-"""What a policy does to the loops it acts in: their greatest sensitivity Ms, measured in the emulator.
+"""The greatest sensitivity Ms of loops with a policy in them, measured in the emulator.
 
 Every episode is run twice, alike to the last random number; in the second, a torque of many frequencies pushes one
 axis. By how much the motor's torque differs between the two tells how much of the push the loops answer, drives and
@@ -28,7 +28,7 @@ from drive_env.motors import find_motor
 Floats = NDArray[np.float64]
 
 MACHINES = 32  # that are drawn
-REPEATS = 4  # of every machine, with other trajectories and phases, against what is not linear
+REPEATS = 4  # of every machine, with other trajectories and phases, against non-linear parts
 SETTLING = 0.2  # of an episode, left out: the push has only begun
 LINES, LOWEST, HIGHEST = 40, 4.0, 0.3  # frequencies, from [Hz], to this share of the rate of actions
 PUSH = 0.05  # of the motor's rated torque, root mean square
@@ -97,7 +97,7 @@ def measure_sensitivity(
 
 
 class NotKeptError(ValueError):
-    """The loops with an agent in them do not keep what is asked of them; the message says by how much."""
+    """The loops with an agent in them do not keep the requirements; the message says by how much."""
 
 
 def check_kept(found: Sensitivity, dynamics: Dynamics) -> None:
@@ -121,7 +121,7 @@ def within(
 ) -> tuple[AgentFile, Sensitivity]:
     """Return an agent that answers following errors less, so that its loops keep the dynamics, and these loops.
 
-    What it leads its set-points by stays as it is. Its card says by how much it answers less.
+    Its lead over its set-points stays as it is. Its card says by how much its answer is lowered.
 
     Raises:
         NotKeptError: If the least of SHARES does not keep them.

@@ -81,7 +81,7 @@ def target_for(
 
 
 def lower_profile_velocity(drives: Drives) -> None:
-    """Lower 6081h where it is beyond the envelope's limit, with which nobody could write it back between episodes."""
+    """Lower 6081h where it is beyond the envelope's limit, which would refuse to write it back between episodes."""
     if not drives.safety:
         return
     limit = given(drives.safety.limits.velocity, drives.num_axes)
@@ -91,7 +91,7 @@ def lower_profile_velocity(drives: Drives) -> None:
 
 
 def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:
-    """Compile what the environment runs, on an emulated machine: a policy would else stall in its first step."""
+    """Compile the environment's kernels, on an emulated machine: a policy would else stall in its first step."""
     lanes = make_environments(environment, 1, _emulated(configuration))
     space: Any = lanes.action_space
     lanes.reset(seed=0)

@@ -42,7 +42,7 @@ class Served(NamedTuple):
 def draw_machines(config: Any, count: int, seed: int) -> list[Machine]:
     """Return machines of a task's configuration, drawn anew for each number; nodes are counted from 1.
 
-    What a row of a bus cannot hold stays as it is: supply, temperatures, and the delays of the bus.
+    Properties that a row of a bus cannot hold stay as they are: supply, temperatures, and the delays of the bus.
 
     Args:
         config: An environment's configuration; its distributions, or those that ship for its load.

@@ -33,7 +33,7 @@ AN_AGENT = "the .npz that drive-agent train writes, or the name of an agent that
 
 
 class BundleError(ValueError):
-    """A file is no bundle, is damaged, or would not be one; the message says which and what to do."""
+    """A file is not a bundle, is damaged, or would not be one; the message gives the mistake and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class AgentFile:
         """Read a bundle.
 
         Raises:
-            BundleError: If there is none, it is of another format, or it was changed after it was written.
+            BundleError: If the file is missing, of another format, or was changed after it was written.
             InputError: If a file of its training beside it was changed.
         """
         path = Path(path)
@@ -130,7 +130,7 @@ class AgentFile:
         bundle = cls(arrays=arrays, **{name: about[name] for name in KINDS_OF_ABOUT})
         if bundle.hash != about.get("hash"):
             raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it again")
-        # Of a load of its own the copy beside it, never what bears its name where somebody runs it.
+        # Of a load of its own the copy beside it, never a file of that name where it is run.
         kept = found_again(bundle.configuration, bundle.card.get("inputs"), path.parent, alone=True)
         return replace(bundle, configuration=kept)
 

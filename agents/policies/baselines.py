@@ -1,4 +1,4 @@
-"""What an agent must beat, as policies, by name: `drive-agent evaluate feed_forward --environment tracking`.
+"""Baselines that an agent must beat, as policies, by name: `drive-agent evaluate feed_forward --environment tracking`.
 
 `nothing` is the drive's own cascade, or the baseline rule's gains; `surrogate` is the tuner that ships. The others are
 feed-forward as one identifies it: the constants below gave the least mean following error over 64 machines drawn from
@@ -159,7 +159,7 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
 
 
 def baselines_of(environment: str) -> dict[str, Any]:
-    """Return the baselines of an environment or task by name: what makes each from configuration and actions."""
+    """Return the baselines of an environment or task by name: functions of configuration and actions."""
     name = environment_name(environment)
     if name not in SUITE_TASKS:
         return BASELINES[name]

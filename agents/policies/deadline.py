@@ -32,7 +32,7 @@ class Deadline:
         self._thread: threading.Thread | None = None
 
     def call(self, function: Callable[..., Any], *arguments: Any, within: float) -> Any:
-        """Return what the function returns, or raise what it raises.
+        """Call a function in the thread; return its result, or raise its exception.
 
         Args:
             function: What is called.
@@ -71,7 +71,7 @@ class Deadline:
         self._calls.put(None)
 
     def _give_up(self) -> None:
-        """Leave the thread behind; what it says later nobody hears, and if it runs Python, it is ended there."""
+        """Leave the thread behind: its answer is dropped, and if it runs Python, it is ended there."""
         thread, self._thread = self._thread, None
         self._calls.put(None)
         self._calls, self._ends = queue.SimpleQueue(), queue.SimpleQueue()

@@ -1,4 +1,4 @@
-"""Experts of the suite's tasks: what a motion engineer would program, given the machine as an identification tells it.
+"""Experts of the suite's tasks: the program of a motion engineer, given the machine as an identification has it.
 
 An expert knows the parameters of each machine when its episode begins (`told`); where none are known, on a bus, it
 takes the nominal ones. What it must cope with all the same: delays of the bus, flexibility, sensors.
@@ -56,7 +56,7 @@ class Expert:
         return np.asarray(self._machine.get(name, nominal), float)
 
     def reset(self, mask: Any = None) -> None:
-        """Forget what belongs to episodes that have ended."""
+        """Forget the state of episodes that have ended."""
 
     def act(self, observation: Any) -> NDArray[np.float32]:
         """Return the action for one observation, or one for each environment."""

@@ -90,7 +90,7 @@ class GuardedPolicy:
         self._deadline = Deadline()
 
     def warm_up(self, observation: Any) -> None:
-        """Ask once and forget the answer, before anything moves: what loads or compiles then is no stall.
+        """Ask once and forget the answer, before anything moves: loading or compiling then is no stall.
 
         Raises:
             PolicyStoppedError: If it does not answer within PATIENT.stall.
@@ -134,7 +134,7 @@ class GuardedPolicy:
         return rows
 
     def answer(self, observation: Any) -> Any:
-        """Return a tuner's choice after its last trial, as an action; None of a policy without a choice.
+        """Return a tuner's choice after its last trial, as an action; None for a policy without a choice.
 
         Raises:
             PolicyStoppedError: If it took too long, or is not a number.
@@ -168,7 +168,7 @@ class GuardedPolicy:
         return rows
 
     def _ask(self, function: Callable[[Any], Any], argument: Any, within: float | None) -> Any:
-        """Return what the policy answers; PolicyStoppedError if it does not in time, or raises what it may."""
+        """Return the policy's answer; PolicyStoppedError if it comes too late, or the policy raises."""
         try:
             if within is None:
                 return function(argument)
@@ -193,7 +193,7 @@ class GuardedPolicy:
 
 @contextmanager
 def unchanged(drives: Drives) -> Iterator[None]:
-    """Put gains, offsets, profile velocity and mode back as they were when what is inside ends; log what fails."""
+    """Put gains, offsets, profile velocity and mode back as they were when the block ends; log failures."""
     before = {name: drives.read(name) for name in (*device_of(drives).gains.keys, *KEPT)}
     try:
         yield
@@ -212,7 +212,7 @@ def unchanged(drives: Drives) -> Iterator[None]:
 
 @contextmanager
 def stopping(drives: Drives) -> Iterator[None]:
-    """Leave the drives at rest and disabled if what is inside ends with any exception, Ctrl-C too."""
+    """Leave the drives at rest and disabled if the block ends with any exception, Ctrl-C too."""
     try:
         yield
     except BaseException as error:

@@ -105,7 +105,7 @@ def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | Non
     Args:
         bundle: The agent.
         path: The ONNX model.
-        act: What it is compared with; the bundle's own NumPy runtime by default.
+        act: The function to compare with; the bundle's own NumPy runtime by default.
         steps: Steps of 16 environments, for policies with a state.
     """
     from agents.policies.onnx_policy import OnnxPolicy

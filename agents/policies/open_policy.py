@@ -31,7 +31,7 @@ class PolicyNotFoundError(ValueError):
 
 @dataclass
 class LoadedPolicy:
-    """A policy and what is known of it.
+    """A policy and its description.
 
     Attributes:
         name: As the user wrote it.
@@ -57,7 +57,7 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
             code, and a Python function is the user's own.
 
     Raises:
-        PolicyNotFoundError: If it is none; BundleError or CheckpointError if its file is not what it seems;
+        PolicyNotFoundError: If it names no policy; BundleError or CheckpointError if its file is not what it seems;
             UntrustedError for a checkpoint without `trust`.
     """
     if is_checkpoint(text):
@@ -125,7 +125,7 @@ class CallablePolicy:
         self._function = function
 
     def act(self, observation: Any) -> Any:
-        """Return what the function returns."""
+        """Return the function's actions."""
         return np.asarray(self._function(observation), np.float32)
 
     def reset(self, mask: Any = None) -> None:
@@ -156,7 +156,7 @@ class ModelPolicy:
         return action[0] if np.ndim(observation) == 1 else action
 
     def reset(self, mask: Any = None) -> None:
-        """Forget what was."""
+        """Forget the episode."""
         if mask is None or self._begins is None:
             self._state = self._begins = None
         else:
@@ -182,12 +182,12 @@ def is_checkpoint(text: str) -> bool:
 
 
 def described_checkpoint(text: str) -> LoadedPolicy:
-    """Return what is known of a checkpoint, its policy None: nothing of its writer is run.
+    """Return the description of a checkpoint, its policy None: nothing of its writer is run.
 
     A file of Stable-Baselines3's own says nothing of its environment.
 
     Raises:
-        CheckpointError: If the file is none.
+        CheckpointError: If the file is not a checkpoint.
     """
     from agents.training import checkpoint
 
@@ -210,7 +210,7 @@ def _checkpoint(text: str, trust: bool) -> LoadedPolicy:
 
 
 def find_object(text: str) -> Any:
-    """Return what module:name means; the present folder's modules count, too.
+    """Import the object of module:name; the present folder's modules count, too.
 
     Raises:
         PolicyNotFoundError: If there is no such thing, or its module cannot be imported.
@@ -225,7 +225,7 @@ def find_object(text: str) -> Any:
         found = importlib.import_module(module)
     except ImportError as error:
         raise PolicyNotFoundError(f"{text}: module {module!r} cannot be imported: {error}") from None
-    except Exception as error:  # whatever somebody's module does when it is imported
+    except Exception as error:  # a foreign module may raise anything when it is imported
         raise PolicyNotFoundError(f"{text}: module {module!r} fails: {type(error).__name__}: {error}") from error
     if not hasattr(found, name):
         functions = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]

@@ -33,16 +33,16 @@ class PolicyError(RuntimeError):
 
 
 def load_policy(path: str | Path) -> Any:
-    """Return what a bundle's kind makes of it.
+    """Return the policy of a bundle, by its kind.
 
     Raises:
-        BundleError: If the file is none, or its kind is not known here.
+        BundleError: If the file is not a bundle, or its kind is not known here.
     """
     return policy_of(AgentFile.load(path))
 
 
 def policy_of(bundle: AgentFile) -> Any:
-    """Return what a bundle's kind makes of it."""
+    """Return the policy of a bundle, by its kind."""
     if bundle.kind not in KINDS:
         raise BundleError(f"an agent of kind {bundle.kind!r} needs a newer drive-env; this one has {', '.join(KINDS)}")
     module, _, name = KINDS[bundle.kind].partition(":")
@@ -89,7 +89,7 @@ OUTPUTS: dict[str, Callable[[Array, Array, Array], Array]] = {"clip": _clip, "ta
 
 
 class Ends:
-    """What all networks have in front and behind: checks, normaliser, action bounds.
+    """Common first and last steps of all networks: checks, normaliser, action bounds.
 
     Arrays: observation_mean, observation_scale (1/standard deviation), shape (entries,); action_low, action_high, shape
     (actions,). Settings: observation_clip (of the normalised observation; None for no normaliser), output (OUTPUTS).
@@ -166,7 +166,7 @@ class MlpPolicy:
             PolicyError: If observation or action is not a number, or the observation has another shape.
         """
         x = self._ends.enter(observation)
-        with np.errstate(over="ignore", invalid="ignore"):  # `leave` tells what comes of it
+        with np.errstate(over="ignore", invalid="ignore"):  # `leave` reports the consequence
             for weight, bias in self._hidden:
                 x = self._activation(x @ weight + bias)
             x = x @ self._last[0] + self._last[1]

@@ -17,7 +17,7 @@ def shipped(name: str) -> Path:
     """Return the file of an agent that ships.
 
     Raises:
-        ValueError: If there is none of that name.
+        ValueError: For an unknown name.
     """
     if name not in shipped_names():
         raise ValueError(f"no agent named {name!r} ships; there are {', '.join(shipped_names())}, or give a file")

@@ -1,8 +1,8 @@
-"""A training run as one file: Stable-Baselines3's own .zip with what it leaves out beside it.
+"""A training run as one file: Stable-Baselines3's own .zip with the parts that it leaves out.
 
 SB3 saves networks, optimisers and counters. Added are `drive_agent.json` (the run), the normaliser, the replay buffer
 and the states of all random generators, so that the file alone can be resumed, exported and evaluated. Like every file
-of SB3 it holds pickles, and whoever unpickles runs what its writer wished: it is loaded only with `trust`, also where a
+of SB3 it holds pickles, and unpickling runs what its writer wished: it is loaded only with `trust`, also where a
 run goes on, since nothing in a folder proves who wrote it. What a file says of its run is JSON and needs none.
 """
 
@@ -37,7 +37,7 @@ class CheckpointError(ValueError):
 
 
 class UntrustedError(CheckpointError):
-    """A file would run what its writer wished, and nobody said that he is trusted."""
+    """A file would run code of its writer, and `trust` was not given."""
 
 
 def save(path: Path, model: Any, normaliser: Any, run: dict[str, Any]) -> None:
@@ -55,10 +55,10 @@ def save(path: Path, model: Any, normaliser: Any, run: dict[str, Any]) -> None:
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """Return what a checkpoint says of its run.
+    """Return a checkpoint's description of its run.
 
     Raises:
-        CheckpointError: If it is none.
+        CheckpointError: If the file is not a checkpoint.
     """
     text = _read(path, RUN)
     try:
@@ -77,13 +77,13 @@ def check_trust(path: Path, trust: bool) -> None:
     if not trust:
         raise UntrustedError(
             f"{path} holds pickles: loading it runs code that its author put there, with your rights (your files, "
-            "your network, the drives). If it is yours, or from somebody whose programs you would run here, give "
+            "your network, the drives). If it is yours, or from a person whose programs you would run here, give "
             "--trust (in Python trust=True); an agent.npz runs no code and needs no trust"
         )
 
 
 def is_plain(path: Path) -> bool:
-    """Return whether a file is Stable-Baselines3's alone, without what drive-agent adds."""
+    """Return whether a file is Stable-Baselines3's alone, without the parts of drive-agent."""
     try:
         names = member_names(path)
     except (OSError, ValueError):
@@ -134,7 +134,7 @@ def load(path: Path, env: Any = None, *, trust: bool = False) -> tuple[Any, Any]
         trust: Its writer is trusted: what he put there is run.
 
     Raises:
-        CheckpointError: If the file is none; UntrustedError without `trust`.
+        CheckpointError: If the file is not a checkpoint; UntrustedError without `trust`.
     """
     run = read_run(path)
     check_trust(path, trust)

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from drive_env.envs.vector_environment import VectorEnvironment
 
-EPISODES = 100  # the last ones, of which means are told
+EPISODES = 100  # the last ones, of which means are reported
 
 
 class CountedEnvironments:

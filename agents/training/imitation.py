@@ -1,4 +1,4 @@
-"""A policy that begins as a teacher: before PPO improves it, its network learns what the teacher does.
+"""A policy that begins as a teacher: before PPO improves it, its network learns the teacher's actions.
 
 The teacher acts with the exploration noise that PPO will begin with, so that the critic learns the returns of that,
 too: an untaught critic's first updates would undo what was imitated.

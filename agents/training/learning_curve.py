@@ -1,4 +1,4 @@
-"""The picture of a training: what its episodes reached, and the terms of its reward, over the steps."""
+"""The picture of a training: the returns of its episodes, and the terms of its reward, over the steps."""
 
 from __future__ import annotations
 

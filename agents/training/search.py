@@ -70,7 +70,7 @@ SPACES["crossq"] = tuple(row for row in SPACES["sac"] if row.key not in NOT_TAKE
 
 
 class SearchTrial(NamedTuple):
-    """A trial that is over: its number, score (None if the training diverged), and what was drawn."""
+    """A trial that is over: its number, score (None if the training diverged), and the drawn hyper-parameters."""
 
     number: int
     score: float | None
@@ -89,7 +89,7 @@ class _TrainingTask(NamedTuple):
 
 
 class _Scored(NamedTuple):
-    """What came of a task: the score to be minimised, None if the training diverged, and files by their names."""
+    """The result of a task: the score to be minimised, None if the training diverged, and files by their names."""
 
     score: float | None
     files: Mapping[str, bytes]
@@ -165,7 +165,7 @@ class _Study:
         from optuna.storages.journal import JournalFileBackend
 
         self._base, self._folder, self._seed, self._episodes, self._told = base, folder, seed, episodes, told
-        optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
+        optuna.logging.set_verbosity(optuna.logging.ERROR)  # failures are reported in a line
         storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
         name = f"{base.environment} {base.algorithm}"
         self._study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
@@ -177,7 +177,7 @@ class _Study:
         self._states = optuna.trial.TrialState
 
     def known(self) -> Any:
-        """Return what is known now, as a study of its own."""
+        """Return the finished trials as a study of its own."""
         import optuna
 
         known = optuna.create_study()
@@ -185,7 +185,7 @@ class _Study:
         return known
 
     def begin(self, known: Any, writes_there: bool) -> tuple[Any, _TrainingTask]:
-        """Return a trial, drawn from what was known when its round began, and what is to be done.
+        """Return a trial, drawn from the trials known when its round began, and its task.
 
         Args:
             known: As `known` returned it.
@@ -203,7 +203,7 @@ class _Study:
         return trial, _TrainingTask(run, self._folder_of(trial) if writes_there else None, self._episodes)
 
     def end(self, trial: Any, scored: _Scored) -> None:
-        """Keep what came of a trial, and tell it."""
+        """Keep the result of a trial, and report it."""
         for name, content in scored.files.items():
             path = self._folder_of(trial) / name
             write_whole(path, content)
@@ -243,7 +243,7 @@ class _Study:
 
 
 def _sampler(known: Any, seed: int) -> Any:
-    """Return Optuna's own sampler, which draws from what is known in place of what the study has meanwhile."""
+    """Return Optuna's own sampler, which draws from the known trials in place of the study's present ones."""
     from optuna.samplers import TPESampler
 
     class FromTheRoundsBefore(TPESampler):  # type: ignore[misc]  # Optuna has no types
@@ -277,7 +277,7 @@ def _trained(task: _TrainingTask) -> _Scored:
 
 
 def _is_score(_: _TrainingTask, scored: Any) -> bool:
-    """Return whether something is what `_trained` returns."""
+    """Return whether an answer is a result of `_trained`."""
     return isinstance(scored, _Scored) and (scored.score is None or math.isfinite(scored.score))
 
 
@@ -299,7 +299,7 @@ def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, tr
 
 
 def drawn(algorithm: str, hyperparameters: Mapping[str, Any], trial: Any) -> dict[str, Any]:
-    """Return hyper-parameters with what a trial drew, or draws, in their places."""
+    """Return hyper-parameters with a trial's values in their places."""
     if algorithm not in SPACES:
         raise ValueError(f"there is no algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
     found: dict[str, Any] = copy.deepcopy(dict(hyperparameters))

@@ -84,7 +84,7 @@ class Segments(BaseCallback):  # type: ignore[misc]
         return True
 
     def finish(self) -> None:
-        """Write what the end of the run leaves."""
+        """Write the files of a run's end."""
         self._save()
         if self.num_timesteps and self._lanes.steps > self._row_steps:
             self._tell()

@@ -44,7 +44,7 @@ def environment_name(text: str) -> str:
     """Return the full name of an environment or task from any spelling: tracking, Tracking-v0, ServoDrive/Tracking-v0.
 
     Raises:
-        ValueError: If there is none, naming those that are.
+        ValueError: For an unknown name, naming the known ones.
     """
     wanted = _letters(text)
     for name in (*ENVIRONMENTS, *SUITE):
@@ -79,7 +79,7 @@ def make_environments(
             which are what they are, no machines are drawn.
 
     Raises:
-        ValueError: For a name or a value that is none.
+        ValueError: For an unknown name or an invalid value.
     """
     name, own = environment_name(environment), dict(configuration or {})
     if name in SUITE and options.get("drives") is not None:
@@ -92,7 +92,7 @@ def make_environments(
 
 
 def without_machines(environment: str, configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of an environment, or of a task of the suite, for drives that are what they are."""
+    """Return the options of an environment, or of a task of the suite, for given drives: without those of machines."""
     own = SUITE[environment].options if environment in SUITE else {}
     return {key: value for key, value in {**own, **configuration}.items() if key not in OF_MACHINES}
 

@@ -45,7 +45,7 @@ _WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts",
 
 
 class DivergedError(ValueError):
-    """The networks hold what nothing can act with: the training is lost; the message says what to change."""
+    """The networks have non-finite weights: the training is lost; the message says what to change."""
 
 
 def train(
@@ -97,7 +97,7 @@ def _train(run: TrainingRun, folder: Path, report: Report | None, resume: bool, 
             model, normaliser = checkpoint.load(path, env, trust=trust)
         else:
             model, normaliser = make_model(run, env)
-            agent_of(model, normaliser, run, configuration_of(lanes))  # what no bundle holds is told now
+            agent_of(model, normaliser, run, configuration_of(lanes))  # raises if no bundle can hold the model
             if run.hyperparameters.get("imitate"):
                 _imitate(run, model, lanes, report)
         folder.mkdir(parents=True, exist_ok=True)
@@ -153,7 +153,7 @@ def with_inputs(run: TrainingRun) -> TrainingRun:
 
 
 def clear(folder: str | Path) -> None:
-    """Delete what a run has written that was ended before its first checkpoint: nothing can go on with it."""
+    """Delete the files of a run that was ended before its first checkpoint: it cannot be resumed."""
     folder = Path(folder)
     for path in (folder / TABLE, *folder.glob("events.out.tfevents.*")):
         path.unlink(missing_ok=True)
@@ -180,7 +180,7 @@ def run_to_resume(folder: str | Path) -> TrainingRun:
 
 
 def agent_of(model: Any, normaliser: Any, run: TrainingRun, configuration: Mapping[str, Any]) -> AgentFile:
-    """Return a trained model as a bundle with what is known of the run on its card."""
+    """Return a trained model as a bundle with the facts of the run on its card."""
     card = {
         "trained": f"{run.algorithm} of Stable-Baselines3, preset {run.preset}, {model.num_timesteps} steps",
         "distribution": plain(as_kept(configuration.get("distributions"))) or "the environment's own",
@@ -198,7 +198,7 @@ def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> AgentFile:
     """Return the agent of a checkpoint.
 
     Raises:
-        CheckpointError: If the file is none, or its writer is not trusted.
+        CheckpointError: If the file is not a checkpoint, or its writer is not trusted.
     """
     table = checkpoint.read_run(Path(path))
     model, normaliser = checkpoint.load(Path(path), trust=trust)
@@ -302,7 +302,7 @@ def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: R
 
 @contextmanager
 def _settings_of(name: str) -> Iterator[None]:
-    """Tell what a constructor does not take as a mistake in the hyper-parameters: SB3 asserts some of it."""
+    """Report arguments that a constructor does not take as a mistake in the hyper-parameters: SB3 asserts some."""
     try:
         yield
     except (TypeError, AssertionError) as error:
@@ -320,7 +320,7 @@ def _named(value: Any) -> tuple[str, dict[str, Any]]:
 
 
 def found(name: str) -> Any:
-    """Return what "module:name" names.
+    """Import the object of "module:name".
 
     Raises:
         HyperparameterError: If there is no such thing.

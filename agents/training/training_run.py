@@ -1,4 +1,4 @@
-"""A run of a training: what is trained, its files, its segments, and how it tells of its progress."""
+"""A run of a training: its task, its files, its segments, and the report of its progress."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EPISODES_PER_SEGMENT = 3  # of every environment, at least
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What is trained.
+    """A training.
 
     Attributes:
         environment: Name of the environment.

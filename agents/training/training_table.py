@@ -1,4 +1,4 @@
-"""What a training reached as it went on: a CSV that is appended to, row by row, and cut where a run is resumed."""
+"""The progress of a training: a CSV that is appended to, row by row, and cut where a run is resumed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""For which devices, motors, loads and machines a tuner's card holds, and what of a target lies outside."""
+"""For which devices, motors, loads and machines a tuner's card holds, and the parts of a target outside."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def outside(agent: AgentFile, target: Target, load: str | None) -> tuple[str, ..
 
     Args:
         agent: The tuner's file. One whose card has no such table holds for what its configuration has.
-        target: What it is to tune.
+        target: The target to tune.
         load: Name of the load; None where it is not known, as on a bus.
     """
     holds = agent.card.get(HOLDS)

@@ -46,7 +46,7 @@ def titles_of_trials(known: GainSet) -> list[str]:
 
 
 def remark(trial: TrialShown) -> str:
-    """Return what there is to say of a trial of one machine."""
+    """Return the remark on a trial of one machine, "" for none."""
     mark = "better" if trial.better[0] else ""
     if trial.lowered[0]:
         mark = f"{mark}; " * bool(mark) + "lowered: the agent's proposal breaks the dynamics"

@@ -38,7 +38,7 @@ SAMPLED, PLAYED = (
 
 
 class Check(NamedTuple):
-    """A check: what was checked, OK, NOTE or NO, and the result, with the remedy where it is a NO."""
+    """A check: its name, OK, NOTE or NO, and the result, with the remedy where it is a NO."""
 
     what: str
     verdict: str
@@ -77,7 +77,7 @@ class Rehearsal(NamedTuple):
 
 
 def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
-    """Check drives on a bus without writing, and return the checks and what a run would write.
+    """Check drives on a bus without writing, and return the checks and the plan of a run.
 
     Args:
         target: The drives, as `tuning.target.on_bus` opens them.
@@ -183,7 +183,7 @@ def _answers(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _samples(target: Target, axis: int) -> Iterator[Check]:
-    """Look whether what is sampled and played fits, and whether its PDOs have identifiers."""
+    """Check that sampled and played objects fit, and that their PDOs have identifiers."""
     if not _is_on_can(target):
         yield _images(target)
         return
@@ -216,7 +216,7 @@ def _samples(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _images(target: Target) -> Check:
-    """Look whether the process images of a slave can carry what is sampled and played."""
+    """Check that the process images of a slave can carry the sampled and played objects."""
     drives = bus_of(target.drives)
     find = drives.description.dictionary.find
     try:
@@ -244,7 +244,7 @@ def _error_control(target: Target, axis: int) -> Iterator[Check]:
                                     f"time 0420h would be set to {1e3 * silence:.0f} ms")  # fmt: skip
     elif description.has((0x1016, 1)):
         value = _read(target, (0x1016, 1), axis)
-        now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
+        now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "no node"
         yield Check("heartbeat", OK, f"the drive can monitor its master by heartbeat: 1016h, now {now}; in real time "
                                      f"it "
                                      f"would be set to {1e3 * silence:.0f} ms")  # fmt: skip
@@ -319,7 +319,7 @@ def _travel(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _envelope(target: Target, axis: int) -> Iterator[Check]:
-    """Say what would stop the drives while a run acts on them."""
+    """Add the limits that would stop the drives while a run acts on them."""
     if target.drives.safety is None:
         yield Check("envelope", NO, "there is none: open the drives with a safety envelope")
         return
@@ -397,7 +397,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
 
 
 def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
-    """Yield what is written so that samples come in PDOs and the drive watches over its master."""
+    """Yield the writes that bring samples in PDOs and have the drive watch over its master."""
     if _is_on_can(target):
         yield from _pdos(target)
     else:
@@ -408,7 +408,7 @@ def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]
 
 
 def _pdos(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
-    """Yield what is written of PDOs."""
+    """Yield the writes to PDOs."""
     from drive_env.master.can.pdo import OUT_OF_DRIVE, slots
 
     known = bus_of(target.drives).description.dictionary
@@ -423,7 +423,7 @@ def _pdos(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
 
 
 def _safeguards(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
-    """Yield what is written so that the drive stops by itself where it must."""
+    """Yield the writes after which the drive stops by itself where it must."""
     if np.isfinite(target.low).all() and np.isfinite(target.high).all():
         for sub, end in ((1, "lower"), (2, "upper")):
             if bus_of(target.drives).description.has((cia402.POSITION_LIMITS, sub)):

@@ -61,7 +61,7 @@ def context_of(identified: Array, shown: Array, dynamics: Dynamics) -> Array:
 
 
 class Normaliser(NamedTuple):
-    """What inputs are normalised with: mean and 1/standard deviation, shapes (21,), (16,); 1/reach of gains."""
+    """The scaling of inputs: mean and 1/standard deviation, shapes (21,), (16,); 1/reach of gains."""
 
     context_mean: Array
     context_scale: Array
@@ -74,7 +74,7 @@ class Normaliser(NamedTuple):
         return np.asarray(np.clip((raw - self.context_mean) * self.context_scale, -CLIP, CLIP))
 
     def shown(self, raw: Array) -> Array:
-        """Return what trials showed as the networks take it."""
+        """Scale the results of trials for the networks."""
         return np.asarray(np.clip((raw - self.shown_mean) * self.shown_scale, -CLIP, CLIP))
 
     def gains(self, raw: Array) -> Array:

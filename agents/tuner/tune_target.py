@@ -174,7 +174,7 @@ def _make_trials(
     margins: KeptMargins | None,
     share: float,
 ) -> tuple[list[TrialShown], Floats]:
-    """Return all trials of an episode, the baseline rule's first, and what the policy sees at its end.
+    """Return all trials of an episode, the baseline rule's first, and the policy's observation at its end.
 
     Args:
         env: The environment.

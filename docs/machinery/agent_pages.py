@@ -29,7 +29,7 @@ def pages() -> dict[str, str]:
 
 
 def section(name: str) -> str:
-    """Return what is known of an agent."""
+    """Return an agent's section: task, training, figures."""
     agent = AgentFile.load(shipped(name))
     card = agent.card
     if agent.environment in TASKS:
@@ -55,7 +55,7 @@ def section(name: str) -> str:
 
 
 def options(agent: AgentFile) -> str:
-    """Return the load and what is not the environment's default, briefly."""
+    """Return the load and the options that differ from the environment's defaults, briefly."""
     known = agent.configuration
     chosen = {key: known[key] for key in ("load", "mode", "action", "gains", "trials") if key in known}
     return ", ".join(f"`{key}={value!r}`" for key, value in chosen.items())

@@ -1,4 +1,4 @@
-"""The pages of the Python interface: which classes and functions are meant for users, by what they are for."""
+"""The pages of the Python interface: classes and functions for users, by their purpose."""
 
 from __future__ import annotations
 

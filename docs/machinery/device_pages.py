@@ -179,7 +179,7 @@ def default(entry: Entry) -> str:
 
 
 def notes(device: Device, entry: Entry, by_place: dict[tuple[int, int], object]) -> str:
-    """Return what else is known of an object."""
+    """Return the notes on an object: its role, allowed values and the like."""
     place = (entry.index, entry.sub)
     found = []
     if place in by_place:

@@ -26,13 +26,13 @@ measurements.
 
 
 def pages() -> dict[str, str]:
-    """Return the page: what all include first, then a set for each load."""
+    """Return the page: the set that all include first, then a set for each load."""
     names = [*GENERAL, *(name for name in shipped() if name not in GENERAL)]
     return {PATH: PAGE + "\n".join(section(name) for name in names)}
 
 
 def section(name: str) -> str:
-    """Return a set: what its file says of it, and its own laws."""
+    """Return a set: its file's comment, and its own distributions."""
     text = (SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
     said = " ".join(
         line.removeprefix("#").strip() for line in takewhile(lambda line: line[:1] == "#", text.splitlines())
@@ -47,7 +47,7 @@ def section(name: str) -> str:
 
 
 def described(row: dict[str, Any]) -> tuple[str, str, str]:
-    """Return a law's name, its numbers in words, and what they are multiples of."""
+    """Return a distribution's name, its numbers in words, and the values that they are multiples of."""
     law = Law(**{key: tuple(value) if isinstance(value, list) else value for key, value in row.items() if key != "of"})
     of = "the default" if "of" in row else ""
     if law.law == "choice":

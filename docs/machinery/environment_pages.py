@@ -113,7 +113,7 @@ def page(name: str, module: str, kind: str) -> str:
 
 
 def parts_of(text: str) -> tuple[str, str]:
-    """Return what stands before a docstring's `Args:`, and its arguments; what they raise is in the API."""
+    """Return the part of a docstring before `Args:`, and its arguments; its `Raises:` is on the page of the API."""
     before, _, after = text.partition("\nArgs:\n")
     return before, inspect.cleandoc(after.partition("\nRaises:")[0])
 
@@ -144,7 +144,7 @@ def shown(value: Any) -> str:
 
 
 def meanings(configuration: Any) -> str:
-    """Return what the configuration's docstring says of its fields, as a list."""
+    """Return the fields of the configuration's docstring as a list."""
     return described(inspect.cleandoc(configuration.__doc__).partition("\n\n")[2])
 
 

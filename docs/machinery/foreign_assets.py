@@ -1,4 +1,4 @@
-"""Tell what pages of a built site load from another host; nothing may be.
+"""Find assets that pages of a built site load from another host; there may be none.
 
 python docs/machinery/foreign_assets.py SITE
 
@@ -59,7 +59,7 @@ def foreign(site: Path) -> list[str]:
 
 
 def main() -> None:
-    """Print what is loaded from another host; exit code 1 where anything is, or where there is no site."""
+    """Print the assets that are loaded from another host; exit code 1 if there are any, or without a site."""
     site = Path(sys.argv[1])
     if not (site / "index.html").is_file():
         sys.exit(f"{site} holds no site (no index.html); build it with mkdocs build --site-dir {site}")

@@ -1,4 +1,4 @@
-"""What MkDocs runs while it builds the site: the pages that are made from the packages' data, and their entries.
+"""Hooks of MkDocs while it builds the site: the pages that are made from the packages' data, and their entries.
 
 A page of the reference is never written by hand where a table of the packages has its facts: it is made anew in every
 build, so that it cannot say what the code does not. Nothing here needs the network.
@@ -46,7 +46,7 @@ def expanded(entries: list[Any], known: list[str]) -> list[Any]:
         if isinstance(entry, dict):
             ((title, value),) = entry.items()
             inner = _flat(value) if isinstance(value, list) else value
-            return [{title: inner}] if inner else []  # a section without pages is none
+            return [{title: inner}] if inner else []  # a section without pages is left out
         if isinstance(entry, str) and entry.endswith("/*"):
             folder = entry[:-1]
             return [page for page in known if page.rpartition("/")[0] + "/" == folder and page not in named]

@@ -1,4 +1,4 @@
-"""The loads: an index with pictures, and a page for each with what it is made of and what can be set."""
+"""The loads: an index with pictures, and a page for each with its parts and parameters."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def page(load: Load) -> str:
 
 
 def drives(load: Load) -> str:
-    """Return what each drive turns, and how far."""
+    """Return a table of the joint, gear and travel of each drive."""
     rows = []
     for axis, (joint, gear) in enumerate(zip(load.joints, load.gears, strict=True)):
         travel = load.travel[axis] if axis < len(load.travel) else None
@@ -86,7 +86,7 @@ def drives(load: Load) -> str:
 
 
 def parameters(load: Load) -> str:
-    """Return what can be set for each machine."""
+    """Return a table of the parameters that each machine may have its own of."""
     alone = one(load)
     rows = []
     for row in load.parameters:

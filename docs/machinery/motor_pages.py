@@ -1,4 +1,4 @@
-"""The page of the motors: what they are, and every number with its source."""
+"""The page of the motors: every number with its source."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ SETTLE = 3.0  # s until a page shows what it has
 
 
 class Shot(NamedTuple):
-    """A picture: its file, its page, its size, light or dark, and what is done before."""
+    """A picture: its file, its page, its size, light or dark, and the actions before it."""
 
     name: str
     path: str
@@ -82,13 +82,13 @@ def browser() -> Iterator[Chrome]:
 
 
 def press(driver: Chrome, css: str) -> None:
-    """Press what a selector finds."""
+    """Press the element of a selector."""
     driver.execute_script("arguments[0].click()", driver.find_element(By.CSS_SELECTOR, css))
     time.sleep(0.3)
 
 
 def enable(driver: Chrome) -> None:
-    """Have the axis enabled, and at a place that is none of the beginning."""
+    """Enable the axis, and move it away from its start."""
     press(driver, "[data-test=enable]")
     time.sleep(1.0)
     press(driver, "[data-test=move-by]")
@@ -140,7 +140,7 @@ def tune(driver: Chrome) -> None:
 
 
 def fail(driver: Chrome) -> None:
-    """Have the encoder stuck; what comes after would suffer from it."""
+    """Have the encoder stuck; later pictures would suffer from it."""
     press(driver, "[data-test=fault-encoder_stuck]")
     time.sleep(1.0)
     driver.execute_script("document.activeElement.blur(); window.scrollTo(0, 0)")

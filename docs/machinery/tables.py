@@ -23,7 +23,7 @@ def cell(value: object) -> str:
 
 
 def unit(text: str) -> str:
-    """Return a unit as people write it: N*m is N·m, kg*m^2 is kg·m²; 1 is none."""
+    """Return a unit as people write it: N*m is N·m, kg*m^2 is kg·m²; "" for 1."""
     if text in ("1", "raw"):
         return ""
     return text.replace("^2", "²").replace("*", "·").replace("ohm", "Ω")

@@ -59,7 +59,7 @@ class CanPort:
         )
         try:
             self._bus.send(message)
-        except can.CanError as error:  # a full buffer, or nobody there to acknowledge
+        except can.CanError as error:  # a full buffer, or no node to acknowledge
             self.lost += 1
             if self.lost == 1:
                 logger.warning("the interface did not take frame %s: %s", frame, error)

@@ -160,7 +160,7 @@ def check_seed(bus: Bus) -> None:
 
 
 def store_folder(bus: Bus) -> Path | None:
-    """Return the folder in which nodes keep what is saved, made where it was not; None: nodes keep it themselves."""
+    """Return the folder of the nodes' stores, made if it was missing; None if nodes keep them in memory."""
     if bus.store is None:
         return None
     path = Path(bus.store)

@@ -12,7 +12,7 @@ class Faults:
     """Shares of frames, 0 to 1, that meet a fault; each frame draws for each fault by the wire's seed.
 
     Attributes:
-        drop: Nobody receives the frame; it takes its time on the bus all the same.
+        drop: No node receives the frame; it takes its time on the bus all the same.
         delay: The sender holds the frame back, and what it sends after it, for up to `delay_max` [s].
         duplicate: The frame is sent twice, as CAN does when the last bit of end of frame is disturbed.
         reorder: The sender's next frame goes first; if none comes within 1 ms, nothing has happened.

@@ -50,7 +50,7 @@ def _is_loopback(address: str) -> bool:
 
 
 class _Client:
-    """One connection: the socket, its channel, frames that have come, and what could not be sent yet.
+    """One connection: the socket, its channel, received frames, and data that could not be sent yet.
 
     Attributes:
         frames: That have come and are not on the wire; each extended or not.
@@ -151,7 +151,7 @@ class Hub:
 
     @property
     def channel(self) -> str:
-        """What python-can's slcan interface takes as its channel."""
+        """The channel for python-can's slcan interface."""
         everywhere = self.host == "0.0.0.0"
         return f"socket://{LOOPBACK if everywhere else self.host}:{self.port}"
 
@@ -206,7 +206,7 @@ class Hub:
             self._append(client, lines[stamped])
 
     def flush(self) -> None:
-        """Send what there is to send, without waiting for anybody."""
+        """Send waiting data, without waiting for a client."""
         for client in self._clients:
             if client.unsent and not client.blocked:
                 self._send(client)
@@ -223,7 +223,7 @@ class Hub:
     def _accept(self, now: float) -> None:
         try:
             connection, address = self._listener.accept()
-        except OSError as error:  # gone again already, or no file number left: somebody gives up his
+        except OSError as error:  # gone again already, or no file number left: a client gives up its own
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 self._make_room(now)
             return
@@ -273,7 +273,7 @@ class Hub:
         """
         others = [c for c in self._clients if not (c is newcomer or c.channel.locked or c.dropped)]
         for client in others:
-            if client.frames and client.has_left():  # as long as it has frames nobody reads it
+            if client.frames and client.has_left():  # its frames are not read before they are gone
                 client.end()
         gone = [c for c in others if c.ended]
         unopened = [c for c in others if not c.was_open]
@@ -313,7 +313,7 @@ class Hub:
         client.end()
 
     def _forget_ended(self, wire: Wire) -> None:
-        """Forget who has gone, once what it sent before is on the bus, and who was dropped at once."""
+        """Forget clients that have gone, once their frames are on the bus, and dropped ones at once."""
         for client in [c for c in self._clients if c.ended]:
             if client.dropped or not (client.frames or wire.waiting(client)):
                 self._clients.remove(client)

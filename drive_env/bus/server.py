@@ -29,7 +29,7 @@ class Server:
     Attributes:
         lateness: Of the cycles begun in real time [s].
         skipped: Time that was not made up for [s].
-        guard: Held while the world is changed; whoever else changes it takes it.
+        guard: Held while the world is changed; take it for changes from another thread.
 
     Args:
         world: What is served.
@@ -71,7 +71,7 @@ class Server:
         self._thread.start()
 
     def stop(self) -> None:
-        """End serving; also from a signal handler or another thread. What ended a thread's serving is raised here."""
+        """End serving; also from a signal handler or another thread. Raises the error that ended a serving thread."""
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -136,7 +136,7 @@ class Server:
         return self._start > 0.0
 
     def catch_up(self) -> None:
-        """Let everything happen that is due in real time; whoever calls holds the guard."""
+        """Let everything happen that is due in real time; the caller holds the guard."""
         late = self._now() - self.world.next_cycle
         if late > MOST_BEHIND:
             self.skipped += late

@@ -23,7 +23,7 @@ VERSION = b"V1013\r"  # hardware 1.0, software 1.3
 SERIAL_NUMBER = b"NDE01\r"
 CLOCK = 8_000_000  # Hz, of the SJA1000's bit timing registers
 TOKEN_WANTED = b"K\r"
-TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and at a guess a second nobody finds eight characters
+TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and at a guess a second eight characters are not found
 
 _STANDARD = re.compile(rb"[tr]([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _EXTENDED = re.compile(rb"[TR]([01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)")
@@ -120,7 +120,7 @@ class Channel:
     def _unlock(self, line: bytes) -> bytes:
         if line[:1] != b"K" or self.wrong_token:
             return b""
-        # Compared in constant time: how long it takes tells nothing of how much of it was right.
+        # Compared in constant time, so that the duration does not show how many characters were right.
         if not secrets.compare_digest(line[1:], self._token):
             self.wrong_token = True
             return b""

@@ -1,4 +1,4 @@
-"""What carries frames between a world and its masters."""
+"""Transports: they carry frames between a world and its masters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drive_env.canopen.frames import Frame
 
 
 class Incoming(NamedTuple):
-    """A frame from a master: what it is, whose it is, and whether its identifier has 29 bits."""
+    """A frame from a master: the frame, its sender, and whether its identifier has 29 bits."""
 
     frame: Frame
     sender: Hashable
@@ -27,7 +27,7 @@ class Transport(Protocol):
         """Take a frame of the bus for all masters but its sender."""
 
     def flush(self) -> None:
-        """Send what was taken."""
+        """Send the frames taken so far."""
 
     def close(self) -> None:
         """End it."""

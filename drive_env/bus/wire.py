@@ -24,7 +24,7 @@ Outcome = Literal["received", "lost", "error", "error passive", "bus off"]
 
 
 class Transmission(NamedTuple):
-    """What ended on the bus at time `end` [s], and what became of it.
+    """A transmission that ended on the bus at time `end` [s], and its result.
 
     "received": everybody but the sender has it. "lost": a fault kept it from everybody. "error": an error frame ended
     it and the sender tries again; "error passive": the same, and the sender's controller has become error passive;
@@ -63,7 +63,7 @@ class _Waiting:
 
 
 class _Sender:
-    """A CAN controller: what it has to send leaves in the order in which it was given."""
+    """A CAN controller: its frames leave in the order in which they were given."""
 
     def __init__(self) -> None:
         self.queue: deque[_Waiting] = deque()
@@ -116,7 +116,7 @@ class Wire:
         self.statistics.most_waiting = max(self.statistics.most_waiting, self._num_waiting)
 
     def silence(self, sender: Hashable, until: float) -> None:
-        """Take a sender's controller off the bus until `until` [s], as many errors do; what waited there is lost."""
+        """Take a sender's controller off the bus until `until` [s], as many errors do; its waiting frames are lost."""
         controller = self._senders.get(sender)
         self._give_up(self._add(sender) if controller is None else controller, until)
 
@@ -146,7 +146,7 @@ class Wire:
         return max(self._free_at, min(c.queue[0].ready for c in self._senders.values() if c.queue))
 
     def take(self, until: float) -> Transmission | None:
-        """Return the next transmission that ends at `until` [s] or before, None if there is none.
+        """Return the next transmission that ends at `until` [s] or before, None if no transmission does.
 
         Who wins arbitration is settled only when the bus is free: call it with times that have come.
         """
@@ -180,7 +180,7 @@ class Wire:
             queue.append(waiting)
 
     def _disturbing(self, frame: Frame) -> Sequence[Faults]:
-        """Return what disturbs a frame."""
+        """Return the faults that apply to a frame."""
         if not self.faults and not self.injected:
             return ()
         return [one for one in (self.faults, *self.injected) if one and (not one.only or frame.can_id in one.only)]
@@ -261,7 +261,7 @@ class Wire:
 
 
 def _arbitration_field(waiting: _Waiting) -> tuple[int, bool, int, bool]:
-    """Return what the bus compares: base identifier, extended or not, extension, remote or not; dominant is lower.
+    """Return the bits of arbitration: base identifier, extended or not, extension, remote or not; dominant is lower.
 
     In a standard frame the remote bit lies where an extended one has its substitute, which is recessive: a standard
     frame of either kind wins, its identifier extension bit being dominant.

@@ -20,7 +20,7 @@ MAX_NODE_ID = 127
 
 
 class BusNode(Protocol):
-    """What a world asks of a node; drive_env/canopen/node.py says what each call means."""
+    """The calls of a world to a node; drive_env/canopen/node.py says what each means."""
 
     def receive(self, frame: Frame, now: float) -> None:
         """Take a frame of the bus."""
@@ -29,7 +29,7 @@ class BusNode(Protocol):
         """Prepare for a communication cycle."""
 
     def after_cycle(self, now: float) -> None:
-        """Send what a communication cycle has brought."""
+        """Send the results of a communication cycle."""
 
     def error_passive(self, now: float) -> None:
         """Learn that its controller has become error passive."""
@@ -48,16 +48,16 @@ class BusNode(Protocol):
 
 
 class Beside(Protocol):
-    """What lives by a world's time without being on its bus: another fieldbus of the same machines."""
+    """A second fieldbus of the same machines, which lives by a world's time."""
 
     def begin_cycle(self) -> None:
         """Prepare for a communication cycle."""
 
     def end_cycle(self) -> None:
-        """Take what a communication cycle has brought."""
+        """Take the results of a communication cycle."""
 
     def pass_time(self, now: float) -> None:
-        """Do what is due between cycles until `now` [s]."""
+        """Run everything due between cycles until `now` [s]."""
 
     def next_event(self) -> float:
         """Return when something is due next [s]."""
@@ -77,7 +77,7 @@ class World:
         machines: Those of `drives` that have a load, in the order in which they were added.
         listeners: Called with each frame that everybody received, also its own sender.
         before_cycle: Called as a communication cycle begins; they may send by the wire.
-        beside: Another fieldbus of these drives, that lives by this world's time; None: there is none.
+        beside: Another fieldbus of these drives, that lives by this world's time; None without one.
         time: Time since the world began [s].
         cycles: Communication cycles that have passed.
 
@@ -350,7 +350,7 @@ class World:
 
 
 def without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
-    """Return as many axes of the same device as nobody has commissioned and no motor is connected to."""
+    """Return axes of the same device with factory values and open phases, as those without a motor have."""
     open_phases = {"motor.open_a": 1.0, "motor.open_b": 1.0}
     return EmulatedDrives(
         drives.device.name, "inertia", drives.motor, number, commissioned=False, parameters=open_phases, num_threads=1

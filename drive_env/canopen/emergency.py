@@ -44,7 +44,7 @@ class EmergencyProducer:
             self.told = error_register
 
     def flush(self, now: float) -> None:
-        """Send what may be sent at `now` [s]."""
+        """Send the waiting emergencies that the inhibit time lets go at `now` [s]."""
         while self._waiting and self._can_id is not None:
             if self._sent_at is not None and now - self._sent_at + EPSILON < self._inhibit:
                 return
@@ -52,7 +52,7 @@ class EmergencyProducer:
             self._send(Frame(self._can_id, self._waiting.popleft()))
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Drop waiting emergencies."""
         self._waiting.clear()
         self._sent_at = None
         self.told = 0

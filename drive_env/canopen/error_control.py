@@ -54,7 +54,7 @@ class HeartbeatConsumer:
 
 
 def consumers(entries: Sequence[int]) -> list[HeartbeatConsumer]:
-    """Return who is watched by the values of 1016h; times in ms, 0 and nodes that cannot be watch nobody."""
+    """Return the consumers of 1016h's values; times in ms; a time of 0 or an impossible node-ID watches no node."""
     found = [(raw >> 16 & 0xFF, (raw & 0xFFFF) * 1e-3) for raw in entries]
     return [HeartbeatConsumer(node_id, time) for node_id, time in found if time > 0.0 and 1 <= node_id <= 127]
 
@@ -68,7 +68,7 @@ class NodeGuarding:
         self._life_time = 0.0
 
     def configure(self, life_time: float) -> None:
-        """Take over guard time times life time factor [s]; 0 watches nobody. Life begins with the next request.
+        """Set guard time times life time factor [s]; 0 watches no master. Life begins with the next request.
 
         A master that configures it anew has stopped asking meanwhile: the time since the master before it is no loss.
         """

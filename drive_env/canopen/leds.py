@@ -39,7 +39,7 @@ class Leds(NamedTuple):
 def leds_of(
     state: NmtState, is_bus_off: bool, conditions: Collection[Hashable], error_counter: int, is_lss: bool = False
 ) -> Leds:
-    """Return what the lamps of a node show; of several errors the gravest.
+    """Return the lamps of a node; of several errors the gravest shows.
 
     Args:
         state: NMT state.

@@ -1,6 +1,6 @@
 """The slave of the layer setting services: node-ID and bit rate over the bus, without a node-ID (CiA 305).
 
-A request goes in, the response comes out: eight bytes, or None where there is none. The slave waits until the master
+A request goes in, the response comes out: eight bytes, or None without a response. The slave waits until the master
 switches it into configuration, all slaves at once or the one with an identity. What is configured is pending: a node-ID
 takes effect with the next reset, a bit rate when all activate it at once.
 """
@@ -53,7 +53,7 @@ FASTSCAN_BEGINS = 0x80  # "bit checked" that begins a scan
 
 
 class LssIdentity(NamedTuple):
-    """The LSS address: 1018h, without a 0 for what a device lacks."""
+    """The LSS address: 1018h, with 0 for an entry that a device lacks."""
 
     vendor: int
     product: int
@@ -62,7 +62,7 @@ class LssIdentity(NamedTuple):
 
 
 class LssNode(Protocol):
-    """What the slave asks of its node."""
+    """The calls of the slave to its node."""
 
     def identity(self) -> LssIdentity:
         """Return its identity."""
@@ -83,7 +83,7 @@ class LssNode(Protocol):
         """Fall silent, take the bit rate after `delay` [s], and be silent for as long again."""
 
     def store(self) -> int:
-        """Store what is pending; return the error code."""
+        """Store the pending settings; return the error code."""
 
     def leave_configuration(self) -> None:
         """Learn that the slave waits again: a node that had no node-ID and now has one boots."""
@@ -114,7 +114,7 @@ class LssSlave:
         self._scanned: int | None = None  # part of the identity that the scan is at
 
     def request(self, data: bytes) -> bytes | None:
-        """Return the response to a request; what is no request of eight bytes has none."""
+        """Return the response to a request; None if it is not a request of eight bytes."""
         if len(data) != 8:
             return None
         service = data[0]

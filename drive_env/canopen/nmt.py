@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class NmtState(IntEnum):
-    """NMT state; the number is what heartbeat and guarding send."""
+    """NMT state; the number is the one in heartbeats and guarding."""
 
     INITIALISING = 0
     STOPPED = 4
@@ -26,7 +26,7 @@ class Command(IntEnum):
 
 
 class Services(NamedTuple):
-    """A row of CiA 301, table 37: what works in a state; NMT and error control work in all three."""
+    """A row of CiA 301, table 37: the services of a state; NMT and error control work in all three."""
 
     sdo: bool
     pdo: bool
@@ -44,7 +44,7 @@ _COMMANDS = {int(command): command for command in Command}
 
 
 def parse_command(data: bytes, node_id: int) -> Command | None:
-    """Return the command that an NMT frame has for this node: to all (0) or to it alone; None if there is none."""
+    """Return the command of an NMT frame for this node: to all (0) or to it alone; None if it has no command for it."""
     if len(data) != 2 or data[1] not in (0, node_id):
         return None
     return _COMMANDS.get(data[0])

@@ -138,7 +138,7 @@ class Node:
         self._empty_buffers(takes_time)
 
     def _empty_buffers(self, takes_time: bool) -> None:
-        """Have no frame received and no answer under way, and know what takes time."""
+        """Drop received frames and answers under way."""
         device = self._device
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
         self._takes_time = takes_time
@@ -222,7 +222,7 @@ class Node:
             self._send_segments(now)
 
     def _send_segments(self, now: float) -> None:
-        """Send what the bus takes of a block upload: a controller's buffer is filled no further than half."""
+        """Send segments of a block upload: a controller's buffer is filled no further than half."""
         while self._has_room():
             segment = self._sdo.next_segment(now)
             if segment is None:
@@ -256,7 +256,7 @@ class Node:
             handler(frame.data, now)
 
     def before_cycle(self, now: float) -> None:
-        """Do what is due before the drives advance by one communication cycle that begins at `now` [s].
+        """Run everything due before the drives advance by one communication cycle that begins at `now` [s].
 
         A lost master so stops the drives in the cycle that begins.
         """
@@ -295,7 +295,7 @@ class Node:
             self._on_sync(data, now)
 
     def after_cycle(self, now: float) -> None:
-        """Do what is due after it: emergencies, event-driven PDOs, timers, heartbeat; the cycle ended at `now` [s]."""
+        """Run everything due after it: emergencies, event-driven PDOs, timers, heartbeat; it ended at `now` [s]."""
         self._now = now
         if not self._is_online:
             return
@@ -322,7 +322,7 @@ class Node:
         self._store.loses_power = value
 
     def leds(self, error_counter: int = 0) -> Leds:
-        """Return what its lamps show; `error_counter` is its controller's."""
+        """Return its lamps; `error_counter` is its controller's."""
         boots = self.state is NmtState.INITIALISING
         is_lss = self.node_id == UNCONFIGURED or (self._lss is not None and self._lss.is_configuring)
         return leds_of(self.state, not self._is_online and not boots, self._errors.conditions, error_counter, is_lss)
@@ -425,7 +425,7 @@ class Node:
         """
         self.state = NmtState.INITIALISING
         if self._take_pending_node_id():
-            # Whoever commanded it, and watched it, knows it no more by its new number.
+            # The master that commanded and watched it does not know it by its new number.
             self._axes.trip()
         self._leaves_for_bootloader = False
         self._received.clear()
@@ -465,7 +465,7 @@ class Node:
         self._handlers = {lss.REQUEST: (self._on_lss,)}
 
     def _configure(self, index: int) -> None:
-        """Let the service behind a communication object take over what was written."""
+        """Have the service behind a communication object read its written value."""
         module = self._module
         if index in (communication.EMERGENCY_ID, communication.EMERGENCY_INHIBIT):
             raw = module.value(communication.EMERGENCY_ID)
@@ -604,7 +604,7 @@ class Node:
         self._segment_at = math.inf
 
     def _on_lss(self, data: bytes, now: float) -> None:
-        assert self._lss is not None, "nobody else is called"
+        assert self._lss is not None, "called on nodes with LSS only"
         self._work = self._device.canopen.sdo_time
         try:
             answer = self._lss.request(data)
@@ -620,7 +620,7 @@ class Node:
             self._clock.set(*time, self._came)
 
     def _on_sync(self, data: bytes, now: float) -> None:
-        # CiA 301: without or with a counter. Whoever has no 1019h takes both.
+        # CiA 301: without or with a counter. A node without 1019h takes both.
         if len(data) > 1 or not nmt.SERVICES[self.state].pdo:
             return
         if self._module.has(communication.SYNC_OVERFLOW):
@@ -667,7 +667,7 @@ class Node:
         self._react(COMMUNICATION_ERROR, "heartbeat_lost")
 
     def _react(self, error_class: int, told: str = COMMUNICATION) -> None:
-        """Do what 1029h says of an error that is detected in operational."""
+        """Change the NMT state as 1029h says for an error that is detected in operational."""
         if self.state is not NmtState.OPERATIONAL:
             return
         raw = self._module.value(communication.ERROR_BEHAVIOUR, error_class)
@@ -704,7 +704,7 @@ class Node:
         module.commands[communication.TIME_STAMP, 0] = lambda raw: self._clock.set_microseconds(raw, self._came)
 
     def _eds_text(self) -> str:
-        """Return what 1021h holds, each byte a character: the EDS as it is, which 1022h says is not compressed."""
+        """Return the content of 1021h, each byte a character: the EDS as it is, which 1022h says is not compressed."""
         return eds_text(self._device.eds).encode().decode("latin-1")
 
     def _leave_for_bootloader(self) -> None:
@@ -728,7 +728,7 @@ class Node:
 
     # --- what LSS asks for (drive_env/canopen/lss.py) -----------------------------------------------------------------
     def identity(self) -> LssIdentity:
-        """Return vendor, product, revision and serial number, 0 for what the device lacks."""
+        """Return vendor, product, revision and serial number; 0 for one that the device lacks."""
         has = self._module.subs(IDENTITY)
         port = self.dictionary.port
         parts = [port(IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]
@@ -761,7 +761,7 @@ class Node:
         """Stop the axes and fall silent; have the pending bit rate after `delay` [s], and speak after as long again."""
         if self._pending_bit_rate is None:
             return
-        self._axes.trip()  # nobody can stop them over a bus whose nodes change their bit rate
+        self._axes.trip()  # no master can stop them over a bus whose nodes change their bit rate
         self._is_online = False
         self._received.clear()
         self._close_sdo()

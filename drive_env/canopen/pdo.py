@@ -15,7 +15,7 @@ EPSILON = 1e-6  # s: times are sums of cycles
 
 
 class Pdo:
-    """What both directions have in common: identifier, transmission type and the mapped objects.
+    """Common part of both directions: identifier, transmission type and the mapped objects.
 
     Args:
         index: Index of its communication parameter.
@@ -31,7 +31,7 @@ class Pdo:
         self.configure()
 
     def configure(self) -> None:
-        """Take over what the objects say."""
+        """Read the settings from the objects."""
         objects, index = self._objects, self.index
         cob_id = objects.value(index, 1)
         self.can_id = None if cob_id & frames.INVALID else cob_id & frames.IDENTIFIER
@@ -50,7 +50,7 @@ class ReceivePdo(Pdo):
     """A PDO that the drive receives."""
 
     def configure(self) -> None:
-        """Take over what the objects say; what waits for SYNC is forgotten."""
+        """Read the settings from the objects; data waiting for SYNC are dropped."""
         super().configure()
         self._waiting: bytes | None = None
 
@@ -64,14 +64,14 @@ class ReceivePdo(Pdo):
         return self._apply(data)
 
     def latch(self) -> str | None:
-        """Let what came since the last SYNC take effect; return the condition that it makes."""
+        """Let data received since the last SYNC take effect; return the error condition, if it makes one."""
         if self._waiting is None:
             return None
         data, self._waiting = self._waiting, None
         return self._apply(data)
 
     def forget(self) -> None:
-        """Forget what waits for SYNC."""
+        """Drop data waiting for SYNC."""
         self._waiting = None
 
     def _apply(self, data: bytes) -> str | None:
@@ -82,8 +82,8 @@ class TransmitPdo(Pdo):
     """A PDO that the drive sends.
 
     Event-driven ones (254, 255) are sent when a mapped value has changed since the last look, once per communication
-    cycle, and when their event timer ends; so is one when the node becomes operational, since then nobody knows its
-    values. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last;
+    cycle, and when their event timer ends; so is one when the node becomes operational, since its values are unknown
+    then. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last;
     event timer and inhibit time are not theirs (CiA 301, 1800h).
     """
 
@@ -100,7 +100,7 @@ class TransmitPdo(Pdo):
         super().__init__(index, objects, port)
 
     def configure(self) -> None:
-        """Take over what the objects say."""
+        """Read the settings from the objects."""
         before = self.can_id, self._sent_at
         super().configure()
         self._inhibit = self._objects.value(self.index, 3) * self._inhibit_unit
@@ -122,7 +122,7 @@ class TransmitPdo(Pdo):
         """Return the data to send at this SYNC, None if there is nothing to send.
 
         Args:
-            counter: The count in the SYNC, None of one without; the one with the SYNC start value (1800h:06) is the
+            counter: The count in the SYNC, None without one; the one with the SYNC start value (1800h:06) is the
                 first.
         """
         if not self.is_synchronous or not len(self._mapped):

@@ -9,7 +9,7 @@ EPSILON = 1e-6  # s: times are sums of cycles
 
 
 class SyncProducer:
-    """When to send SYNC, and what is in it."""
+    """When to send SYNC, and its data."""
 
     def __init__(self) -> None:
         self._period = 0.0
@@ -62,5 +62,5 @@ class SyncWindow:
         self._opened = None
 
     def is_over(self, now: float) -> bool:
-        """Return whether what comes or goes at `now` [s] is late."""
+        """Return whether a PDO at `now` [s] is later than the window after SYNC."""
         return self._length > 0.0 and self._opened is not None and now - self._opened > self._length + EPSILON

@@ -19,7 +19,7 @@ def encode(days: int, milliseconds: int) -> bytes:
 
 
 def decode(data: bytes) -> tuple[int, int] | None:
-    """Return days since 1984 and milliseconds after midnight; None of what is no time of day."""
+    """Return days since 1984 and milliseconds after midnight; None for data that are not a time of day."""
     if len(data) != 6:
         return None
     milliseconds = int.from_bytes(data[:4], "little") & 0x0FFF_FFFF

@@ -63,7 +63,7 @@ def check_model(
         from drive_env.trials.replay import read_log
 
         recorded = read_log(log)
-        # The compiler is imported from here on: a mistake above is told at once.
+        # The compiler is imported from here on: a mistake above is reported at once.
         from drive_env.commands.parameters import load_parameters
         from drive_env.emulator.emulated_drives import EmulatedDrives
         from drive_env.envs.randomisation import Distributions

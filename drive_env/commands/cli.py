@@ -1,4 +1,4 @@
-"""The command `drive-env`: it only puts together what lies in `tools`, one file per command or family."""
+"""The command `drive-env`: it assembles the commands of this folder, one file per command or family."""
 
 from __future__ import annotations
 

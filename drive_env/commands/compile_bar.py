@@ -1,4 +1,4 @@
-"""What a cold start shows on stderr while Numba compiles the kernels: a line, and on a terminal a bar."""
+"""The progress of a cold start on stderr while Numba compiles the kernels: a line, and on a terminal a bar."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OF_OTHERS = 1
 
 
 def show_compiling() -> CompileBar:
-    """Let a program show what is compiled from now on, and return what shows it."""
+    """Show kernels as they compile from now on, and return the bar that shows them."""
     kernels = logging.getLogger(KERNELS)
     for handler in [one for one in kernels.handlers if isinstance(one, CompileBar)]:
         kernels.removeHandler(handler)
@@ -36,7 +36,7 @@ def show_compiling() -> CompileBar:
 
 
 class CompileBar(logging.Handler):
-    """Shows what `mechanics.kernel_files` logs: lines as they are, kernels as a bar whose parts are functions."""
+    """Shows the log of `mechanics.kernel_files`: lines as they are, kernels as a bar whose parts are functions."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""`drive-env ethercat`: what a try of EtherCAT on one machine needs."""
+"""`drive-env ethercat`: network namespaces for a try of EtherCAT on one machine."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def fault(
             ]
             words += [f"when={when}"] if when else []
             line = shlex.join(words)
-            order = parse_order(line)  # what cannot be understood is told here, with or without a server
+            order = parse_order(line)  # a mistake in it is reported here, with or without a server
             checked_parameters(find_fault(order.name), order.parameters)
             number = ask(control, f"fault {line}")["number"]
             print_json({"number": number}) if as_json else print(number)

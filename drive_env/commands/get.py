@@ -159,7 +159,7 @@ def _tell_plan(
     raw: bool,
     json: bool,
 ) -> None:
-    """Say what the drive has, and what would be written; raises for a value that the object cannot take."""
+    """Print the present values and those to write; raises for a value that the object cannot take."""
     from drive_env.dictionary.access import check_limits, check_writable
 
     check_writable(entry)
@@ -239,8 +239,8 @@ def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
     if who := _live(drives):
         raise RuntimeError(
             f"{who} is enabled by its statusword, and {entry.label} is part of what stops it when its master dies, "
-            "whoever set it: it was not changed, and --yes does not change that. Switch the axis off first, in the "
-            "program that enabled it or with drive-env set 6040 2"
+            "whichever program set it: it was not changed, and --yes does not change that. Switch the axis off first, "
+            "in the program that enabled it or with drive-env set 6040 2"
         )
 
 

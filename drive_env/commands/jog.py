@@ -166,7 +166,7 @@ class _OneAxis:
         self.drives.write(name, raw, where=self.where)
 
     def rows(self, raw: list[int], others: int) -> Any:
-        """Return rows of what is played: of it, and of the others what does nothing."""
+        """Return rows to play: those of the axis, and for the others values without effect."""
         import numpy as np
 
         return np.where(self.where, np.array(raw, int)[:, None], others)
@@ -183,7 +183,7 @@ class _OneAxis:
 
 @dataclass(frozen=True)
 class _Movement:
-    """What an axis shall do, in the drive's units: turn at a speed for a time [s], or by a distance if there is one."""
+    """The movement of an axis, in the drive's units: turn at a speed for a time [s], or by a distance if given."""
 
     velocity: int
     duration: float
@@ -233,7 +233,7 @@ def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale:
 
 @contextlib.contextmanager
 def _what_stops(reasons: list[str]) -> Iterator[None]:
-    """Note what ends a movement early, in words of this command; what the bus says is none of it."""
+    """Note why a movement ends early, in words of this command; errors of the bus pass."""
     from drive_env.master.errors import BusError
     from drive_env.safety.envelope import SafetyError
 
@@ -248,7 +248,7 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
 
 
 def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> str:
-    """Return what a speed is, and how rpm are written where it was a bare number."""
+    """Return a speed in the object's unit, with a hint how to write rpm if it was a bare number."""
     from drive_env.master import quantities
 
     text = quantities.show(velocity, entry, scale)
@@ -290,7 +290,7 @@ def _tell_plan(
     *,
     json: bool,
 ) -> None:
-    """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
+    """Print where the axis is and the planned movement; raises for an axis in fault, which could not be enabled."""
     from drive_env.master import quantities
 
     status = one.read(cia402.STATUSWORD)

@@ -146,7 +146,7 @@ def replay(
 
 
 def _check_frames(file: Path, frames: list[Any], speed: float) -> None:
-    """Raise ValueError for frames that classic CAN does not have, and stamps between which nobody can wait.
+    """Raise ValueError for frames that classic CAN does not have, and for waits between stamps that are too long.
 
     A log goes a little back where two buses were.
     """
@@ -166,7 +166,7 @@ def _check_frames(file: Path, frames: list[Any], speed: float) -> None:
 
 
 def _replay(port: Any, frames: list[Any], speed: float, timeout: float, json: bool) -> None:
-    """Send frames, stop what they leave live, and say so; a signal ends the sending, never the stop."""
+    """Send frames, stop axes that they leave live, and say so; a signal ends the sending, never the stop."""
     from drive_env.commands.replay_watchdog import ReplayWatchdog
     from drive_env.commands.replayed_motors import ReplayedMotors
     from drive_env.held_signals import held_signals

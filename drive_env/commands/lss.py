@@ -66,7 +66,7 @@ def scan_lss(
 ) -> None:
     """Find the nodes that have no node-ID, by fastscan, and print the identity of each. Nothing is changed.
 
-    A node takes 133 steps, of which those that nobody answers wait for --timeout: 2 s, with large numbers up to 13 s.
+    A node takes 133 steps; each without an answer waits for --timeout: 2 s, with large numbers up to 13 s.
     Nodes that have a node-ID are found by `drive-env scan`.
     """
     with errors_as_exit_codes():
@@ -138,7 +138,7 @@ def set_node_id(
             if not dry_run:
                 kept = "" if store else "; it is lost with the power"
                 when = "" if boots else "; it takes effect with the next reset (NMT, or power)"
-                if boots:  # by SDO, which is none of LSS
+                if boots:  # by SDO, which is not part of LSS
                     await_node(port, chosen, new, node, BOOT_TIMEOUT)
                 print(f"{_name(chosen, node)} has {what}{when}{kept}")
 
@@ -227,7 +227,7 @@ def _check_choice(identity: str | None, node: int | None, dry_run: bool) -> None
     if identity is not None:
         parse_identity(identity)
     elif dry_run:
-        raise ValueError("--dry-run asks nobody which node is there; name it with --identity")
+        raise ValueError("--dry-run cannot find out which node is there; name it with --identity")
 
 
 def _choose(port: Port, master: LssMaster, identity: str | None, node: int | None, timeout: float) -> LssIdentity:

@@ -99,7 +99,7 @@ class _Pushing:
         self._watch = LimitAtRest(drives)
 
     def look(self) -> list[bool]:
-        """Return which of the axes do now, as they are listed."""
+        """Return which of the axes stand at their current limit now, in their order."""
         if not self._watch.is_known:
             return [False] * len(self._axes)
         names: tuple[int | Role, ...] = (

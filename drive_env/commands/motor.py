@@ -136,7 +136,7 @@ def _number(name: str, text: str) -> float:
 
 
 def _missing(kind: str, given: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """Return what is still to be asked for: of each quantity the forms in which it can be given."""
+    """Return the quantities that are still missing, each as the names by which it can be given."""
     from drive_env import motors
 
     if kind == "stepper":
@@ -170,7 +170,7 @@ def _ask_for(choice: tuple[str, ...]) -> tuple[str, float]:
 
 
 def _is_answered() -> bool:
-    """Return whether somebody is there to answer."""
+    """Return whether a user at a terminal can answer."""
     return sys.stdin.isatty()
 
 
@@ -197,7 +197,7 @@ def _write(file: Path, data: Mapping[str, object]) -> None:
 
 
 def _tell(file: Path, row: Motor) -> None:
-    """Say what the numbers make of the motor, by which a wrong one is noticed."""
+    """Print figures that follow from the numbers, so that a wrong one is noticed."""
     from drive_env.devices import device_names, find_device
     from drive_env.firmware import motor_kinds
     from drive_env.motors import is_extra_low
@@ -213,7 +213,7 @@ def _tell(file: Path, row: Motor) -> None:
         print(f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * rpm:.0f} rpm without load")
         print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
     of_kind = [device for device in map(find_device, device_names()) if row.kind in motor_kinds(device.firmware_name)]
-    # Of another voltage class nobody expects it.
+    # A device of another voltage class is not expected to turn it.
     of_kind = [one for one in of_kind if is_extra_low(one.highest_supply) == is_extra_low(row.voltage)] or of_kind
     refused = {}
     for device in of_kind:

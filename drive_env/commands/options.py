@@ -78,7 +78,7 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmat
 _INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
 
 
-# Whoever types one of these means drives on a bus.
+# Each of these options means drives on a bus.
 OF_A_BUS = ("interface", "channel", "node", "nodes", "bitrate", "lockstep")
 
 
@@ -155,7 +155,7 @@ def look_first(
 
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
-    """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    """End with one red line: code 1 for an error of a drive or the bus, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
 
@@ -170,7 +170,7 @@ def ending_by(
     refused: tuple[type[Exception], ...],
     mistakes: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """End a program by its own `fail`, which takes what to say and the exit code.
+    """End a program by its own `fail`, which takes the message and the exit code.
 
     Args:
         fail: What ends it.
@@ -195,7 +195,7 @@ def ending_by(
         fail(error, REFUSED)
     except OSError as error:
         if isinstance(error, BrokenPipeError) and output_is_closed():
-            raise typer.Exit(CLOSED) from None  # `| head -1` has seen enough: no mistake, and nobody to tell
+            raise typer.Exit(CLOSED) from None  # `| head -1` has read enough: no error, and no reader for a message
         fail(f"{error.filename}: {error.strerror}" if error.filename else error, USER_ERROR)
     except MemoryError as error:
         fail(f"there is not enough memory{f' ({error})' if str(error) else ''}; ask for less at a time", USER_ERROR)
@@ -205,7 +205,7 @@ def ending_by(
 
 @contextmanager
 def told_if_interrupted(what: str) -> Iterator[None]:
-    """Say what was written, if Ctrl-C ends a block before the command has said it."""
+    """Print which files were written, if Ctrl-C ends a block before the command has printed it."""
     try:
         yield
     except KeyboardInterrupt:
@@ -270,7 +270,7 @@ def ask(question: str, yes: bool) -> None:
 
 
 def scales_of(drives: BusDrives) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it."""
+    """Read the scales of every axis, as far as the drives have them."""
     from drive_env.master import quantities
 
     return quantities.scales_of(drives)
@@ -289,7 +289,7 @@ def default_samples(known: ObjectDictionary, names: Iterable[str]) -> list[str]:
 
 
 def cycle_for(known: Description) -> float | None:
-    """Return a time between SYNCs [s] in which the bus has room for all axes of a node; None of a node with one."""
+    """Return a time between SYNCs [s] in which the bus has room for all axes of a node; None for a node with one."""
     return None if known.num_axes == 1 else AXIS_CYCLE * known.num_axes
 
 
@@ -323,13 +323,13 @@ def axes_of_nodes(drives: BusDrives, axis: int | None) -> list[int]:
 
 
 def axis_name(drives: BusDrives, axis: int) -> str:
-    """Return what a line calls an axis: its node and, of a node with several, its number in the node."""
+    """Return an axis' name for a line: its node and, of a node with several, its number in the node."""
     node, part = divmod(axis, drives.description.num_axes)
     return f"node {drives.nodes[node]}" + (f" axis {part}" if drives.description.num_axes > 1 else "")
 
 
 def axis_place(drives: BusDrives, axis: int) -> dict[str, Any]:
-    """Return what JSON calls an axis, as `axis_name` does a line."""
+    """Return an axis' place for JSON, as `axis_name` does for a line."""
     node, part = divmod(axis, drives.description.num_axes)
     return {"node": drives.nodes[node]} | ({"axis": part} if drives.description.num_axes > 1 else {})
 

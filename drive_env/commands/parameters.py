@@ -238,13 +238,13 @@ def _exchange(
     json: bool,
     dry_run: bool,
 ) -> None:
-    """Write parameters and say what the drive holds then, as another connection reads it.
+    """Write parameters, and print the drive's values as another connection reads them then.
 
     Args:
         bus: The node.
         wanted: The parameters.
         axis: Of the node.
-        name: What they are from.
+        name: Their source.
         check: Raises for a drive that they are not meant for.
         store: Have the drive keep them.
         yes: Do not ask.
@@ -296,7 +296,7 @@ def _exchange(
 
 
 def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, json: bool) -> None:
-    """Say what would be written."""
+    """Print the parameters that would be written."""
     if json:
         rows = [_row(difference, scale) for difference in differences]
         print_json({"would change": rows, "would store": store, "written": 0})
@@ -348,7 +348,7 @@ def _check_axis(drives: BusDrives, axis: int) -> None:
 
 
 def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
-    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
+    """Return parameters as TOML; the objects' names are comments, their indices are read."""
     from drive_env.master.identity import read_identity
     from drive_env.whole_file import FORMAT
 
@@ -372,7 +372,7 @@ def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int
 
 
 def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
-    """Return the parameters of a file; ValueError for what is none."""
+    """Return the parameters of a file; ValueError if it has none or is damaged."""
     from drive_env.dictionary.access import check_in_range, check_writable
 
     rows = _read_toml(path).get("parameters")
@@ -395,7 +395,7 @@ def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Return what a file holds; ValueError if it is no TOML."""
+    """Return the content of a TOML file; ValueError if it is missing or not TOML."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
     try:

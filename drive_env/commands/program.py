@@ -1,4 +1,4 @@
-"""What the three programs have before their commands: the version, and how much is said besides results."""
+"""Options of the three programs before their commands: the version, and how much they print besides results."""
 
 from __future__ import annotations
 

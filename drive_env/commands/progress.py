@@ -14,7 +14,7 @@ shown: list[Progress] = []
 
 
 def progress_on(console: Console, *, transient: bool = False) -> Progress:
-    """Return bars for a console: what is under way, the share done and the time since; transient ones vanish."""
+    """Return bars for a console: the task, the share done and the time since; transient ones vanish."""
     from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     class Bars(Progress):

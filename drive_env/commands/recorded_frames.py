@@ -64,7 +64,7 @@ def _frames_as_bytes(file: Path, everything: bool) -> bytes:
 
 
 def _check_end(file: Path) -> None:
-    """Raise ValueError for a candump that ends within a line: what is left of a frame that was cut is another one."""
+    """Raise ValueError for a candump that ends within a line: the rest of a frame that was cut is another frame."""
     if file.suffix.lower() != ".log" or file.stat().st_size == 0:
         return
     with file.open("rb") as content:

@@ -1,4 +1,4 @@
-"""What stops the drives when `drive-env replay` itself dies: their heartbeat consumers, set for as long as it runs."""
+"""The watchdog for the death of `drive-env replay` itself: heartbeat consumers of the drives, set while it runs."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class ReplayWatchdog:
         return without
 
     def give_up(self, nodes: Iterable[int]) -> list[str]:
-        """Give nodes whose motors are proved off what they had; the others stop by themselves.
+        """Give nodes whose motors are proved off their settings back; the others stop by themselves.
 
         Returns:
             What could not be put back, in words.
@@ -151,16 +151,16 @@ class ReplayWatchdog:
 
 
 def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], dict[int, str]]:
-    """Return the nodes whose watch over a master frames set themselves, and of which there is none, why (0: all)."""
+    """Return the nodes whose watch over a master the frames set, and those left without one, why (0: all)."""
     own: set[int] = set()
     left: dict[int, str] = {}
     for frame in frames:
         can_id, data = frame.arbitration_id, bytes(frame.data)
         if can_id == NMT and len(data) == 2:
             if data[0] in RESETS:
-                left[data[1]] = "the frames reset it, after which it watches nobody"
+                left[data[1]] = "the frames reset it, after which it watches no master"
             elif data[0] != START:
-                left.setdefault(data[1], "the frames take it out of NMT operational, where it may watch nobody")
+                left.setdefault(data[1], "the frames take it out of NMT operational, where it may watch no master")
             elif "operational" in left.get(data[1], ""):
                 del left[data[1]]
             continue

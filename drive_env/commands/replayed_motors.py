@@ -74,7 +74,7 @@ class ReplayedMotors:
         self._no_drives: set[int] = set()  # they answer, and have no statusword
 
     def check_none_is_live(self) -> None:
-        """Raise BusError for a node that somebody else runs."""
+        """Raise BusError for a node that another master has enabled."""
         status = self._statuswords(self._nodes)
         live = [f"{name(axis)} ({word:04X}h)" for axis, word in status.items() if cia402.is_live(word)]
         if live:
@@ -94,13 +94,13 @@ class ReplayedMotors:
         return sorted(self._there - self._no_drives)
 
     def stop(self) -> tuple[list[Stopped], list[str]]:
-        """Stop what is live: quick stop, off when it is at rest, and a look at the statusword.
+        """Stop live axes: quick stop, off at rest, and a look at the statusword.
 
         Returns the axes that were, and in words what could not be proven to be off.
         """
         stopped: list[Stopped] = []
         unproven: list[str] = []
-        # Who is known to be there answers at once; nobody's motor runs on while others are waited for.
+        # Nodes that are known to be there answer at once; no motor may run on while others are waited for.
         for nodes in (sorted(self._there), [node for node in self._nodes if node not in self._there]):
             known = bool(self._there.intersection(nodes))
             try:
@@ -148,7 +148,7 @@ class ReplayedMotors:
         return found
 
     def _ask(self, nodes: Iterable[int], index: int) -> dict[int, int | None]:
-        """Return what nodes answer to the read of an object; None of one that has no such object."""
+        """Read an object of nodes; return the answers, None for a node without that object."""
         answers: dict[int, int | None] = {}
 
         def take(node: int, data: bytes) -> None:
@@ -167,7 +167,7 @@ class ReplayedMotors:
 def stop_axes(
     port: Port, clients: Mapping[int, ObjectClient], axes: Sequence[Axis], timeout: float
 ) -> list[Stopped | str]:
-    """Quick-stop axes, all at once, and switch each off at rest; return how each ended, or in words what is not off.
+    """Quick-stop axes, all at once, and switch each off at rest; return how each ended, or which are not off.
 
     Args:
         port: The bus.
@@ -212,7 +212,7 @@ class _Stop:
         self._start = time.monotonic()
 
     def read_scale(self) -> None:
-        """Read what of a way counts as rest."""
+        """Read the scale of positions, of which a small way counts as rest."""
         for index, sub in _scales():
             scale = self._read(index + (self._offset if index in cia402.PROFILE_AREAS else 0), sub)
             if scale:
@@ -220,7 +220,7 @@ class _Stop:
                 break
 
     def look(self) -> None:
-        """Look at statusword and position, and do what is next."""
+        """Look at statusword and position, and take the next step of the stop."""
         now = time.monotonic()
         word = self._read(cia402.STATUSWORD + self._offset)
         if word is not None and not cia402.is_live(word):
@@ -256,7 +256,7 @@ class _Stop:
         return self._quiet >= AT_REST_LOOKS
 
     def _is_to_be_cut(self, now: float) -> bool:
-        """Return whether the ramp does not end in time: by the clock, or by what it has done so far."""
+        """Return whether the ramp will not end in time: by the clock, or by its deceleration so far."""
         since = now - self._start
         if since > RAMP:
             self._cut = f"it was not at rest after {RAMP:g} s of its quick stop"
@@ -304,7 +304,7 @@ def nodes_spoken_to(frames: Iterable[Any]) -> tuple[int, ...]:
 
 
 def name(axis: Axis) -> str:
-    """Return what a line calls an axis."""
+    """Return an axis' name for a line."""
     node, part = axis
     return f"node {node}" + (f" axis {part}" if part else "")
 
@@ -314,7 +314,7 @@ def _list(nodes: Iterable[int]) -> str:
 
 
 def _scales() -> list[tuple[int, int]]:
-    """Return the objects that may say what a revolution counts: the standard's, and those of the devices there are."""
+    """Return the objects that may hold the scale of positions: the standard's, and those of the known devices."""
     roles = [find_device(name).roles for name in device_names()]
     own = {each[Role.POSITION_SCALE] for each in roles if Role.POSITION_SCALE in each}
     return [(cia402.ENCODER_RESOLUTION, 1), *sorted(own)]

@@ -1,4 +1,4 @@
-"""`drive-env scan`: find the nodes on the bus, and what they are."""
+"""`drive-env scan`: find the nodes on the bus, and identify them."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> No
 
 
 def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, str, int]]:
-    """Return the nodes that answer or are heard, each with what is known of its state, and how many answered as it."""
+    """Return the nodes that answer or are heard, each with its state if known, and the number that answered as it."""
     from drive_env.canopen.frames import ERROR_CONTROL, SDO_REQUEST, SDO_RESPONSE
 
     answered: Counter[int] = Counter()

@@ -234,7 +234,7 @@ def _record(
     before: float,
     wait: float,
 ) -> tuple[dict[Any, Any], int, BaseException | None]:
-    """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
+    """Return rows of each entry, the row at which the trigger fired, and the error that ended the recording."""
     count, keep = round(duration / 0.001), round(before / 0.001)
     if trigger is None:
         samples = _Samples(drives, axes, entries)
@@ -257,7 +257,7 @@ def _wait_for(
     import numpy as np
 
     rows = samples.none()
-    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # a wrong level is told before the wait
+    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # a wrong level is reported before the wait
     held = True  # a condition that holds from the start must end first
     for _ in range(max(1, round(wait / CHUNK))):
         chunk = samples.record(CHUNK)

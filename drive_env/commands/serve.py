@@ -16,7 +16,7 @@ import typer
 
 from drive_env.commands.options import REFUSED, USER_ERROR, fail
 
-# The compiler and MuJoCo take long to import: whoever asks for --help should not pay it.
+# The compiler and MuJoCo take long to import: --help should not wait for them.
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
     from drive_env.bus.server import Server
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 AUTO = "auto"  # as --token
-NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of what is not named as its option
-NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
+NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of fields with another option name
+NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then receives nothing
 ETHERCAT = ("ethercat", "ethercat-udp")
 TOKEN_BYTES = 12  # of chance: 16 characters
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
@@ -143,7 +143,7 @@ def serve(
 
 
 def _bus(one: Mapping[str, Any], config: Path | None, bitrate: int | None, store: Path | None, seed: int | None) -> Bus:
-    """Return the bus that the arguments ask for; `one` are those of its one machine, None for what is not given."""
+    """Return the bus of the arguments; `one` are those of its one machine, None for those not given."""
     from drive_env.bus.config import Bus, BusConfigError, Machine, load_bus
 
     one = {key: value for key, value in one.items() if value is not None}
@@ -241,7 +241,7 @@ def _server(
 
 
 def _beside(server: Server, bus: Bus, real_time: bool) -> list[BesideCan]:
-    """Return what answers the EtherCAT master of a bus that has drives on both."""
+    """Return the EtherCAT side of a bus that has drives on both; [] without one."""
     from drive_env.commands.serve_ethercat import open_beside
 
     if not bus.has_both:
@@ -293,7 +293,7 @@ def _can_port(interface: str, channel: str | None, bit_rate: int) -> Transport:
 
 
 def _warm_up(bus: Bus) -> None:
-    """Do once on drives that are thrown away what serving does: what happens first compiles or loads for long."""
+    """Do once, on drives that are thrown away, the work of serving: its first time compiles or loads for long."""
     from drive_env.bus.config import build_world
     from drive_env.canopen.frames import NMT, SDO_REQUEST, SYNC, Frame
 
@@ -325,9 +325,9 @@ def _announce(
     if isinstance(hub, Hub):
         if hub.is_public:
             print(
-                f"drive-env: {hub.host}:{hub.port} is open to the network: whoever can reach it and has the token may "
-                "read and move these drives. Token and frames travel as plain text; where others listen, serve on "
-                f"{LOOPBACK} and use an SSH tunnel."
+                f"drive-env: {hub.host}:{hub.port} is open to the network: any program that can reach it and has "
+                "the token may read and move these drives. Token and frames travel as plain text; where others listen, "
+                f"serve on {LOOPBACK} and use an SSH tunnel."
             )
         print("import can")
         print(f'bus = can.Bus(interface="slcan", channel="{hub.channel}", sleep_after_open=0)')
@@ -349,7 +349,7 @@ def _booted(server: Server, given: int) -> str:
 
 
 def _statistics(server: Server) -> str:
-    """Return what --stats prints."""
+    """Return the lines of --stats."""
     world, late = server.world, server.lateness
     counts = world.wire.statistics
     lost = counts.lost + getattr(server.transport, "lost", 0)
@@ -370,7 +370,7 @@ def _statistics(server: Server) -> str:
 
 
 def _ender(server: list[Server | EtherCatServer]) -> Any:
-    """Return a signal handler that ends the server, or the process where there is none yet."""
+    """Return a signal handler that ends the server, or the process if the server does not exist yet."""
 
     def end(*_: object) -> None:
         if server:

@@ -40,7 +40,7 @@ def open_ethercat(
         except BusConfigError as error:
             fail(str(error))
 
-    open_way().close()  # a mistake is told before a minute of compiling
+    open_way().close()  # a mistake is reported before a minute of compiling
     world = build(bus, not real_time)
     first = build(replace(bus, machines=bus.machines[:1], store=None), True)
     first.power_on()
@@ -71,7 +71,7 @@ def open_beside(server: Server, bus: Bus, fail: Callable[[str], NoReturn]) -> Be
 
 
 def run_ethercat(server: EtherCatServer, bus: Bus, duration: float | None, pcap: Path | None, stats: bool) -> None:
-    """Serve until `duration` [s] is over or somebody stops it; what is printed is for a user."""
+    """Serve until `duration` [s] is over or a signal ends it; lines are printed for a user."""
     from drive_env.ethercat.pcap_log import PcapLog
 
     log = None
@@ -115,7 +115,7 @@ def _announce(server: EtherCatServer, bus: Bus) -> None:
 
 
 def _statistics(server: EtherCatServer) -> str:
-    """Return what --stats prints."""
+    """Return the lines of --stats."""
     world, way = server.world, server.way
     lines = [f"{way.answered} frames answered in {world.time:.3f} s of the drives' time, {way.lost} lost"]
     for name, late in (("cycles", server.lateness), ("answers", server.answer_times)):

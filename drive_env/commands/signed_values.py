@@ -11,7 +11,7 @@ _NEGATIVE = re.compile(r"-\.?\d")
 
 
 class SignedValues(TyperCommand):
-    """A command that takes what looks like a negative number as a value, before `--` as behind it."""
+    """A command that takes an argument that looks like a negative number as a value, before `--` as behind it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line; a space in front hides the minus from the parser."""

@@ -126,7 +126,7 @@ def check_extra() -> None:
 
 
 def _machine(device: str, load: str, motor: str | None, factory: bool, seed: int) -> Callable[[], Drives]:
-    """Return what opens an emulated machine; ValueError for one that cannot be."""
+    """Return a function that opens an emulated machine; ValueError if it cannot be opened."""
     from drive_env.devices import find_device
     from drive_env.motors import find_motor
     from mechanics.loads import find_load
@@ -152,7 +152,7 @@ def _bus(
     eds: Path | None,
     **options: Any,
 ) -> Callable[[], Drives]:
-    """Return what opens drives of a bus, with the envelope; where another master commands them it raises."""
+    """Return a function that opens drives of a bus with the envelope; it raises where another master commands them."""
 
     def open_bus() -> Drives:
         refuse_other_masters(interface, channel, nodes, options["bitrate"])

@@ -56,7 +56,7 @@ def tables(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int)
 
 
 def print_names(lists: Mapping[str, Mapping[str, str]]) -> None:
-    """Print what there is by its names, with what each means, under titles."""
+    """Print names with their meanings, under titles."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

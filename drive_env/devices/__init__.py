@@ -63,7 +63,7 @@ class EmergencyCode(NamedTuple):
     extra: tuple[int, ...]
 
     def of_axis(self, axis: int) -> EmergencyCode:
-        """Return it with the bytes that an axis of the node sends; one that tells no axis as it is."""
+        """Return it with the bytes that an axis of the node sends; unchanged if it has no byte of the axis."""
         return EmergencyCode(self.code, tuple(axis if byte == AXIS else byte for byte in self.extra))
 
     @property
@@ -72,7 +72,7 @@ class EmergencyCode(NamedTuple):
         return AXIS in self.extra
 
     def axis_told(self, extra: tuple[int, ...], num_axes: int) -> int | None:
-        """Return the axis that received bytes tell, 0 where they tell none; None if they are another emergency's."""
+        """Decode the axis number from the emergency's bytes; 0 if they carry none, None if they are of another one."""
         told = {sent for byte, sent in zip(self.extra, extra, strict=True) if byte == AXIS} or {0}
         axis = min(told)
         return axis if axis < num_axes and self.of_axis(axis).extra == extra else None
@@ -87,7 +87,7 @@ class AxisOffset(NamedTuple):
 
 
 class CanopenBehaviour(NamedTuple):
-    """What a device does on a CANopen bus; times in s.
+    """Behaviour of a device on a CANopen bus; times in s.
 
     Attributes:
         sdo_timeout: Time after which the server gives a transfer up.
@@ -127,16 +127,16 @@ class CanopenBehaviour(NamedTuple):
 
 
 class MasterHints(NamedTuple):
-    """What a master must know of a device besides its EDS; times in s.
+    """Facts about a device that a master needs besides its EDS; times in s.
 
     Attributes:
         rpdo_type: Transmission type of an RPDO that waits for SYNC.
         timeout: Longest wait for an answer.
         timeouts: Index -> longest wait, of objects that take longer.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
-        commands: Index -> what it is, of the device's own objects that can be written but are no parameters.
-        addresses: Index -> what it is, of those that a backup keeps and nobody restores: the node would be another one
-            after its next reset, or mute.
+        commands: Index -> its name, of the device's own objects that can be written but are not parameters.
+        addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be
+            another one after its next reset, or mute.
     """
 
     rpdo_type: int
@@ -198,7 +198,7 @@ class Device(NamedTuple):
 
     @property
     def firmware(self) -> Firmware:
-        """What runs in the drive; it is composed at the first look, and compiled at its first use."""
+        """The drive's firmware; it is composed at the first look, and compiled at its first use."""
         return find_firmware(self.firmware_name)
 
     @property
@@ -306,7 +306,7 @@ def device_names() -> list[str]:
 
 
 def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
-    """Return the name of the device that a node says that it is, None of one that is not known.
+    """Return the name of the device that a node says that it is, None for an unknown one.
 
     Args:
         kind: Its 1000h; a device and its variants, which are one product, are identified by it.
@@ -355,7 +355,7 @@ def find_device(name: str) -> Device:
 
 
 def _own_device(folder: Path) -> Device:
-    """Return the device in a folder of one's own; ValueError names the file that is wrong, and what is wrong in it."""
+    """Return the device in a folder of one's own; ValueError names the file and its mistake."""
     with naming(folder / "device.toml"):
         data = own_data(folder)
         eds = folder / data["eds"]

@@ -32,5 +32,5 @@ def least_ripple(motor: Motor, current: float, supply: float) -> float:
 
 
 def chopper_settings(motor: Motor, current: float, supply: float) -> dict[str, int]:
-    """Return what is written for a motor, object name -> raw value: nothing where the factory's settings suit it."""
+    """Return the settings to write for a motor, object name -> raw value; {} if the factory's suit it."""
     return dict(SHORT) if least_ripple(motor, current, supply) > MOST * current else {}

@@ -5,7 +5,7 @@ Each is a switch that is off where a device does not name it:
     refuses_same_mode           6060h cannot be written with the mode that it has (08000022h): some firmwares begin a
                                 mode anew with each write, and so forbid it
     mode_display_delay          s from the write of 6060h until mode and 6061h change: a firmware that changes modes in
-                                a slow task; whoever goes on at once is still in the mode before
+                                a slow task; a master that goes on at once is still in the mode before
     mode_change_needs_halt      an enabled axis changes its mode only at rest with halt (controlword bit 8) set: the
                                 firmware does not hand a motion over from one generator to another
     absent_status_bits          bits of 6041h that never come: CiA 402 leaves 4, 7, 9, 10 ... 15 to the maker in part

@@ -1,4 +1,4 @@
-"""Process data of an EDS that a node could not start with: COB-IDs that are missing, mappings of what is not there."""
+"""Process data of an EDS that a node could not start with: missing COB-IDs, mappings of missing objects."""
 
 from __future__ import annotations
 

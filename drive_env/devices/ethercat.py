@@ -1,4 +1,4 @@
-"""What a device is on EtherCAT: the table `ethercat` of its data. A device without it has no EtherCAT.
+"""A device on EtherCAT: the table `ethercat` of its data. A device without it has no EtherCAT.
 
 Vendor, product and revision are those of its dictionary (1018h), and its process data those of 1C12h and 1C13h.
 """
@@ -23,7 +23,7 @@ class Place(NamedTuple):
 
 
 class EtherCatBehaviour(NamedTuple):
-    """What a device is on EtherCAT.
+    """Properties of a device on EtherCAT.
 
     Attributes:
         receive: What the master writes: sync manager 0.

@@ -172,7 +172,7 @@ class GainSet:
         return np.array([self.names.index(own[name]) for name in names])
 
     def clipped(self, raw: ArrayLike) -> Integers:
-        """Return gains as integers within what the device takes; those of a loop are 1 at least: 0 opens it."""
+        """Return gains as integers within the device's ranges; those of a loop are 1 at least: 0 opens it."""
         return np.asarray(np.clip(np.rint(np.asarray(raw, float)), self.lowest, self.highest), np.int64)
 
     def with_velocity_p(self, raw: Integers, factor: ArrayLike) -> Integers:

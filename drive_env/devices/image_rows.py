@@ -1,4 +1,4 @@
-"""Process images that a device has ready-made, as packed structures: its `images.toml` says what each field is."""
+"""Process images that a device has ready-made, as packed structures: `images.toml` has the object of each field."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAMES_ANOTHER = "@"
 
 
 class ImageField(NamedTuple):
-    """A field: its type, the object that it is, None of a reserved one; whether that names the one it carries."""
+    """A field: its type, its object, None for a reserved field; whether it names the object that the image carries."""
 
     type: str
     key: Key | None
@@ -31,7 +31,7 @@ class FixedImage(NamedTuple):
 
 @cache
 def fixed_images(folder: Path) -> dict[int, FixedImage]:
-    """Return the images of the device in a folder, by number; none where it has no such file."""
+    """Return the images of the device in a folder, by number; {} without the file."""
     path = folder / "images.toml"
     if not path.exists():
         return {}

@@ -1,4 +1,4 @@
-"""A device's folder from a vendor's EDS: dictionary, bindings, roles, gains, class values, what a person must fill in.
+"""A device's folder from a vendor's EDS: dictionary, bindings, roles, gains, class values, a list of open questions.
 
 Everything that the EDS says is taken; what it does not say and the emulator needs is a class value or an object of the
 emulator's own, in the manufacturer's area where the EDS has none; each is in the list. An object of the EDS that has no
@@ -83,7 +83,7 @@ MODE_TARGETS = {
 
 
 class Note(NamedTuple):
-    """A line of the list: what, and why."""
+    """A line of the list: the subject, and the reason."""
 
     what: str
     why: str
@@ -95,7 +95,7 @@ class NewDevice(NamedTuple):
     Attributes:
         folder: The folder.
         fill_in: What a person must fill in or check.
-        modes: What became of the drive's modes of operation.
+        modes: The drive's modes of operation, and their support here.
         without_effect: Objects that are stored and have no effect here.
         repairs: What was put right in the EDS.
     """
@@ -127,7 +127,7 @@ class NewDevice(NamedTuple):
 def new_device(
     eds: Path, folder: Path, motor: Motor, *, velocity_unit: str = "", acceleration_unit: str = ""
 ) -> NewDevice:
-    """Write the folder of a device that its EDS describes; return what a person must know of it.
+    """Write the folder of a device that its EDS describes; return the notes that a person must read.
 
     Args:
         eds: The vendor's file.
@@ -158,7 +158,7 @@ def new_device(
 
 
 class _Draft:
-    """What one EDS becomes."""
+    """The device of one EDS in the making."""
 
     def __init__(self, eds: Path, motor: Motor, velocity_unit: str, acceleration_unit: str) -> None:
         self._eds, self._motor = eds, motor
@@ -309,7 +309,7 @@ class _Draft:
                 self._roles["current_limit"] = key
                 return
 
-    # --- what it has not ------------------------------------------------------------------------------------------
+    # --- missing objects ------------------------------------------------------------------------------------------
     def _free_block(self) -> int:
         used = {index for index, _ in self._types}
         for base in OWN_BLOCKS:
@@ -369,7 +369,7 @@ class _Draft:
             self._sections[object_section(index, sub)] = section | {"DefaultValue": str(default)} | shown
 
     def _correct_defaults(self) -> None:
-        """Give objects whose factory value the emulator cannot have another, and units to what is bound."""
+        """Give objects another factory value where the emulator cannot have theirs, and units to bound objects."""
         for key, binding in self._bindings.items():
             row = self._section(key)
             if binding.unit != "raw" and not row.get("Unit"):
@@ -412,7 +412,7 @@ class _Draft:
         return self._sections[name] if name in self._sections else self._sections[object_section(key[0])]
 
     def _drop_twinless(self) -> None:
-        """Leave out what a further axis has and the first has not: what it is cannot be known from the first."""
+        """Leave out objects of further axes that the first axis lacks: their meaning cannot be known from the first."""
         for index, sub in list(self._types):
             first = cia402.of_first_axis(index)
             if self._axes > 1 and first != index and (first, sub) not in self._types and index in cia402.PROFILE_AREAS:
@@ -552,7 +552,7 @@ def _text(key: Key) -> str:
 
 
 def _shown(unit: str) -> str:
-    """Return a unit as the EDS has it: what a position is counted in is an increment, whatever its limits mean."""
+    """Return a unit as the EDS has it: the unit of a position is an increment, whatever its limits mean."""
     return "inc" if unit in ("counter", "position window", "position limit") else unit
 
 

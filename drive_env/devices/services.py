@@ -18,7 +18,7 @@ BIT_30 = ("keep", "refuse", "store")
 
 
 class NodeServices(NamedTuple):
-    """Parts of a node beyond what every node has; what a dictionary's objects ask for, they switch on by themselves.
+    """Parts of a node beyond those of every node; objects of a dictionary switch theirs on.
 
     1003h, 1007h, 1019h and 1012h with 1013h need no row here: the node has them where its EDS does.
 

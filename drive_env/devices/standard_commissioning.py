@@ -39,7 +39,7 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
     """Return object ("6081:0") -> raw value, in the order of writing.
 
     Raises:
-        ValueError: If a gain leaves the drive's range: the motor is none for this drive.
+        ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
     """
     from drive_env.gains import bandwidth_gains
 
@@ -101,7 +101,7 @@ def _values(motor: Motor) -> dict[str, float]:
 
 
 def _scale(device: Device, dictionary: ObjectDictionary, motor: Motor) -> dict[str, int]:
-    """Return what the scale of positions is set to where the factory's values make none: counts of the encoder."""
+    """Return the values that the scale of positions gets, counts of the encoder; {} if the factory's make a scale."""
     scale = position_scale(device.roles)
     if scale is None:
         return {}

@@ -1,4 +1,4 @@
-"""Objects of CiA 402 that this emulator gives an effect, and what it has instead where a drive lacks them.
+"""Objects of CiA 402 that this emulator gives an effect, and the substitutes for those that a drive lacks.
 
 A row of `STANDARD` binds an object of the standard to a field of the drive record. Its unit is one of `dictionary/
 units.py`, or the name of a quantity that each drive counts in its own unit: velocity, acceleration, torque.

@@ -188,7 +188,7 @@ def compose_eds(name: str, base: str, data: Mapping[str, Any]) -> EdsText:
 
 
 def variant_bindings(base: Mapping[Key, Binding], rows: Mapping[str, Mapping[str, Any]]) -> dict[Key, Binding]:
-    """Return a device's bindings with what a variant's rows bind, and in the units that they name."""
+    """Return a device's bindings with those of a variant's rows, and in the units that these name."""
     bindings = dict(base)
     for text, row in rows.items():
         key = parse_key(text)

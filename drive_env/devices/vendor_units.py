@@ -48,21 +48,21 @@ _ANGLE = re.compile(r"(\d+(?:\.\d+)?)?\*?(m?)(deg|degree|degrees|\u00b0|rad)(/s|
 
 
 class Feed(NamedTuple):
-    """Units of position in a turn of the shaft that 6092h counts, and what says so; 0 and "" where nothing does."""
+    """Units of position in a turn of the shaft that 6092h counts, and their source; 0 and "" without a source."""
 
     units: float
     source: str
 
 
 class VendorUnits(NamedTuple):
-    """Units of a drive, and what says so.
+    """Units of a drive, and their sources.
 
     Attributes:
         velocity, acceleration, torque: Names of units (dictionary/units.py).
         scale: Name of a role -> object of the dictionary, of what makes the scale of positions; empty: nothing does.
         increments: Units of position in a turn of the motor where they are known and no object has them, else 0.
         sources: Quantity -> where its unit stands; "" where it is the standard's.
-        notes: What stands in the file and is not taken: object, and why.
+        notes: Entries of the file that are not taken: object, and why.
     """
 
     velocity: str
@@ -110,7 +110,7 @@ def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", accelerati
 
 
 class UnitCode(NamedTuple):
-    """What an object of 60A8h to 60AAh says."""
+    """The unit code of an object of 60A8h to 60AAh."""
 
     prefix: float
     numerator: int
@@ -123,7 +123,7 @@ class UnitCode(NamedTuple):
 
 
 def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
-    """Return what an object says; None where there is none, or it is 0."""
+    """Return the unit code of an object; None if the object is missing, or 0."""
     variable = types.get((index, 0))
     if variable is None or not isinstance(variable.default, int) or variable.default & 0xFFFFFFFF == 0:
         return None
@@ -133,7 +133,7 @@ def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
 
 
 def _rate(code: UnitCode, bases: tuple[str, ...], feed: Feed, position: UnitCode | None) -> str:
-    """Return the unit that a code of a speed or an acceleration is; "" of one not known."""
+    """Return the unit of a code of a speed or an acceleration; "" for an unknown code."""
     by_minute, counted = bases
     is_speed = by_minute == "rpm"
     if not is_speed and code.numerator == PER_MINUTE and code.denominator == SECOND:
@@ -190,9 +190,9 @@ def _shown(types: Mapping[Key, ODVariable], index: int) -> str:
 
 
 def written_angle(text: str) -> tuple[float, int]:
-    """Return what angle a second, or second squared, an EDS writes beside an object, in revolutions, and which it is.
+    """Parse the angle a second, or second squared, that an EDS writes beside an object, in revolutions, with the power.
 
-    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) of what is none.
+    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) for other texts.
     """
     found = _ANGLE.match(re.sub(r"[\s\[\]]", "", text.lower()))
     if found is None:
@@ -203,7 +203,7 @@ def written_angle(text: str) -> tuple[float, int]:
 
 
 def written_unit(text: str) -> str:
-    """Return the name of a unit that an EDS writes beside an object: "0.1 r/min" is "0.1 rpm"; "" of one not known."""
+    """Return the name of a unit that an EDS writes beside an object: "0.1 r/min" is "0.1 rpm"; "" if unknown."""
     plain = re.sub(r"[\s\[\]]", "", text.lower())
     if plain in _WRITTEN:
         return _WRITTEN[plain]

@@ -1,4 +1,4 @@
-"""What a dictionary refuses: the error, with its SDO abort code of CiA 301."""
+"""The error of a dictionary's refusal, with its SDO abort code of CiA 301."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def checked_values(entry: Entry, value: Any, num_axes: int) -> NDArray[np.int64]
 
 
 def _as_array(value: Any) -> NDArray[Any]:
-    """Return the value as an array; what makes none becomes an array of objects, which is no integer."""
+    """Return the value as an array; one of objects, which has no integer type, if it is not numbers."""
     try:
         return np.asarray(value)
     except ValueError:
@@ -84,14 +84,14 @@ def check_in_range(entry: Entry, raw: NDArray[Any]) -> None:
 
 
 def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]) -> None:
-    """Raise 06090030h for a value that is none of the few that the object knows."""
+    """Raise 06090030h for a value that is not among the few that the object allows."""
     wrong = raw[~np.isin(raw, allowed)]
     if wrong.size:
         raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; allowed are {_listed(allowed)}")
 
 
 def _listed(values: tuple[int, ...]) -> str:
-    """Return ascending values as a message tells them: what follows one another, from three on, as a range."""
+    """Return ascending values for a message: three or more consecutive ones as a range."""
     runs: list[list[int]] = []
     for value in values:
         if runs and value == runs[-1][-1] + 1:

@@ -29,7 +29,7 @@ class Code(NamedTuple):
         unit: Name of a unit (`find_unit`), whose factor is SI per integer.
         event: What a write sets off in the firmware, as in the binding.
         low, high: Least and greatest integer; what lies beyond saturates, integers of `specials` excepted.
-        period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
+        period: Number of integers of a counter that goes on past the end of its type; 0 for one that saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
         follows_scale: Whether the factor follows the scale of positions.
     """
@@ -53,12 +53,12 @@ class Code(NamedTuple):
 
     @property
     def least(self) -> int:
-        """Least integer that stands for what the factor gives."""
+        """Least integer that is computed by the factor."""
         return self.low + any(raw == self.low for raw, _ in self.specials) if self.specials else self.low
 
     @property
     def greatest(self) -> int:
-        """Greatest integer that stands for what the factor gives."""
+        """Greatest integer that is computed by the factor."""
         return self.high - any(raw == self.high for raw, _ in self.specials) if self.specials else self.high
 
 
@@ -122,7 +122,7 @@ SPECIALS = 2  # of a unit at most
 
 
 def compiled_rows(codes: Sequence[Code], *, decoded: bool) -> Floats:
-    """Return rows as numbers, shape (n, 7): limits, period, special integers and their values, nan where there is none.
+    """Return rows as numbers, shape (n, 7): limits, period, special integers and their values; nan for a missing one.
 
     The limits are those of integers that are decoded, or of what is encoded by the factor.
     """

@@ -1,4 +1,4 @@
-"""What makes an EDS that of a CiA 402 drive: its axes, and objects that are integers of the standard's length."""
+"""Checks that an EDS is of a CiA 402 drive: its axes, and objects that are integers of the standard's length."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
     """Return how many axes an EDS describes.
 
     Raises:
-        ValueError: If it is that of no CiA 402 drive, or has an object that decides what a drive does with another
-            type than the standard's.
+        ValueError: If it describes no CiA 402 drive, or an object that decides what a drive does has another type
+            than the standard's.
     """
     _check_values(path, types)
     axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(MOST_AXES))

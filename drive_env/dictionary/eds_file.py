@@ -1,4 +1,4 @@
-"""An EDS as makers write it, made readable: sections, and what had to be put right in them.
+"""An EDS as makers write it, made readable: sections, and the corrections that they needed.
 
 CiA 306 says how an EDS is written; real ones have stray lines, other spellings of numbers and names, sections twice,
 lists that count wrong, sub-objects without their object. Nothing is invented here: what cannot be understood is left
@@ -64,7 +64,7 @@ MOST_ENTRIES = 20_000  # sections, those included that CompactSubObj stands for:
 MOST_SUB = 254  # highest sub-index (CiA 301)
 MOST_LINES = 300_000  # an entry has some ten
 LONGEST_NAME = 200  # letters of a section's name
-LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 members, and in what is told
+LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 members, and in messages
 
 VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
 MEMBER_KEYS = (*VALUE_KEYS, "ParameterValue", "ObjFlags", "Unit", "Factor", "Description")  # that an array hands down
@@ -73,14 +73,14 @@ Section = dict[str, str]
 
 
 class Repair(NamedTuple):
-    """What was put right in a file: where (a section, or a line), and what."""
+    """A correction of a file: where (a section, or a line), and what was wrong."""
 
     where: str
     what: str
 
 
 class EdsFile(NamedTuple):
-    """An EDS: its sections in a clean order, every one as CiA 306 writes it, and what was put right."""
+    """An EDS: its sections in a clean order, every one as CiA 306 writes it, and the corrections."""
 
     sections: dict[str, Section]
     repairs: tuple[Repair, ...]
@@ -99,7 +99,7 @@ def object_section(index: int, sub: int | None = None) -> str:
 
 
 def place_of(name: str) -> tuple[int, int] | None:
-    """Return index and sub-index of a section, sub-index -1 of an object as a whole; None of another section."""
+    """Return index and sub-index of a section, sub-index -1 for an object as a whole; None for another section."""
     if len(name) > LONGEST_NAME:
         return None
     if found := _OBJECT.match(name):
@@ -110,7 +110,7 @@ def place_of(name: str) -> tuple[int, int] | None:
 
 
 def place_of_line(line: str) -> tuple[int, int] | None:
-    """Return the same of a line of a file, None of one that begins no section of an object."""
+    """Return the same for a line of a file, None for one that begins no section of an object."""
     found = _section_of(line)
     return None if found is None else place_of(found[0])
 
@@ -124,7 +124,7 @@ def _section_of(line: str) -> tuple[str, bool] | None:
 
 @lru_cache(maxsize=16)
 def parse_eds(text: str, node_id: int = 1) -> EdsFile:
-    """Return what an EDS says, put right.
+    """Read an EDS and correct its mistakes.
 
     Args:
         text: Of the file.
@@ -282,7 +282,7 @@ class _Repairer:
             row["SubNumber"] = str(len(subs))
 
     def _move_value_to_sub_0(self, name: str, row: Section) -> None:
-        """Let what an object with sub-objects says of itself be its sub-index 0, at which CiA 301 has a value."""
+        """Make the value of an object with sub-objects that of its sub-index 0, where CiA 301 has a value."""
         own = {key: row.pop(key) for key in VALUE_KEYS if key in row}
         self._sections[f"{name}sub0"] = {"ParameterName": row.get("ParameterName", "")} | own
         self._tell(f"[{name}]", "has a DataType beside its sub-objects: that of sub-index 0, which was added")
@@ -293,7 +293,7 @@ class _Repairer:
             return VAR
         kind = OBJECT_TYPES.get(text.upper(), number_of(text))
         if kind is None or kind not in OBJECT_TYPES.values():
-            self._tell(f"[{name}]", f"ObjectType={text} is none of CiA 306")
+            self._tell(f"[{name}]", f"ObjectType={text} is not one of CiA 306")
             kind = VAR
         row["ObjectType"] = f"0x{kind:X}"
         return kind
@@ -467,7 +467,7 @@ def _is_known_sum(text: str) -> bool:
 
 
 def _in_range(number: int, bits: int, low: int, high: int) -> int | None:
-    """Return a number as its type has it; what is written in two's complement, or as -1 for all bits, is understood."""
+    """Return a number as its type has it; two's complement, and -1 for all bits, are understood."""
     if low <= number <= high:
         return number
     if low < 0 and high < number < 1 << bits:

@@ -92,7 +92,7 @@ class NodeIdSum:
 
 
 def node_id_sum(text: str) -> NodeIdSum | None:
-    """Return what a text with the node-ID is; None for one without, or that cannot be understood."""
+    """Parse a text with the node-ID as a sum; None for a text without it, or one that is not understood."""
     plain = re.sub(r"\s", "", text).upper().strip("()")
     if "NODEID" not in plain or len(plain) > LONGEST or not re.fullmatch(r"[-+*$&0-9A-Z]+", plain):
         return None

@@ -36,7 +36,7 @@ INTEGER_TYPES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """One sub-index: everything the dictionary says of it. `bits`, `low`, `high` are None for a text.
+    """One sub-index with all that the dictionary has of it. `bits`, `low`, `high` are None for a text.
 
     A dictionary has one for each, which is equal to itself alone: tables by entry are looked up every millisecond.
     """
@@ -74,14 +74,14 @@ class EdsText:
 def read_eds(path: Path | EdsText, node_id: int = 1) -> canopen.ObjectDictionary:
     """Return python-canopen's model of an EDS, put right first: real files are not as CiA 306 has them.
 
-    It is read once: whoever changes it takes a copy.
+    It is read once: take a copy to change it.
     """
     text, name = _source(path)
     return _model(text, name, node_id)
 
 
 def eds_file(path: Path | EdsText, node_id: int = 1) -> EdsFile:
-    """Return what an EDS says, and what had to be put right in it.
+    """Return the content of an EDS, and the corrections that it needed.
 
     A file that is not UTF-8 is read as cp1252, which many vendors' are; bytes that cp1252 lacks stand in names and
     comments alone, where they are shown as unknown.
@@ -170,7 +170,7 @@ def _entry(variable: ODVariable, name: str) -> Entry:
 
 
 def _as_key(name: str) -> tuple[int, int] | None:
-    """Return index and sub-index of "6081:0", as the files of a device write them; None of another text."""
+    """Return index and sub-index of "6081:0", as the files of a device write them; None for another text."""
     index, colon, sub = name.partition(":")
     is_key = bool(colon) and len(index) == 4 and all(letter in "0123456789abcdefABCDEF" for letter in index)
     return (int(index, 16), int(sub)) if is_key and sub.isdecimal() else None

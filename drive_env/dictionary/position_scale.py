@@ -23,14 +23,14 @@ COARSEST, FINEST = 100.0, float(2**28)
 
 
 class PositionScale(NamedTuple):
-    """The objects that say a scale, and what their values make: the increments of a revolution, of any shape."""
+    """The objects of a scale, and a function of their values: the increments of a revolution, of any shape."""
 
     keys: tuple[Key, ...]
     increments: Callable[[Sequence[Floats]], Floats]
 
 
 def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return what a drive with these roles counts positions in; None of one that does not say."""
+    """Return the scale of positions of a drive with these roles; None if it has none of the roles."""
     if Role.POSITION_SCALE in roles:
         return PositionScale((roles[Role.POSITION_SCALE],), lambda values: values[0])
     inside = (Role.TURN_INSIDE, Role.POSITION_NUMERATOR, Role.POSITION_DIVISOR)
@@ -65,7 +65,7 @@ def _per_motor_turn(values: Sequence[Floats]) -> Floats:
 
 
 def velocity_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return the objects that say the rpm of a velocity unit, and what they make of it; None of other drives."""
+    """Return the objects of the rpm of a velocity unit, and the function of their values; None for other drives."""
     parts = (Role.VELOCITY_NUMERATOR, Role.VELOCITY_DIVISOR)
     if not all(role in roles for role in parts):
         return None

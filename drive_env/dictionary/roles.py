@@ -1,7 +1,7 @@
 """Roles: the parts that objects play on a drive, whatever their index; a device's `roles.toml` says which object does.
 
-A role is a name for an object wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. A role that a device does
-not have is an answer: `has_role`, or an error that says so.
+A role is a name for an object wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. `device.roles` has those
+of a device; to read or write another one is an error that names the role.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from enum import Enum
 
 
 class Role(Enum):
-    """A part that an object plays; the value is what a message calls it."""
+    """A part that an object plays; the value is its name in messages."""
 
     POSITION_SCALE = "scale of positions (increments of a revolution)"
     ENCODER_INCREMENTS = "increments of the encoder"

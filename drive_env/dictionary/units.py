@@ -21,20 +21,20 @@ TWO_PI = 2.0 * np.pi
 
 
 class Context(NamedTuple):
-    """What factors depend on, one value per axis or one for all."""
+    """The values on which factors depend, one per axis or one for all."""
 
     position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
     rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
     velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
-    peak_current: Any = math.nan  # of the motor [A], where torques are told in its parts
+    peak_current: Any = math.nan  # of the motor [A], of which torques are parts
 
 
 class Unit(NamedTuple):
-    """A row: name, what it is, and SI per drive unit.
+    """A row: name, quantity, and SI per drive unit.
 
     Attributes:
-        period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
+        period: Number of integers of a counter that goes on past the end of its type; 0 for one that saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
         follows_scale: Whether the factor follows a scale, of positions, velocities or torques: what is stored in such a
             unit is kept in raw integers when a scale changes.
@@ -129,7 +129,7 @@ UNITS: dict[str, Unit] = {
 
 
 def split_unit(name: str) -> tuple[float, str]:
-    """Return how many of which unit one is: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
+    """Split a unit into a number and a base: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
     number, _, base = name.partition(" ")
     if name in UNITS or base not in UNITS:
         return 1.0, name

@@ -1,1 +1,1 @@
-"""The Drives interface: what callers of drives hold, on an emulator and on a bus alike."""
+"""The Drives interface: callers hold it on an emulator and on a bus alike."""

@@ -1,4 +1,4 @@
-"""What either side of the Drives interface is given, checked: which axes or machines, and whole cycles."""
+"""Checks of arguments of the Drives interface: which axes or machines, and whole cycles."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def chosen_parts(axes: Iterable[int], count: int, name: str) -> tuple[int, ...]:
     Args:
         axes: Their numbers, from 0.
         count: How many a module has.
-        name: What it is, for the message.
+        name: Their name, for the message.
 
     Raises:
         ValueError: For an axis that it does not have, or none at all.
@@ -79,7 +79,7 @@ class ChosenAxes:
 
     @property
     def device(self) -> Device | None:
-        """What the drives are."""
+        """The device that the drives are."""
         return self._drives.device
 
     @property
@@ -89,7 +89,7 @@ class ChosenAxes:
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real; limits are those of the chosen axes."""
+        """The envelope around drives that may be real; limits are those of the chosen axes."""
         return cast("Envelope | None", self._safety)
 
     @property
@@ -139,7 +139,7 @@ class ChosenAxes:
         return self._drives.record(objects, duration, rows or None, period).of_axes(self._axes.tolist())
 
     def _rows(self, name: ObjectName, values: Integers) -> Integers:
-        """Return rows for all axes: those left out get what they have."""
+        """Return rows for all axes: those left out keep their values."""
         if name not in self._others:
             self._others[name] = np.asarray(self._drives.read(name))
         whole = np.tile(self._others[name], (len(values), 1))
@@ -147,7 +147,7 @@ class ChosenAxes:
         return whole
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the chosen axes have said by themselves since the last call, by their place among these."""
+        """Return the emergencies of the chosen axes since the last call, by their place among these."""
         place = {int(axis): k for k, axis in enumerate(self._axes)}
         told = self._drives.emergencies()
         return [message._replace(axis=place[message.axis]) for message in told if message.axis in place]
@@ -157,7 +157,7 @@ class ChosenAxes:
         raise ValueError("a node is reset with all its axes, and some are left out here; open it with all of them")
 
     def close(self) -> None:
-        """Release what the drives hold."""
+        """Release the drives' resources."""
         self._drives.close()
 
     def __enter__(self) -> Self:

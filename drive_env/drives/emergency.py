@@ -1,4 +1,4 @@
-"""What drives say by themselves: emergencies, from an emulator and from a bus alike."""
+"""Emergencies of drives, from an emulator and from a bus alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Drives interface: what callers may ask of drives, emulated, on a bus, or behind an observer."""
+"""The Drives interface: the calls that drives answer, emulated, on a bus, or behind an observer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Integers = NDArray[np.int64]
 
 
 class BasicDrives(Protocol):
-    """What it takes to move axes: objects that are read and written, and time that passes.
+    """The part that moves axes: objects that are read and written, and time that passes.
 
     Integers are those of the wire, one for each axis, shape (num_axes,).
     """
@@ -46,16 +46,16 @@ class BasicDrives(Protocol):
 class Drives(BasicDrives, Protocol):
     """Everything that callers may ask of drives.
 
-    What a kind of drives does not have is None: a bus has no `machine`, emulated drives have no `bus` and no `safety`.
+    An attribute that a kind of drives lacks is None: a bus has no `machine`, emulated drives no `bus` and no `safety`.
     """
 
     @property
     def device(self) -> Device | None:
-        """What the drives are; None where only their EDS is known."""
+        """The device that the drives are; None where only their EDS is known."""
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called: its number among all axes of the drives, of which these may be chosen ones."""
+        """Each axis' number among all axes of the drives, of which these may be chosen ones."""
 
     @property
     def machine(self) -> Machines | None:
@@ -67,7 +67,7 @@ class Drives(BasicDrives, Protocol):
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
+        """The envelope around drives that may be real."""
 
     @property
     def time_waits(self) -> bool:
@@ -87,13 +87,13 @@ class Drives(BasicDrives, Protocol):
         """Let time pass [s] while objects are recorded, and others, the keys of `play`, are written row by row."""
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies of the drives since the last call."""
 
     def reset_node(self, where: Mask | None = None) -> None:
         """Restart nodes, as after power-on."""
 
     def close(self) -> None:
-        """Release what the drives hold."""
+        """Release the drives' resources."""
 
     def __enter__(self) -> Self: ...
 
@@ -103,7 +103,7 @@ class Drives(BasicDrives, Protocol):
 
 
 def axis_number(drives: BasicDrives, axis: int) -> int:
-    """Return what an axis is called in messages and results."""
+    """Return an axis' number in messages and results."""
     numbers: Sequence[int] | None = getattr(drives, "axis_numbers", None)  # BasicDrives need not have them
     return axis if numbers is None else int(numbers[axis])
 
@@ -123,7 +123,7 @@ def bus_of(drives: Drives) -> BusDrives:
 
 
 def device_of(drives: Drives) -> Device:
-    """Return what drives are; ValueError where their EDS alone is known."""
+    """Return the device that drives are; ValueError where their EDS alone is known."""
     if drives.device is None:
         raise ValueError("only the EDS of these drives is known; give the device by name")
     return drives.device

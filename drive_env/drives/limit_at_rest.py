@@ -25,11 +25,11 @@ SAYS = (
 
 
 class LimitAtRest:
-    """Tells the axes that stand with their current at its limit; raw integers of the wire throughout.
+    """Finds axes that stand with their current at its limit; raw integers of the wire throughout.
 
     Args:
-        drives: The drives. Of those without a current limit of their own, as steppers, and of those known by
-            their EDS alone, none is named.
+        drives: The drives. No axis is found on drives without a current limit of their own, as steppers, or known by
+            their EDS alone.
     """
 
     def __init__(self, drives: Drives) -> None:

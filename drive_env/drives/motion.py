@@ -92,7 +92,9 @@ def _why_not_heard(drives: BasicDrives, status: int) -> str:
     """Return, for a message, that a drive takes no commands; empty where its own mode is not why."""
     if not _own_modes(drives) or cia402.matches(status, cia402.REMOTE):
         return ""
-    return "; it takes no commands (bit 9 is 0), since somebody has changed its own mode or its mode of operation"
+    return (
+        "; it takes no commands (bit 9 is 0), since another program has changed its own mode or its mode of operation"
+    )
 
 
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
@@ -141,13 +143,13 @@ def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
 
 
 def _has_target_inside(drives: BasicDrives) -> bool:
-    """Return whether an object is the same as 607Ah: an image that carries it would bring what it had before back."""
+    """Return whether an object doubles 607Ah: an image that carries it would bring its old value back."""
     device: Device | None = getattr(drives, "device", None)
     return device is not None and Role.TARGET_INSIDE in device.roles
 
 
 def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
-    """Return an object of every axis, None of drives that have no such object."""
+    """Return an object of every axis, None if the drives have no such object."""
     try:
         return drives.read(name)
     except ObjectAccessError as error:
@@ -157,7 +159,7 @@ def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
 
 
 def _stay_in_own_mode(drives: BasicDrives, axes: Mask, mode: str | None) -> None:
-    """Have axes stay once they are enabled: in a mode, or in what each of them has, None."""
+    """Keep axes in place once they are enabled: in a mode, or with None in each axis' own."""
     if mode is not None:
         stay(drives, mode, axes)
         return
@@ -211,7 +213,7 @@ def _not_in_mode(drives: BasicDrives, mode: str, axes: Mask) -> Mask:
 
 
 def _shown_modes(drives: BasicDrives) -> Integers | None:
-    """Return what 6061h shows, None of drives that have none."""
+    """Return the mode in 6061h, None for drives without 6061h."""
     try:
         return drives.read(cia402.MODE_DISPLAY)
     except ObjectAccessError:
@@ -220,7 +222,7 @@ def _shown_modes(drives: BasicDrives) -> Integers | None:
 
 def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
     """Return the drive's own mode that each mode of operation needs; empty of drives that have no such thing."""
-    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know what they are
+    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know their device
     return {} if device is None else device.mode_gate
 
 
@@ -298,7 +300,7 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         try:
             wait_for(drives, state, timeout, name, not_enabled)
         except TimeoutError:
-            # A drive that waits for its brake would enable later, when nobody expects it any more.
+            # A drive that waits for its brake would enable later, unexpectedly.
             late = not_enabled & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
             drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=late)
             raise
@@ -317,7 +319,7 @@ def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0
 
 
 def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
-    """Command a quick stop; what follows the ramp is 605Ah's."""
+    """Command a quick stop; 605Ah decides what follows the ramp."""
     _command_stop(drives, cia402.QUICK_STOP, where)
 
 
@@ -327,7 +329,7 @@ def _command_stop(drives: BasicDrives, word: int, where: Mask | None) -> None:
     drives.write(cia402.CONTROLWORD, word, where=where)
     if not _own_modes(drives):
         return
-    drives.advance(STEP)  # a statusword may be of before somebody changed the drive's own mode
+    drives.advance(STEP)  # a statusword may be older than a change of the drive's own mode by another program
     ignored = ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
     ignored = ignored if where is None else ignored & where
     if ignored.any():
@@ -401,7 +403,7 @@ def _raise_bit_4(drives: BasicDrives, word: int, where: Mask, timeout: float, mo
 
 @contextlib.contextmanager
 def _bit_4_is_low(drives: BasicDrives, word: int, where: Mask | None) -> Iterator[None]:
-    """Lower bit 4 of the controlword, which must rise to begin anything; and again where what follows fails.
+    """Lower bit 4 of the controlword, which must rise to begin anything; and again if the block fails.
 
     Left high it would keep each move and each homing from beginning until the axis is disabled.
     """
@@ -476,7 +478,7 @@ def _stands_at(drives: BasicDrives, goal: Integers, axes: Mask) -> Mask:
 
 
 def _window(drives: BasicDrives) -> int:
-    """Return the widest position window of the axes [inc]; 0 where there is none, or it is switched off."""
+    """Return the widest position window of the axes [inc]; 0 without a window, or if it is switched off."""
     try:
         window = int(drives.read(cia402.POSITION_WINDOW).max())
     except ObjectAccessError:

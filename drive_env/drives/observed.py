@@ -40,10 +40,10 @@ class Observer:
         return None
 
     def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
-        """Take note of what was written."""
+        """Note a write."""
 
     def passes(self, duration: float) -> None:
-        """Take note that time is about to pass [s]."""
+        """Note that time is about to pass [s]."""
 
     def passed(
         self,
@@ -53,7 +53,7 @@ class Observer:
         asked: Sequence[ObjectName],
         play: Mapping[ObjectName, ArrayLike] | None,
     ) -> None:
-        """Look at what has passed.
+        """Note time that has passed.
 
         Args:
             below: The drives to act on.
@@ -83,17 +83,17 @@ class ObservedDrives:
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called."""
+        """Each axis' number."""
         return self._drives.axis_numbers
 
     @property
     def device(self) -> Device | None:
-        """What the drives are."""
+        """The device that the drives are."""
         return self._drives.device
 
     @property
     def machine(self) -> Machines | None:
-        """The emulated machines' side, unless somebody hides it."""
+        """The emulated machines' side, unless an observer hides it."""
         return None if any(observer.hides_machine for observer in self._observers) else self._drives.machine
 
     @property
@@ -103,7 +103,7 @@ class ObservedDrives:
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
+        """The envelope around drives that may be real."""
         return self._drives.safety
 
     @property
@@ -167,7 +167,7 @@ class ObservedDrives:
         return parts[0] if len(parts) == 1 else Trace.joined(parts, period)
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies of the drives since the last call."""
         return self._drives.emergencies()
 
     def reset_node(self, where: Mask | None = None) -> None:

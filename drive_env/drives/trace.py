@@ -62,7 +62,7 @@ class Trace:
         return self._values[entry.index, entry.sub]
 
     def of_axes(self, axes: Sequence[int]) -> Trace:
-        """Return what was recorded of some axes, in their order."""
+        """Return the trace of some axes, in their order."""
         values = {key: rows[:, axes] for key, rows in self._values.items()}
         scale = self._scale
         scales = None if scale is None else lambda: _of(scale(), axes)

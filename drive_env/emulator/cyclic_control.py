@@ -44,7 +44,7 @@ class CyclicControl:
 
     Attributes:
         play: What is played.
-        played: Integers to play, shape (objects, cycles, num_axes); whoever runs, or `before`, fills them in.
+        played: Integers to play, shape (objects, cycles, num_axes); filled in by the caller, or by `before`.
         sampled: Integers of each cycle, written, shape (objects, cycles, num_axes).
     """
 
@@ -96,7 +96,7 @@ conversion_at = reader(Conversion)
 
 @cached(allocates=False)
 def convert_in(address: Any, first: Any, count: Any) -> Any:
-    """Run the hook before, and bring what is played into SI; return 0 if an integer is out of range."""
+    """Run the hook before, and convert the integers to play into SI; return 0 if one is out of range."""
     own = conversion_at(address)
     if own.before != 0:
         call_hook(own.before, own.data, first, count)

@@ -153,7 +153,7 @@ class EmulatedDrives(Saved):
         self._commission(np.array(numbers), is_commissioned=commissioned)
 
     def _apply_what_was_drawn(self, supply: float) -> None:
-        """Give the records what machines, motor and supply [V] are."""
+        """Write the drawn values of machines, motor and supply [V] into the records."""
         self._set_constants(supply)
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)
@@ -208,7 +208,7 @@ class EmulatedDrives(Saved):
 
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
-            ValueError: For a quantity that the object is none of.
+            ValueError: For a quantity of another kind than the object's.
         """
         axes = checked_mask(where, self.num_axes)
         if is_quantity(value):
@@ -218,7 +218,7 @@ class EmulatedDrives(Saved):
         self._objects.write(name, value, axes)
 
     def _scales(self) -> list[Scale]:
-        """Return what the units of each axis follow, read again once it was written."""
+        """Return each axis' scale of units, read again once it was written."""
         if self._scale[0] != self._objects.scale_changes:
             found = self._objects.context()
             every = (found.position_scaler, found.velocity_ratio, found.peak_current)
@@ -328,7 +328,7 @@ class EmulatedDrives(Saved):
             group.load.restore_state(saved)
 
     def _description(self) -> State:
-        """Return what must be equal in two sets of drives so that one can restore the state of the other."""
+        """Return the properties that must be equal in two sets of drives so that one can restore the other's state."""
         groups = [(group.load.copies, group.load.h, group.load.staggered) for group in self._groups]
         return {
             "device": self.device.name, "load": str(self.load.name), "motor": self.motor.name,

@@ -22,7 +22,7 @@ class Channels(NamedTuple):
 
 
 def channels(layout: RecordLayout, fields: list[tuple[str, int]], kinds: list[int] | None = None) -> Channels:
-    """Return the channels of (field, part) pairs; `kinds` overrides what the field's type says."""
+    """Return the channels of (field, part) pairs; `kinds` overrides the field's type."""
     found = []
     offsets = []
     for k, (name, part) in enumerate(fields):

@@ -1,4 +1,4 @@
-"""What is inside emulated drives: how tools, faults and tests look there, and change what they must."""
+"""The inside of emulated drives, for tools, faults and tests that read and change it."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Inside:
         return self._drives._cycles(duration)
 
     def connect_axes(self, first: int, number: int) -> None:
-        """Let machines of one axis each have in common what axes of one drive share, as a DC link: as on a node.
+        """Let machines of one axis each share what axes of one drive do, as a DC link: as on a node.
 
         Args:
             first: The drive's first axis.
@@ -83,5 +83,5 @@ class Inside:
             drives._kind.connect(drives._records, drives.device, (axes >= first) & (axes < first + number))
 
     def refresh_inertia(self) -> None:
-        """Tell the rotors what they turn, after a load was changed."""
+        """Update the rotors' total inertias after a load was changed."""
         self._drives._refresh_inertia()

@@ -103,12 +103,12 @@ class LiveDictionary:
         self._write(entry, raw, where)
 
     def impose(self, name: ObjectName, raw: ArrayLike) -> None:
-        """Set what a read-only object that the firmware does not compute shows, from outside; its range is checked."""
+        """Set a read-only object that the firmware does not compute, from outside; the value's range is checked."""
         entry = self.entries.find(name)
         self._set_value(entry, checked_values(entry, raw, self.num_axes), np.ones(self.num_axes, bool))
 
     def engrave(self, name: ObjectName, raw: ArrayLike, where: Mask | None = None) -> None:
-        """Set what a read-only object shows for ever, a serial number for instance, of the axes where the mask is true.
+        """Set a read-only object for ever, a serial number for instance, of the axes where the mask is true.
 
         Its range is checked.
         """
@@ -133,7 +133,7 @@ class LiveDictionary:
         self.device.firmware.power_on(self._records, axes)
 
     def save_state(self) -> dict[str, Any]:
-        """Return records, values beside them and what is stored, as plain data."""
+        """Return records, values beside them and stored values, as plain data."""
         return {
             "records": self._records.view(np.uint8).copy(),
             "values": {key: value.copy() for key, value in self._values.items() if isinstance(value, np.ndarray)},
@@ -142,7 +142,7 @@ class LiveDictionary:
         }
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
-        """Bring records and values of as many axes of the same device to what `save_state` returned."""
+        """Bring records and values of as many axes of the same device to a state of `save_state`."""
         before = self.context()
         self._records.view(np.uint8)[...] = state["records"]
         self._count_scale_change(before)
@@ -171,11 +171,11 @@ class LiveDictionary:
         return self._values[entry.index, entry.sub]
 
     def stored(self, axis: int) -> dict[tuple[int, int], int]:
-        """Return what a restart restores on one axis."""
+        """Return the values that a restart restores on one axis."""
         return {key: int(raw[axis if len(raw) > 1 else 0]) for key, raw in self._stored.items()}
 
     def store(self, axis: int, values: Mapping[tuple[int, int], int]) -> None:
-        """Set what a restart restores on one axis; the values are those of objects that exist, within their range."""
+        """Set the values that a restart restores on one axis; those of existing objects, within their range."""
         for key, raw in values.items():
             if len(self._stored[key]) < self.num_axes:
                 self._stored[key] = np.repeat(self._stored[key], self.num_axes)
@@ -211,7 +211,7 @@ class LiveDictionary:
         return self._scale_changes
 
     def prepared_record(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> PreparedRecord | None:
-        """Return what a call of `record` needs when it repeats, None if an object needs the long way.
+        """Return the prepared form of a repeated call of `record`, None if an object needs the long way.
 
         The call was made before, so that everything was found that could be refused but values.
         """
@@ -242,7 +242,7 @@ class LiveDictionary:
         )
 
     def recordable(self, entry: Entry) -> Code | None:
-        """Return where the value of an entry is that changes by itself, None of one that only a write changes."""
+        """Return where the value of an entry is that changes by itself, None for one that only a write changes."""
         check_readable(entry)
         key = (entry.index, entry.sub)
         if key in self.device.parts:
@@ -252,7 +252,7 @@ class LiveDictionary:
         return self.codes.get(key)
 
     def recorded(self, entry: Entry, code: Code, values: Floats) -> Integers:
-        """Return what an object was, of SI values of where `recordable` has it, axes last."""
+        """Return an object's integers of recorded SI values, from the place that `recordable` has for it; axes last."""
         raw = self.to_od(code, values)
         if self._is_error_code(entry):
             return self._error_codes(raw)
@@ -332,9 +332,9 @@ class LiveDictionary:
         return np.resize(np.array(found, np.int64), self.num_axes)
 
     def _stored_snapshot(self) -> RecordSnapshot:
-        """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
+        """Return the fields that a restart sets from stored values, converted by the stored scales.
 
-        What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
+        Fields that the firmware computes are left out; a parameter that cannot be written is fixed.
         An object that only shows what another sets has no say.
         """
         length = max(map(len, self._stored.values()))
@@ -373,7 +373,7 @@ class LiveDictionary:
         return (entry.index, entry.sub) in self.codes
 
     def context(self) -> units.Context:
-        """Return what the factors of units depend on now, one value per axis."""
+        """Return the values that the factors of units depend on now, one per axis."""
         scales = units.Context(
             position_scaler=self._scale_field(SCALE_FIELD),
             current_lsb=self.device.current_full_scale / 32768.0,
@@ -403,7 +403,7 @@ class LiveDictionary:
         return (entry.index, entry.sub) == ERROR_CODE and not self._is_bound(entry)
 
     def _error_codes(self, faults: Integers) -> Integers:
-        """Return 603Fh: the emergency code of what holds an axis in fault, 0 of one in none; axes last."""
+        """Return 603Fh: the emergency code of the fault that an axis is in, 0 without a fault; axes last."""
         codes = np.zeros(faults.shape, np.int64)
         for row in np.unique(faults[faults > 0]):
             emergency = self.device.emergencies[self.device.firmware.causes[int(row) - 1].name]
@@ -461,7 +461,7 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
 
     def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Change a scale: what is stored in units that follow it keeps its integers, whose SI value changes."""
+        """Change a scale: stored values in units that follow it keep their integers, and change in SI."""
         kept = [
             (other, self._read(other))
             for other in self.entries
@@ -525,7 +525,7 @@ def check_state(device: Device, entry: Entry, state: int) -> None:
 
 
 def refuse_same_mode(entry: Entry, mode: int) -> NoReturn:
-    """Raise 08000022h: the mode is what it is already."""
+    """Raise 08000022h: the axis has this mode already."""
     raise ObjectAccessError(
         WRONG_STATE,
         f"{entry.label} is {mode} already, and this drive refuses the same mode twice; read 6061h first",

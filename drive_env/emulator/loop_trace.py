@@ -1,4 +1,4 @@
-"""What emulated drives do between two communication cycles: signals at the rate of the velocity loop.
+"""Traces between two communication cycles of emulated drives: signals at the rate of the velocity loop.
 
 No bus carries this; a real drive of this kind shows its loops once a millisecond. The machines run exactly as they do
 otherwise, to the bit: a cycle is run as windows, and only the first of them does what the drive does once a cycle.

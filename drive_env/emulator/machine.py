@@ -66,7 +66,7 @@ class Machines:
 
     @property
     def parameter_rows(self) -> Mapping[str, MachineParameter]:
-        """What each parameter is by name: unit, default, and the range in which random machines have it."""
+        """Each parameter by name: unit, default, and the range in which random machines have it."""
         return self._drives._parameter_rows
 
     @property
@@ -87,7 +87,7 @@ class Machines:
 
     @contextmanager
     def pushed(self) -> Iterator[Callable[[ArrayLike], None]]:
-        """Give what puts a torque on each axis by itself, beside `load_torque`, which is all there is again at the end.
+        """Give a function that puts torques on the axes besides `load_torque`, which alone acts again at the end.
 
         It takes torques as the rotors see them [N*m], shape (num_axes,), one after the other; the load's joints that no
         axis turns feel nothing of them.
@@ -129,7 +129,7 @@ class Machines:
             period: After which the table begins anew; without one the first and last values hold outside.
 
         Raises:
-            ValueError: For a table that is none; nothing is changed then.
+            ValueError: For an invalid table; nothing is changed then.
         """
         drives = self._drives
         if of not in ("time", "position"):
@@ -344,7 +344,7 @@ class Machines:
     def error_bits(self) -> NDArray[np.int64]:
         """Errors that are there whatever machine and drive do, shape (num_axes,); bit k is error k of the table.
 
-        Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is none of
+        Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is not of
         its errors, and on drives whose errors have no numbers.
         """
         self._check_has_errors()
@@ -370,7 +370,7 @@ class Machines:
 
     @property
     def leds(self) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-        """What the run lamp and the error lamp of each axis' node show, by name, each of shape (num_axes,).
+        """The run lamp and the error lamp of each axis' node, by name, each of shape (num_axes,).
 
         "off", "on", "blinking", "single flash" or "double flash" (CiA 303-3; their times are in canopen/leds.py).
         Drives on no bus show what they do after power-on: pre-operational, without an error.
@@ -383,7 +383,7 @@ class Machines:
         return run, error
 
     def connect_lamps(self, axes: slice, lamps: Callable[[], tuple[str, str]]) -> None:
-        """Let the lamps of axes show what a node's do: run and error, by name."""
+        """Set the lamps of axes to those of a node: run and error, by name."""
         self._lamps.append((axes, lamps))
 
     @property
@@ -471,7 +471,8 @@ class Machines:
             Its number, for `clear_fault`.
 
         Raises:
-            ValueError: For a fault, parameter, time or condition that is none, or one that this load cannot have.
+            ValueError: For an unknown fault or parameter, an invalid time or condition, or a fault that this load
+                cannot have.
         """
         order = Order(name, at, when, duration, axis=axis, parameters=parameters)
         return self._drives._faults.add(order, self._mask(where))
@@ -493,7 +494,7 @@ class Machines:
         return found
 
     def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
-        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        """End a fault or call it off, None all of them; ValueError for an unknown number."""
         self._drives._faults.clear(number, self._mask(where))
 
     def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:

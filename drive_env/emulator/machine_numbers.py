@@ -1,4 +1,4 @@
-"""What is drawn for each machine, of thousands at once: the numbers that NumPy's generator of each would give.
+"""Random numbers of thousands of machines at once: those that NumPy's generator of each would give.
 
 Machine k of a seed has a generator of its own, `numpy.random.default_rng((seed, k))`, so that it is the same machine in
 every set. To make one takes some 30 us; the same arithmetic on arrays, one element for each machine, takes 2, and 3 ms

@@ -39,7 +39,7 @@ class MachineParameter(NamedTuple):
 
 
 class MachineKind(NamedTuple):
-    """What the machines of a firmware are made of, beside what all have; a row of `machine_kinds.py`.
+    """The parts that the machines of a firmware have beside those of all; a row of `machine_kinds.py`.
 
     Attributes:
         motor_parameters: (motor) -> parameters of the motor, in the order in which they are drawn.
@@ -112,7 +112,7 @@ def draw_parameters(
         wired_as_known: Draw no wiring unless it is named itself: for drives that were commissioned for the motor's.
 
     Raises:
-        ValueError: If a name is none of a group or parameter.
+        ValueError: For an unknown group or parameter.
     """
     chosen = _chosen(table, randomise)
     if wired_as_known:
@@ -209,7 +209,7 @@ def velocity_filter(cutoff: Floats, rate: float) -> tuple[Floats, Floats, Floats
 
 
 def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> None:
-    """Let encoders count otherwise from here on, by a field of the record: what they have counted they keep."""
+    """Change how encoders count from here on, by a field of the record: their counts so far stay."""
 
     def lanes(name: str) -> Floats:
         return get_lanes(records, name, len(values)).astype(float)

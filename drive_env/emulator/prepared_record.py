@@ -1,4 +1,4 @@
-"""A call of `record` that repeats, prepared: what it plays and samples, with factors and limits, for compiled code.
+"""A call of `record` that repeats, prepared: objects to play and to sample, with factors and limits, for compiled code.
 
 An outer controller makes the same call a thousand times a second; looking names up and converting object by object
 takes longer then than the drives' own millisecond.
@@ -45,7 +45,7 @@ class PreparedObject(NamedTuple):
 
 
 class PreparedRecord:
-    """What one call plays and samples.
+    """The objects that one call plays and samples.
 
     Args:
         played: Fields that rows go to, and their rows.

@@ -1,4 +1,4 @@
-"""Values of many fields of drive records, to be put into some axes at once: what a reset or a restart restores."""
+"""Values of many fields of drive records, to be put into some axes at once, as a reset or a restart does."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def _set_adc(records: Records, device: Device, bits: Floats, axes: Mask) -> None
 
 
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
-    """Write what stage and motor are besides their parameters."""
+    """Write the constants of stage and motor that are not parameters."""
     records["duty_limit"] = device.duty_limit
     records["overcurrent"] = device.overcurrent
     records["nominal_current"] = device.nominal_current

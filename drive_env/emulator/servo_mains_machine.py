@@ -46,7 +46,7 @@ _NOT_HERE = {"stage.idle_current", "stage.supply_sinks"}  # the rectifier feeds 
 
 
 def motor_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return the parameters of a motor, in the order in which they are drawn, and what is never drawn of the mains."""
+    """Return the parameters of a motor, in the order in which they are drawn, and those of the mains, never drawn."""
     rows = servo_machine.motor_parameters(motor)
     for name in ("mains_phase_lost", "emergency_stop"):
         rows.append(MachineParameter(f"stage.{name}", "1", 0.0, 0.0, 0.0, 0.0))
@@ -62,7 +62,7 @@ def apply(records: Records, device: Device, motor: Motor, name: str, values: Flo
 
 
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
-    """Write what stage and motor are besides their parameters, and what the drive has been told of its motor."""
+    """Write the constants of stage and motor that are not parameters, and the drive's own data of its motor."""
     servo_machine.set_constants(records, device, motor)
     records["cyclic_wraps"] = 1  # positions of 64 bits inside: the 32 bits outside are their end
     records["chopper_enable"] = 1.0

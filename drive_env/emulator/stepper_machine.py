@@ -126,7 +126,7 @@ def apply(records: Records, device: Device, motor: Motor, name: str, values: Flo
 
 
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
-    """Write what stage and motor are besides their parameters."""
+    """Write the constants of stage and motor that are not parameters."""
     records["duty_limit"] = device.duty_limit
     records["overcurrent"] = device.overcurrent
     records["full_scale_current"] = device.current_full_scale

@@ -88,7 +88,7 @@ class BusDelays(Saved):
         return self.actions.pass_on(actions, latched=False) if self.is_there else actions
 
     def observe(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """Let the drives sample in some cycles, (cycles, num_envs, ...); return what the master has by their ends."""
+        """Return the observations that have reached the master by the ends of some cycles, (cycles, num_envs, ...)."""
         return self.observations.pass_on(observations) if self.is_there else observations
 
 
@@ -105,7 +105,7 @@ class Line(Bundle):
     last_arrival: Numbers
     arrivals: NumberMatrix  # of the last messages, (num_envs, depth)
     messages: Cube  # (num_envs, depth, width)
-    held: Matrix  # what is there now, (num_envs, width)
+    held: Matrix  # the arrived message, (num_envs, width)
 
     @property
     def is_there(self) -> bool:
@@ -113,7 +113,7 @@ class Line(Bundle):
         return bool(self.latency.any() or self.jitter.any())
 
     def reset(self, latency: Floats, jitter: Floats, first: NDArray[Any], where: Mask) -> None:
-        """Begin anew in the environments where the mask is true, with what is there before the first message."""
+        """Begin anew in the environments where the mask is true, with the message that stands before the first one."""
         lanes, width, depth = len(where), first[0].size, self.arrivals.shape[1]
         if self.held.shape[1] != width:
             self.replace(messages=np.zeros((lanes, depth, width)), held=np.zeros((lanes, width)))
@@ -133,7 +133,7 @@ class Line(Bundle):
         self.held[where] = begun[where]
 
     def pass_on(self, messages: NDArray[Any], latched: bool = True) -> NDArray[Any]:
-        """Return what is there in each cycle, of messages of shape (cycles, num_envs, ...) sent in them."""
+        """Return the messages that have arrived in each cycle, of those sent in them, shape (cycles, num_envs, ...)."""
         sent = np.ascontiguousarray(messages, float).reshape(*messages.shape[:2], -1)
         arrived = np.empty_like(sent)
         _pass_rows_on(self.address, sent, arrived, latched)

@@ -1,4 +1,4 @@
-"""A payload that changes while machines run: which parameter of the load it is, when it changes, and to what."""
+"""A payload that changes while machines run: which parameter of the load it is, its times and its values."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Payload(NamedTuple):
 
 
 def find_payload(load: Load, chosen: str, low: float | None, high: float | None) -> Payload:
-    """Return what changes of a load.
+    """Return the payload of a load: which parameter changes, and in which range.
 
     Args:
         load: The row.
@@ -41,7 +41,7 @@ def find_payload(load: Load, chosen: str, low: float | None, high: float | None)
         high: Likewise.
 
     Raises:
-        ValueError: For a parameter that there is not, naming those that there are, or a range that is none.
+        ValueError: For an unknown parameter, naming the known ones, or an invalid range.
     """
     known = [f"load.{p.name}" for p in load.parameters]
     name = next((n for n in PAYLOADS if n in known), NO_PAYLOAD) if chosen == "auto" else chosen
@@ -57,7 +57,7 @@ def find_payload(load: Load, chosen: str, low: float | None, high: float | None)
 
 
 class PayloadChanges(Saved):
-    """When each machine's payload changes in an episode, and to what: once in each of its equal parts.
+    """The times and values of each machine's payload in an episode: one change in each of its equal parts.
 
     Args:
         payload: What changes.

@@ -240,7 +240,7 @@ class GainScheduling(VectorEnvironment):
         options: Fields of the configuration that replace its own.
 
     Raises:
-        ValueError: For a value that is none, naming those that are.
+        ValueError: For an invalid value, naming the valid ones.
     """
 
     STATE = (
@@ -396,7 +396,7 @@ class GainScheduling(VectorEnvironment):
         self._acting = np.zeros((n, self._axes), np.int64)
 
     def _prepare_scales(self, load: Load) -> None:
-        """Set what the programme may ask for: half of what motor and travel give, with the heaviest payload."""
+        """Set the programme's limits: half of what motor and travel allow, with the heaviest payload."""
         motor, alone = self.config.motor_row, one(load)
         shaft, turning = shaft_load(alone), way(alone)
         heaviest = motor.inertia + self._payload.high * shaft.inertia[0]
@@ -491,7 +491,7 @@ class GainScheduling(VectorEnvironment):
         at_once = 1 if self._pictures is not None and self._pictures.is_looking else self._cycles
         traces = []
         with warnings.catch_warnings():
-            # A machine that leaves physics ends its environment; who steps it is told so by `info`.
+            # A machine that leaves physics ends its environment; `info` says so.
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             for begin in range(0, self._cycles, at_once):
                 part = {key: values[begin : begin + at_once] for key, values in play.items()}
@@ -559,7 +559,7 @@ class GainScheduling(VectorEnvironment):
         return terms | {"trip": -1.0 * terminated}
 
     def _faults(self, tripped: Mask) -> NDArray[np.object_]:
-        """Return the name of what ended each environment, "" where nothing did."""
+        """Return the emergency or other cause that ended each environment, "" for those that go on."""
         names = np.full(self.num_envs, "", object)
         if tripped.any():
             names[tripped.reshape(self.num_envs, -1).any(axis=1)] = "unknown"

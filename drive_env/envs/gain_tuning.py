@@ -203,7 +203,7 @@ class GainTuning(VectorEnvironment):
         options: Fields of the configuration that replace its own.
 
     Raises:
-        ValueError: For a value that is none, naming those that are.
+        ValueError: For an invalid value, naming the valid ones.
     """
 
     STATE = (
@@ -476,7 +476,7 @@ class GainTuning(VectorEnvironment):
         self._best_is_stable = np.where(best, ~tried.aborted[:2].any(axis=0), self._best_is_stable)
         self._measured = np.where(better, measured, self._measured)
 
-    # --- what is told ---------------------------------------------------------------------------------------------
+    # --- observations and info -------------------------------------------------------------------------------------
     def _observe(self) -> Any:
         identified = identified_entries(self._identified, self.motor)
         known = self._device.gains

@@ -1,4 +1,4 @@
-"""Motion programmes, drawn per environment: smooth moves from point to point, or a sine, within what an axis can do."""
+"""Motion programmes, drawn per environment: smooth moves from point to point, or a sine, within an axis' limits."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PACE = (0.5, 1.0)  # how hard a move is driven, of what the axis can do
 
 
 class Reach(NamedTuple):
-    """What a programme may ask of each axis of a machine, shape (axes,): [rad], [rad/s], [rad/s^2] at the rotor."""
+    """Limits of a programme for each axis of a machine, shape (axes,): [rad], [rad/s], [rad/s^2] at the rotor."""
 
     distance: Floats
     speed: Floats

@@ -157,7 +157,7 @@ class Distributions:
         one away, and so does `faults = false`.
 
         Raises:
-            ValueError: For a set, law, key or number that is none, with those that are.
+            ValueError: For an unknown set, distribution or key, with the known ones, or an invalid number.
         """
         if isinstance(source, Distributions):
             return source
@@ -376,7 +376,7 @@ def shipped() -> list[str]:
 
 
 def laws_of(load: str, device: Device, parameters: Collection[str]) -> Distributions:
-    """Return the set that ships for a load, with what the device's machines have otherwise than servo drives.
+    """Return the set that ships for a load, with the distributions that differ for the device's machines.
 
     Args:
         load: Name of a load that has a set.
@@ -546,7 +546,7 @@ def _toml(value: Any) -> str:
 def shares_of_chance(key: np.uint64 | NDArray[np.uint64], marks: NDArray[np.uint64]) -> Floats:
     """Return shares of chance in [0, 1) of keys with marks: splitmix64 of both (Steele, Lea, Flood 2014).
 
-    Whoever knows a key can have any of its chances, in any order: what one of them is asked for changes no other.
+    Any chance of a key can be computed alone and in any order: one does not change another.
     """
     with np.errstate(over="ignore"):
         z = key + marks * np.uint64(0x9E3779B97F4A7C15)

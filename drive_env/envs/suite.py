@@ -53,7 +53,7 @@ def _scheduling(about: str, solved: float, **options: Any) -> SuiteTask:
 
 
 def _tuning(about: str, solved: float, load: str, laws: Any, gains: tuple[str, ...], **options: Any) -> SuiteTask:
-    """Return a task of GainTuning: ten trials, each rewarded by what its own gains are worth."""
+    """Return a task of GainTuning: ten trials, each rewarded by the worth of its own gains."""
     own = {"load": load, "distributions": laws, "gains": gains, "trials": 10, "dynamics": "standard"}
     return SuiteTask("ServoDrive/GainTuning-v0", about, 10, solved, own | {"judged": "trial"} | options)
 

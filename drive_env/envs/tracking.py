@@ -65,7 +65,7 @@ REST_SPEED, REST_TIME = 0.02, 0.5  # of the trajectory's speed: at rest; s that 
 
 @dataclass(frozen=True)
 class Task:
-    """What is done with a load: the defaults of a configuration.
+    """A task with a load: the defaults of a configuration.
 
     mode: csp, csv or cst.
     trajectory: A row of trajectories.TRAJECTORIES.
@@ -203,7 +203,7 @@ class TrackingConfig:
 
     @property
     def task(self) -> Task:
-        """What the load's row says."""
+        """The task of the load's row."""
         task = TASKS.get(self.load, OTHER) if isinstance(self.load, str) else OTHER
         return of_stepper(task) if turns_steppers(find_device(self.device)) else task
 
@@ -224,7 +224,7 @@ def turns_steppers(device: Device | None) -> bool:
 
 
 def _check_device(device: Device | None, mode: str) -> None:
-    """Raise ValueError for drives that do not tell what is observed, or have no such mode."""
+    """Raise ValueError for drives that lack an observed object, or such a mode."""
     if device is None or ((cia402.TORQUE_ACTUAL, 0) in device.bindings and Role.CURRENT_LIMIT in device.roles):
         return
     if not turns_steppers(device):
@@ -289,7 +289,7 @@ class Tracking(VectorEnvironment):
     `terminated`: a drive tripped, its machine left physics, or the pole fell; `truncated`: time ran out.
 
     `info`: "reward_terms"; "parameters" of environments that begin, the true machine, not on a bus; "fault" once an
-    environment ended so, a name or several, "" of the others.
+    environment ended so, a name or several, "" for the others.
 
     Args:
         num_envs: Number of environments.
@@ -301,7 +301,7 @@ class Tracking(VectorEnvironment):
         options: Fields of the configuration that replace its own.
 
     Raises:
-        ValueError: For a value that is none, naming those that are.
+        ValueError: For an invalid value, naming the valid ones.
     """
 
     OPTIONS = (*VectorEnvironment.OPTIONS, "trajectory")
@@ -367,7 +367,7 @@ class Tracking(VectorEnvironment):
         return Box(-bound, bound, dtype=np.float32), Box(-1.0, 1.0, (axes,), np.float32)
 
     def _new_machines(self) -> RandomMachines | None:
-        """Return the emulated machines, as they are drawn; None on a bus, whose drives must tell what is observed."""
+        """Return the emulated machines as drawn; None on a bus, whose drives must have the observed objects."""
         distributions, machine = self.config.distributions, self.drives.machine
         if machine is not None:
             if isinstance(distributions, str) and distributions in shipped():
@@ -650,7 +650,7 @@ class Tracking(VectorEnvironment):
                     raise
 
     def _faults(self, lanes: Mask) -> NDArray[np.object_]:
-        """Return what ended each lane: emergencies by name, "diverged", "fell", "not enabled"; "" where nothing did."""
+        """Return the cause of each environment's end: emergencies by name, "diverged", "fell", "not enabled", or ""."""
         self._take_emergencies()
         machine = self.drives.machine
         diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)
@@ -665,7 +665,7 @@ class Tracking(VectorEnvironment):
         return found
 
     def _take_emergencies(self) -> None:
-        """Keep what drives tell, until their episodes end: a statusword may show a fault a step later."""
+        """Keep emergencies until their episodes end: a statusword may show a fault a step later."""
         for message in self.drives.emergencies():
             if message.code:
                 self._causes[message.axis // self._axes].append(message.name)

@@ -140,7 +140,7 @@ def within_a_turn(angle):
 
 @inlined
 def torque(lags, fourth, position):
-    """Return what tells the torque: a torque actual value, or the demand less the position [inc]."""
+    """Return the signal of the torque: the torque actual value, or the demand less the position [inc]."""
     return position_error(fourth, position, 0.0) if lags == 1 else float(fourth)
 
 

@@ -58,8 +58,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
             episodes end, (num_envs,) each; returns the rewards, (num_envs,), in place of the environment's.
 
     Raises:
-        ValueError: For a mode that is none, or less than one environment; in a step for a reward of another shape, or
-            one that is not a number.
+        ValueError: For an unknown mode, or less than one environment; in a step for a reward of another shape, or one
+            that is not a number.
     """
 
     OPTIONS: tuple[str, ...] = ("reset_mask", "state", "machine")  # of reset
@@ -114,7 +114,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         raise NotImplementedError
 
     def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
-        """Act in the only environment; return what `gymnasium.Env.step` returns."""
+        """Act in the only environment; return the tuple of `gymnasium.Env.step`."""
         observation, reward, terminated, truncated, info = self._step_rewarded(_batch_of_one(action))
         return one_of(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), one_of(info)
 
@@ -151,7 +151,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     def stage(self) -> float:
         """Stage of the curriculum, 0...1, of machines that are drawn from now on; the configuration's until it is set.
 
-        Whoever trains sets it, with `curriculum.stage_at(environment steps so far)`.
+        A training sets it, with `curriculum.stage_at(environment steps so far)`.
         """
         return float(self.config.stage if self._stage is None else self._stage)
 
@@ -207,7 +207,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return machine.drives
 
     def _description(self) -> State:
-        """Return what must be equal in two vectors of environments so that one can restore the state of the other."""
+        """Return the properties that must be equal in two vectors of environments to restore the other's state."""
         table = {one.name: _text(getattr(self.config, one.name)) for one in fields(self.config)}
         table.pop("num_threads", None)
         return {"environment": type(self).__name__, "version": version("drive-env"), "num_envs": self.num_envs, **table}
@@ -225,7 +225,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """What it was made by, with the steps of an episode as they are configured; None if not by Gymnasium."""
+        """The spec that it was made by, with the configured steps of an episode; None if not by Gymnasium."""
         return self._spec
 
     @spec.setter
@@ -275,7 +275,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return observation, info
 
     def step(self, actions: Any) -> Stepped:
-        """Act in every environment; what follows the end of an episode is `autoreset_mode`'s.
+        """Act in every environment; `autoreset_mode` decides what follows the end of an episode.
 
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
@@ -479,7 +479,7 @@ def merge_info(chosen: Info, others: Info, mask: Mask) -> Info:
 
 
 def one_of(tree: Any) -> Any:
-    """Return environment 0 of an array, or of a dict of arrays; of a masked entry only what is there."""
+    """Return environment 0 of an array, or of a dict of arrays; masked entries only where they are valid."""
     if not isinstance(tree, dict):
         return tree[0]
     if not any(key.startswith("_") for key in tree):
@@ -537,7 +537,7 @@ def _are_finite(actions: Any) -> bool:
 
 
 def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
-    """Return actions with 0 for what is no number in environments whose action is ignored.
+    """Return actions with 0 for those that are not a number, in environments whose action is ignored.
 
     Raises:
         ValueError: For what is no number elsewhere: a drive would be told whatever its integer happens to be.

@@ -1,4 +1,4 @@
-"""What an EtherCAT slave controller and the device behind it ask of each other.
+"""The calls between an EtherCAT slave controller and the device behind it.
 
 The controller (`controller.py`) owns whatever ETG.1000.4 and ETG.1000.6 put before the application: registers, EEPROM
 interface, FMMUs, sync managers, the mailbox header with its counter and its repetitions, FoE in Bootstrap, the AL state
@@ -183,10 +183,10 @@ class Application(Protocol):
         """Return and forget the CoE messages that nothing asked for now: emergencies, answers that took time."""
 
     def before_cycle(self, now: float) -> None:
-        """Do what is due before the drives advance by one communication cycle."""
+        """Run everything due before the drives advance by one communication cycle."""
 
     def after_cycle(self, now: float) -> None:
-        """Do what is due after it."""
+        """Run everything due after it."""
 
     def outputs(self, data: bytes, now: float) -> None:
         """Take the output image, `output_size` bytes, which take effect with the cycle that begins next."""

@@ -1,6 +1,6 @@
 """CANopen over EtherCAT: services of a mailbox message, and emergencies (ETG.1000.6, 5.6).
 
-A message has two bytes of header: a number, of which nobody makes use, and the service in the upper four bits.
+A message has two bytes of header: a number, which is not used, and the service in the upper four bits.
 """
 
 from __future__ import annotations
@@ -73,6 +73,6 @@ class MailboxEmergencies:
         return taken
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Drop waiting emergencies."""
         self._waiting.clear()
         self.told = 0

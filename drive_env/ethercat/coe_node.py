@@ -1,4 +1,4 @@
-"""A drive on EtherCAT: what is behind the slave controller (`application.py` has the calls and their order).
+"""A drive on EtherCAT: the device behind the slave controller (`application.py` has the calls and their order).
 
 Dictionary, axes, errors, stored parameters and the process image are those of any node (`node/`). Here stands what
 EtherCAT makes of them: which AL state lets what act, and when outputs take effect.
@@ -206,7 +206,7 @@ class CoeNode:
             self._stop_axes(now)
 
     def after_cycle(self, now: float) -> None:
-        """Tell of what the axes had."""
+        """Queue the emergencies of the axes."""
         self._errors.collect(now)
 
     # --- mailbox ------------------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ class CoeNode:
                 return []
         if service == CoeService.INFORMATION:
             return self._information.request(content)
-        raise ValueError(f"service {service} of CoE is none that this device has")
+        raise ValueError(f"service {service} of CoE is not one of this device")
 
     def pending_coe(self, now: float) -> list[bytes]:
         """Return and forget the emergencies that wait."""
@@ -255,7 +255,7 @@ class CoeNode:
         return self._sii
 
     def write_sii(self, content: bytes) -> None:
-        """Keep what the master has written."""
+        """Store the EEPROM that the master has written."""
         self._sii = content
 
 

@@ -269,7 +269,7 @@ class CoeSdoServer:
 
 
 def _parts(entries: Sequence[Entry], content: bytes) -> tuple[list[tuple[Entry, int]], bytes]:
-    """Return the values of entries from sub-index 1 on, as far as there are data, and what is left over."""
+    """Return the values of entries from sub-index 1 on, as far as there are data, and the data left over."""
     rows = []
     for entry in entries[1:]:
         size = size_of(entry)

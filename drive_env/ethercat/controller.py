@@ -205,7 +205,7 @@ class SlaveController:
         _add(frame, first + length, has_read + has_written * (2 if command in READING else 1))
 
     def _read_unit(self, unit: Fmmu, frame: bytearray, place: int, start: int, end: int, now: int) -> bool:
-        """Read what an FMMU maps of the logical addresses from `start` to `end`, which lie at `place` of the frame."""
+        """Read the data that an FMMU maps to the logical addresses from `start` to `end`, at `place` of the frame."""
         low, high = max(unit.first, start), min(unit.end, end)
         if unit.offset is not None:
             data = self.read(low + unit.offset, high - low, now)
@@ -225,7 +225,7 @@ class SlaveController:
         return True
 
     def _write_unit(self, unit: Fmmu, sent: bytes | bytearray, start: int, end: int, now: int) -> bool:
-        """Write what an FMMU maps of the logical addresses from `start` to `end`, whose data is `sent`."""
+        """Write the data `sent` that an FMMU maps to the logical addresses from `start` to `end`."""
         low, high = max(unit.first, start), min(unit.end, end)
         source = sent[low - start : high - start]
         if unit.offset is not None:
@@ -239,7 +239,7 @@ class SlaveController:
 
     # --- memory -------------------------------------------------------------------------------------------------------
     def read(self, address: int, length: int, now: int) -> bytes | None:
-        """Return what a master reads at world time `now` [ns]; None: nothing there could be read."""
+        """Return the bytes that a master reads at world time `now` [ns]; None if the range cannot be read."""
         end = address + length
         if length == 0 or end > registers.RAM_END:
             return None
@@ -264,7 +264,7 @@ class SlaveController:
         return bytes(found) if done else None
 
     def write(self, address: int, data: bytes | bytearray, now: int) -> bool:
-        """Take what a master writes at world time `now` [ns]; returns whether any of it could be written."""
+        """Write a master's bytes at world time `now` [ns]; returns whether any of them could be written."""
         end = address + len(data)
         if not data or end > registers.RAM_END:
             return False
@@ -286,11 +286,11 @@ class SlaveController:
         return done
 
     def _peek(self, address: int, length: int) -> bytes:
-        """Return what the master wrote last, to write some of its bits anew."""
+        """Return the bytes that the master wrote last, to write some of their bits anew."""
         return bytes(self.memory[address : address + length]).ljust(length, b"\0")
 
     def _refresh(self, address: int, end: int, now: int) -> None:
-        """Let registers show what the time and the sync managers say."""
+        """Update registers from the time and the sync managers."""
         if address < registers.TIME_OFFSET and end > registers.SYSTEM_TIME:
             self.clock.refresh(now)
         elif address < SYNC_MANAGERS_END and end > registers.SYNC_MANAGERS:
@@ -340,7 +340,7 @@ class SlaveController:
         return locked
 
     def _react(self, address: int, end: int, data: bytes | bytearray, now: int) -> None:
-        """Do what a write to registers from `address` to `end` sets off."""
+        """Act on a write to registers from `address` to `end`."""
 
         def has(first: int, size: int) -> bool:
             return address < first + size and end > first

@@ -1,4 +1,4 @@
-"""The clock of a slave controller: local time, system time, what it has to be put right by, SYNC0 (ETG.1000.4, 6.8).
+"""The clock of a slave controller: local time, system time, its correction, SYNC0 (ETG.1000.4, 6.8).
 
 Every slave has an oscillator of its own. A master measures by port receive times how long frames take, writes each
 slave's offset and delay, and then lets the first slave's system time pass all others (ARMW, FRMW): each compares, and
@@ -89,7 +89,7 @@ class DistributedClock:
         struct.pack_into("<h", memory, registers.SPEED_DIFFERENCE, speed)
 
     def restart_comparison(self, now: int) -> None:
-        """Forget what comparisons have brought, as a write of the speed counter's start does."""
+        """Drop the results of comparisons, as a write of the speed counter's start does."""
         self._anchor, self._anchor_local = now, float(self.local(now))
         self._correction = self._mean = 0.0
         self._compared = None
@@ -109,7 +109,7 @@ class DistributedClock:
         return int(cycle)
 
     def activate(self, now: int) -> None:
-        """Take what 0981h says: SYNC0 from its start time on. A start that has passed makes no pulse."""
+        """Act on 0981h: SYNC0 from its start time on. A start that has passed makes no pulse."""
         self._memory[registers.SYNC_STATUS] = 0
         self._next_pulse = None
         if self.has_sync0:
@@ -121,7 +121,7 @@ class DistributedClock:
                 self._memory[registers.SYNC_STATUS] = NOT_IN_NEAR_FUTURE
 
     def next_pulse(self) -> int | None:
-        """Return the world time [ns] of the next pulse, None where there is none."""
+        """Return the world time [ns] of the next pulse, None without pulses."""
         if self._next_pulse is None:
             return None
         (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)

@@ -68,7 +68,7 @@ def _object(
 
 
 def _image(index: int, image: FixedImage, dictionary: ObjectDictionary) -> ODArray | ODRecord:
-    """Return the mapping object of a ready-made image; what is reserved, or another's, has no index (ETG.1000.6)."""
+    """Return the mapping object of a ready-made image; reserved and foreign fields have no index (ETG.1000.6)."""
     mapped = []
     for field in image.fields:
         bits = TYPES[field.type][1]

@@ -89,7 +89,7 @@ class EtherCatServer:
         return self._receive(frame)
 
     def _catch_up(self) -> None:
-        """Let what is due happen, but one cycle at most: frames that wait are not to wait for several."""
+        """Run everything due, but one cycle at most: frames that wait are not to wait for several."""
         world, now = self.world, self._now()
         late = now - world.next_cycle
         if late > MOST_BEHIND:

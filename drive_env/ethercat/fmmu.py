@@ -24,7 +24,7 @@ class Fmmu(NamedTuple):
 
 
 def parse(registers: bytes | bytearray) -> Fmmu | None:
-    """Return what the 16 bytes of an FMMU's registers say; None: it is off, or maps nothing."""
+    """Parse the 16 bytes of an FMMU's registers; None if it is off, or maps nothing."""
     start, length, first_bit, last_bit, physical, physical_bit, kind, active = struct.unpack_from(
         "<IHBBHBBB", registers
     )

@@ -54,7 +54,7 @@ class FileServer:
         self._packet = 0
 
     def request(self, message: bytes, full: int, room: int, *, is_bootstrap: bool) -> bytes | None:
-        """Return the answer to a message without its mailbox header; None: there is none.
+        """Return the answer to a message without its mailbox header; None without an answer.
 
         Args:
             message: The message.
@@ -79,7 +79,7 @@ class FileServer:
         self.close()
         if operation in (FoeOperation.ERROR, FoeOperation.BUSY):
             return None
-        return _error(FoeError.ILLEGAL, f"operation {operation} is none of FoE")
+        return _error(FoeError.ILLEGAL, f"operation {operation} is not one of FoE")
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _take(self, number: int, content: bytes, full: int) -> bytes:

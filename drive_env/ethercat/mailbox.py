@@ -76,7 +76,7 @@ class Mailbox:
         self._waiting.append((protocol, message, address))
 
     def work(self, now: float) -> bool:
-        """Do what is due: repeat an answer, take a message, put the next answer where the master reads.
+        """Run everything due: repeat an answer, take a message, put the next answer where the master reads.
 
         Returns:
             Whether a message was taken.
@@ -124,7 +124,7 @@ class Mailbox:
     def _dispatch(
         self, data: bytes, length: int, channel: int, protocol: int, now: float, address: int
     ) -> MailboxError | None:
-        """Answer a message; returns what is wrong with it."""
+        """Answer a message; returns the error in it, if there is one."""
         if length > len(data) - HEADER:
             return MailboxError.INVALID_SIZE
         if channel & CHANNEL:

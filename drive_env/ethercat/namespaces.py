@@ -78,7 +78,7 @@ def _check() -> None:
 
 
 def _ip(*arguments: str) -> str:
-    """Return what `ip` prints; OSError with its own words where it fails."""
+    """Run `ip` and return its output; OSError with its own words if it fails."""
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True, timeout=30, check=False)
     if done.returncode != 0:
         raise OSError(f"ip {' '.join(arguments)} failed: {done.stderr.strip() or done.returncode}")

@@ -1,4 +1,4 @@
-"""What an EDS says of each object for those who ask by EtherCAT: names, types, access (ETG.1000.6, 5.6.3; ETG.2000)."""
+"""Descriptions of objects by EtherCAT, from an EDS: names, types, access (ETG.1000.6, 5.6.3; ETG.2000)."""
 
 from __future__ import annotations
 

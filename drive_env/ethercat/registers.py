@@ -1,7 +1,8 @@
 """The registers of a slave controller as rows (ETG.1000.4, clause 6; ET1100 data sheet, section II).
 
-A master may write the bits of `mask`; what a write sets off is in the parts that the rows belong to: `sii.py`,
-`sync_manager.py`, `distributed_clock.py`, `state_machine.py`. Rows of one FMMU or sync manager stand for all of them.
+A master may write the bits of `mask`; what a write sets off is in the parts that the rows belong to:
+`sii_interface.py`, `sync_manager.py`, `distributed_clock.py`, `state_machine.py`. Rows of one FMMU or sync manager
+stand for all of them.
 """
 
 from __future__ import annotations

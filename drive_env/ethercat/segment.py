@@ -1,7 +1,7 @@
 """A segment: slaves in a line. A frame passes each of them on its way out and comes back through all.
 
 A frame that is not whole changes nothing: its datagrams must fill its length, and, where the way it came tells the FCS,
-that must fit. Then the first slave counts it (0300h or 030Ch), those behind count that somebody did (0308h).
+that must fit. Then the first slave counts it (0300h or 030Ch), those behind count that one before did (0308h).
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class SiiInterface:
 
     Attributes:
         content: The EEPROM's.
-        is_changed: The master has written to it, since somebody last looked.
+        is_changed: The master has written to it since this was last reset.
     """
 
     def __init__(self, memory: bytearray, takes_time: bool) -> None:
@@ -69,7 +69,7 @@ class SiiInterface:
         )
 
     def command(self, now: float) -> None:
-        """Do what the master has written to 0502h; while it is busy, or the device owns the EEPROM, nothing."""
+        """Run the command written to 0502h; none while it is busy, or the device owns the EEPROM."""
         (control,) = struct.unpack_from("<H", self._memory, registers.SII_CONTROL)
         command = (control & COMMAND) >> COMMAND_SHIFT
         if now < self._busy_until or self._memory[registers.SII_ACCESS] & PDI_OWNS:

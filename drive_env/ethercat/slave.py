@@ -55,7 +55,7 @@ class EtherCatSlave:
         self.application.power_on(now)
 
     def after_frame(self, now: float) -> None:
-        """Look at what a frame has changed, and act by it."""
+        """Act on the changes of a frame."""
         controller = self.controller
         if controller.reset_requested:
             self.power_on(now)
@@ -77,12 +77,12 @@ class EtherCatSlave:
             self.application.outputs(outputs, now)
 
     def before_cycle(self, now: float) -> None:
-        """Do what is due before the drives advance by a communication cycle."""
+        """Run everything due before the drives advance by a communication cycle."""
         self.run_until(now)
         self.application.before_cycle(now)
 
     def after_cycle(self, now: float) -> None:
-        """Let the master read what a cycle has brought."""
+        """Let the master read the results of a cycle."""
         self.application.after_cycle(now)
         state = self._machine.state
         if state in WITH_MAILBOX:

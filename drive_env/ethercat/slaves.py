@@ -21,7 +21,7 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
     """Return the world of a bus on EtherCAT, its slaves not switched on yet.
 
     Args:
-        bus: What it is made of; bit rate, node numbers and faults of the wire are CAN's, and count for nothing.
+        bus: Its configuration; bit rate, node numbers and faults of the wire are CAN's, and have no meaning here.
         lockstep: Time advances by process data.
 
     Raises:

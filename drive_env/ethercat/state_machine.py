@@ -66,7 +66,7 @@ class StateMachine:
         self._show()
 
     def request(self, control: int, now: float) -> None:
-        """Do what the master has written to AL control."""
+        """Act on the master's write to AL control."""
         wanted = control & STATE
         if self.has_error and not control & ACKNOWLEDGE and wanted >= self.state:
             return

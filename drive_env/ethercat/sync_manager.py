@@ -1,6 +1,6 @@
 """A sync manager: the memory that master and device hand each other whole (ETG.1000.4, 6.7; ET1100, section I, 8).
 
-Buffered, it has three buffers: who reads gets the newest that was written to its end, and nobody waits. As a mailbox it
+Buffered, it has three buffers: a read gets the newest that was written to its end, and no side waits. As a mailbox it
 has one: it is full or empty, and the other side waits. An access to the first byte opens the buffer, one to the last
 closes it; what comes between is refused as long as it is not open.
 """
@@ -105,7 +105,7 @@ class SyncManager:
         self._interrupts = INTERRUPT_WRITE
 
     def take(self) -> bytes | None:
-        """Return what the master has written since the last call; a mailbox is empty then."""
+        """Return the bytes that the master has written since the last call; a mailbox is empty then."""
         data, self.written = self.written, None
         if data is not None:
             self.is_full = False

@@ -35,7 +35,7 @@ TYPES = {SYNCHRONISATION[0]: (WITH_OUTPUTS, WITH_SYNC0), SYNCHRONISATION[1]: (IN
 
 
 class Synchronisation:
-    """The objects, and what happens by them.
+    """The objects of synchronisation, and their effects.
 
     Args:
         device: Whose they are.
@@ -80,7 +80,7 @@ class Synchronisation:
     def begin(self, clock: ClockSetting) -> AlStatusCode:
         """Take the clocks as they are set before Safe-Op; return why that cannot be, or NO_ERROR.
 
-        A cycle of SYNC0 that the device cannot keep up with is refused; 0, a single pulse, is none.
+        A cycle of SYNC0 that the device cannot keep up with is refused; 0 means a single pulse and is taken.
         """
         if clock.has_sync0 and clock.sync0_cycle < self._shortest:
             return AlStatusCode.DC_CYCLE_TIME
@@ -99,7 +99,7 @@ class Synchronisation:
         return AlStatusCode.NO_ERROR
 
     def leave(self) -> None:
-        """Be in Pre-Op again: what the master has set counts."""
+        """Be in Pre-Op again: the master's settings count."""
         self._shown = {}
 
     def outputs_came(self, now: float) -> None:

@@ -52,7 +52,7 @@ class RawSocket:
         interface: Its name, as veth1.
 
     Raises:
-        OSError: Where there is none of that name, or raw sockets are not there or not allowed; says what to do.
+        OSError: If there is no interface of that name, or raw sockets are missing or not allowed; says what to do.
     """
 
     def __init__(self, interface: str) -> None:

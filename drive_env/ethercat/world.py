@@ -95,12 +95,12 @@ class EtherCatWorld:
         self.end_cycle()
 
     def begin_cycle(self) -> None:
-        """Do what is due before the drives advance."""
+        """Run everything due before the drives advance."""
         for slave in self.segment.slaves:
             slave.before_cycle(self.time)
 
     def end_cycle(self) -> None:
-        """Do what is due after the drives have advanced."""
+        """Run everything due after the drives have advanced."""
         self.cycles += 1
         self.time = max(self.time, self.cycles * self.cycle_time)
         for slave in self.segment.slaves:

@@ -1,1 +1,1 @@
-"""Faults as a feature: a table of what can fail, schedules, and what each does to machines, bus and nodes."""
+"""Faults: a table of them, schedules, and their effects on machines, bus and nodes."""

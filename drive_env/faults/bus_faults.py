@@ -38,7 +38,7 @@ BABBLE = bytes(8)
 
 
 class BusFault(NamedTuple):
-    """A fault that is still to come or is there: its number, what was asked for, its node, and whether it is there."""
+    """A fault that is scheduled or active: its number, its order, its node, and whether it is active."""
 
     number: int
     order: Order
@@ -90,8 +90,8 @@ class BusFaults:
                 say which axis of it.
 
         Raises:
-            ValueError: For a fault, parameter, time, condition, node or axis that is none, or that this machine cannot
-                have.
+            ValueError: For an unknown fault, parameter, node or axis, an invalid time or condition, or a fault that
+                this machine cannot have.
         """
         row = find_fault(order.name)
         given = checked_parameters(row, order.parameters)
@@ -119,7 +119,7 @@ class BusFaults:
             return [BusFault(fault.number, fault.order, fault.node, self._is_active(fault)) for fault in self._faults]
 
     def clear(self, number: int | None = None) -> None:
-        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        """End a fault or call it off, None all of them; ValueError for an unknown number."""
         with self._lock:
             known = [fault.number for fault in self._faults]
             if number is not None and number not in known:
@@ -160,7 +160,7 @@ class BusFaults:
         return fault.ends is not None
 
     def _act(self) -> None:
-        """Begin, go on with and end what is due; the world calls it as a communication cycle begins."""
+        """Begin, go on with and end faults that are due; the world calls it as a communication cycle begins."""
         if not self._faults and not self._ended:
             return
         now = self._world.cycles
@@ -236,7 +236,7 @@ class BusFaults:
         return drives.inside.faults.add(replace(order, axis=None), machines, chosen if of_axis else None)
 
     def _axes_of(self, number: int) -> NDArray[np.bool_]:
-        """Return which of the drives' axes are a node's, shape (num_axes,); those without a motor are none of them."""
+        """Return which of the drives' axes belong to a node, shape (num_axes,); without axes that have no motor."""
         node = self._emulated(number)
         axes = np.arange(node.drives.num_axes) - node.first_axis
         of_node: NDArray[np.bool_] = (axes >= 0) & (axes < node.drives.device.num_axes)

@@ -24,7 +24,7 @@ ANSWER_TIME = 5.0  # s that the server may take for its answer
 
 
 class ControlError(RuntimeError):
-    """Nobody answers there, or not as a control socket does."""
+    """No server answers at the address, or not as a control socket does."""
 
 
 class Control:
@@ -92,7 +92,7 @@ def ask(port: int, request: str) -> dict[str, Any]:
     """Send a request to the control socket of a bus that is served, and return its answer.
 
     Raises:
-        ControlError: If nobody answers there.
+        ControlError: If no server answers there.
         ValueError: What the server says of a request that cannot be.
     """
     remedy = f"start it with drive-env serve --control {port}, or give another --control"

@@ -1,4 +1,4 @@
-"""What the faults of machines change: rows of quantities, each with its value under the fault by its value without."""
+"""Effects of the machines' faults: rows of quantities, each with its value under the fault by its value without."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Given = Mapping[str, float]
 
 
 class Quantity(NamedTuple):
-    """What a fault changes.
+    """A quantity that a fault changes.
 
     kind: "record", a field of the drives' records, one per axis; "load", a parameter of the load, one per machine;
         "jam", what holds the load [N*m at the rotor], one per axis.
@@ -113,7 +113,7 @@ def of_drives(name: str, changes: tuple[Change, ...], fields: Collection[str], d
 
 
 def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes: int) -> tuple[Change, ...]:
-    """Return what a fault changes on a machine.
+    """Return the changes that a fault makes to a machine.
 
     Args:
         name: The fault.

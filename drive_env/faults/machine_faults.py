@@ -100,7 +100,7 @@ def axes_that_fulfil(condition: Condition, drives: EmulatedDrives) -> Mask:
 
 
 class MachineFaults:
-    """All faults of a set of emulated machines. Nothing is looked at while there are none.
+    """All faults of a set of emulated machines. Without faults nothing is checked.
 
     A fault's change is on top of the machine as it was built: `base` keeps what a quantity is without any, and several
     faults of one quantity act in the order in which they were given.
@@ -117,7 +117,7 @@ class MachineFaults:
 
     # --- giving, listing, taking back -----------------------------------------------------------------------------
     def add(self, order: Order, machines: Mask, of_node: Mask | None = None) -> int:
-        """Schedule a fault and return its number; `Machines.fault` says what an order holds.
+        """Schedule a fault and return its number; `Machines.fault` explains an order.
 
         Args:
             order: What is asked for.
@@ -149,10 +149,10 @@ class MachineFaults:
         return self._next_number
 
     def check(self, order: Order) -> tuple[FaultRow, tuple[Change, ...]]:
-        """Return the row of a fault and what it changes.
+        """Return the row of a fault and its changes.
 
         Raises:
-            ValueError: For a fault that these machines cannot have, or an order that is none.
+            ValueError: For a fault that these machines cannot have, or an invalid order.
         """
         name, axis = order.name, order.axis
         row = find_fault(name)
@@ -176,7 +176,7 @@ class MachineFaults:
         ]  # fmt: skip
 
     def clear(self, number: int | None, machines: Mask) -> None:
-        """End a fault, or all, on some machines; ValueError if there is none of that number."""
+        """End a fault, or all, on some machines; ValueError for an unknown number."""
         known = [fault.number for fault in self._faults]
         if number is not None and number not in known:
             raise ValueError(f"there is no fault {number}; there are {', '.join(map(str, known)) or 'none'}")
@@ -193,7 +193,7 @@ class MachineFaults:
 
     # --- states ---------------------------------------------------------------------------------------------------
     def save_state(self) -> dict[str, Any]:
-        """Return the faults that are there or still to come, and what they act on, as plain data."""
+        """Return the active and scheduled faults, and the quantities that they act on, as plain data."""
         return {
             "next": self._next_number,
             "jam": self._jam.copy(),
@@ -214,7 +214,7 @@ class MachineFaults:
 
     # --- time -----------------------------------------------------------------------------------------------------
     def act(self, now: int) -> int:
-        """Begin and end what is due at cycle `now`; return the cycle by which to call again."""
+        """Begin and end the faults due at cycle `now`; return the cycle by which to call again."""
         following = NEVER
         for fault in list(self._faults):
             waiting = fault.state == WAITING
@@ -317,7 +317,7 @@ class MachineFaults:
         return found
 
     def _refresh(self, fault: _MachineFault) -> None:
-        """Bring the quantities that a fault changes to what all faults that are there make of them."""
+        """Set the quantities that a fault changes to their values under all active faults."""
         for quantity in {change.quantity for change in fault.changes}:
             while not self._refresh_quantity(quantity):
                 # Several faults together have made a load that cannot be stepped, the latest of them too much.
@@ -331,7 +331,7 @@ class MachineFaults:
                 )
 
     def _refresh_quantity(self, quantity: Quantity) -> bool:
-        """Bring one quantity to what its faults make of it; return whether the machines can have it."""
+        """Set one quantity to its value under its faults; return whether the machines can have it."""
         axes = self._drives.num_axes
         held = self._held.setdefault(quantity, np.zeros(axes, bool))
         present = self._get(quantity)

@@ -17,7 +17,7 @@ _WORDS = ("at", "when", "duration", "node", "axis")
 
 @dataclass(frozen=True)
 class Condition:
-    """What a fault waits for, of the axes that it is of; any of them will do.
+    """The condition of a fault, on the axes that it is of; any of them will do.
 
     quantity: "enabled": operation enabled. "position": true rotor angle [rad]; "speed": its rate without its sign
         [rad/s]; these are compared with `limit`. "" means none.
@@ -30,10 +30,10 @@ class Condition:
 
     @classmethod
     def parse(cls, text: str) -> Condition:
-        """Return what `when` says: "enabled", or as "speed > 100" or "position < -3.5".
+        """Parse `when`: "enabled", or a comparison such as "speed > 100" or "position < -3.5".
 
         Raises:
-            ValueError: If it says neither.
+            ValueError: For any other text.
         """
         if text.strip() in (NO_CONDITION, ENABLED):
             return cls(text.strip())
@@ -70,7 +70,7 @@ def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tu
     """Return delay and length of a fault in communication cycles; `cycles` counts them in a time [s].
 
     Raises:
-        ValueError: For times that are no whole cycles, or a duration of what is a moment.
+        ValueError: For times that are not whole cycles, or a duration of a fault that is a moment.
     """
     if order.duration is not None and row.once:
         raise ValueError(f"fault {row.name} is a moment and has no duration; leave duration out")
@@ -81,10 +81,10 @@ def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tu
 
 
 def parse_order(text: str) -> Order:
-    """Return what one line asks for: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
+    """Parse one line as an order: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
 
     Raises:
-        ValueError: For a line that cannot be understood; the values are checked by whoever takes the order.
+        ValueError: For a line that cannot be understood; the values are checked where the order is taken.
     """
     try:
         words = shlex.split(text)

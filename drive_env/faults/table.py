@@ -1,4 +1,4 @@
-"""The table of faults: what can fail, with which parameters, and what drive and master make of it."""
+"""The table of faults: names, parameters, and the reactions of drive and master."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRIVE = "tmcm1636"  # whose reactions the table has
 
 @dataclass(frozen=True)
 class FaultParameter:
-    """A number of a fault: default, lowest and highest value, unit, and what it means."""
+    """A number of a fault: default, lowest and highest value, unit, and meaning."""
 
     default: float
     low: float
@@ -33,7 +33,7 @@ class FaultParameter:
 
 @dataclass(frozen=True)
 class FaultRow:
-    """A fault; table.toml says what each entry holds. `emergency` is None where nothing in the drive sees it."""
+    """A fault; table.toml explains each field. `emergency` is None where the drive does not detect it."""
 
     name: str
     group: str
@@ -66,7 +66,7 @@ def find_fault(name: str) -> FaultRow:
     """Return the row of a fault.
 
     Raises:
-        ValueError: If there is none of that name, with those that are.
+        ValueError: For an unknown name, with the known ones.
     """
     if name not in FAULTS:
         raise ValueError(f"no fault is named {name!r}; there are {', '.join(FAULTS)}{did_you_mean(name, FAULTS)}")

@@ -44,7 +44,7 @@ UNSTABLE = 100.0  # 1/s: a motion that grows so fast has a clearance of -1
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What loops must keep.
+    """Margins that loops must keep.
 
     Attributes:
         name: "soft", "standard", "stiff", or the numbers.

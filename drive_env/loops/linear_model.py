@@ -1,4 +1,4 @@
-"""The cascade as transfer functions, exact for its sampling: what the drive's firmware does, without its limits.
+"""The cascade as transfer functions, exact for its sampling: the drive's firmware without its limits.
 
 The winding, the rotor and an elastic load are one linear system in continuous time. The current loop samples it every
 tick, computes a duty that acts during the next one, and repeats that as often as ticks make a window; the velocity and
@@ -47,7 +47,7 @@ class KnownValue(Protocol):
 
 
 class KnownAxis(Protocol):
-    """What was identified of an axis, by name."""
+    """Identified values of an axis, by name."""
 
     @property
     def estimates(self) -> Mapping[str, KnownValue]:
@@ -73,7 +73,7 @@ class Plant:
         emf_constant: Voltage per speed [V*s/rad]; nan for that of a PMSM, torque_constant / 1.5.
 
     Raises:
-        ValueError: If a value is none that an axis can have.
+        ValueError: If a value is impossible for an axis.
     """
 
     R: float
@@ -125,7 +125,7 @@ class Plant:
 
     @classmethod
     def from_identification(cls, device: Device, motor: Motor, supply: float, identification: KnownAxis) -> Plant:
-        """Return an axis as identified; what was refused is taken from the data sheet, an elastic pair as rigid.
+        """Return an axis as identified; refused values are the data sheet's, a refused elastic pair makes it rigid.
 
         Raises:
             ValueError: If the inertia was refused, since no loop can be computed without one.
@@ -181,7 +181,7 @@ def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
 
 
 def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
-    """Return what the velocity loop regulates: filtered velocity [rad/s] per demanded current [A].
+    """Return the plant of the velocity loop: filtered velocity [rad/s] per demanded current [A].
 
     Of the gains, those of the current loop matter.
     """
@@ -253,7 +253,7 @@ def controllers(device: Device, gains: RawGains) -> Controllers:
 
 
 def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:
-    """Return the velocity filter, and what the axis delays beyond the loop's own period, at frequencies [Hz]."""
+    """Return the velocity filter, and the axis' delay beyond the loop's own period, at frequencies [Hz]."""
     from drive_env.emulator.parameters import velocity_filter
 
     at = np.asarray(f, float)

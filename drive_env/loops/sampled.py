@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
-RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
+RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is rigid motion
 _TERMS = 14  # of Taylor's series of exp(X), |X| <= 1/2: 2e-17 are left
 
 
@@ -57,7 +57,7 @@ class LinearMachines(NamedTuple):
 
 
 class Windings(NamedTuple):
-    """What moves the rotors of machines, (machines, axes) each: as `LinearMachines` has supply and velocity filter.
+    """The motors of machines, (machines, axes) each: as `LinearMachines` has supply and velocity filter.
 
     R, L: Of a phase, in the torque-making axis [ohm], [H]. emf: Voltage per speed [V*s/rad].
     torque: Per current [N*m/A].
@@ -72,7 +72,7 @@ class Windings(NamedTuple):
 
 
 def linear_machines(windings: Windings, M: Floats, D: Floats, K: Floats, rotors: Floats) -> LinearMachines:
-    """Return machines by what they move: M q'' + D q' + K q = torque.
+    """Return machines from the matrices of their loads: M q'' + D q' + K q = torque.
 
     Args:
         windings: Of their motors.
@@ -123,7 +123,7 @@ class CascadeGains(NamedTuple):
 
 
 class LoopWindow(NamedTuple):
-    """What happens in a window of the velocity loop while the demanded currents i are held: x' = W x + H i.
+    """The system in a window of the velocity loop while the demanded currents i are held: x' = W x + H i.
 
     W: (machines, states, states). H: (machines, states, axes). turn, turn_of_demand: How far the rotors turn [rad] by
     state, (machines, axes, states), and by demanded current, (machines, axes, axes).
@@ -136,7 +136,7 @@ class LoopWindow(NamedTuple):
 
 
 def held(A: Floats, B: Floats, speed: Floats, T: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return Phi, Gamma of systems whose inputs are held for T [s], and what their rotors turn meanwhile, likewise."""
+    """Return Phi, Gamma of systems whose inputs are held for T [s], and the rotors' angle meanwhile, likewise."""
     machines, states, axes = B.shape
     size = states + 2 * axes
     block = np.zeros((machines, size, size))

@@ -1,4 +1,4 @@
-"""What emulated machines truly are, linearised where their loads start: the truth that scores and tests measure by.
+"""Emulated machines, linearised where their loads start: the truth that scores and tests measure by.
 
 Flanks that transmit count as pressed, dry friction and gravity as none.
 """
@@ -56,7 +56,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
 
 
 class LinearLoad(NamedTuple):
-    """M q'' + D q' + K q = torque: (copies, D, D) each, and what each rotor turns by joint, (axes, D)."""
+    """M q'' + D q' + K q = torque: (copies, D, D) each, and the joint coordinates of each rotor's angle, (axes, D)."""
 
     M: Floats
     D: Floats
@@ -106,11 +106,11 @@ def true_machines(drives: Drives) -> LinearMachines:
 
 
 def elastic_lags(drives: Drives) -> Floats:
-    """Return by how much springs hold up each axis of emulated machines [s], (machines, axes); 0 of a rigid one.
+    """Return each axis' delay by the springs of emulated machines [s], (machines, axes); 0 for a rigid axis.
 
-    While a rotor accelerates by a and the others stand, what hangs on its springs is twisted behind it: the square of
-    the lag is the energy of that over that of the motion. On one spring it is the square root of the load's share of
-    the inertia, over the angular frequency of the anti-resonance.
+    While a rotor accelerates by a and the others stand, the parts on its springs are twisted behind it: the square of
+    the delay is the energy of the twist over that of the motion. On one spring it is the square root of the load's
+    share of the inertia, over the angular frequency of the anti-resonance.
     """
     machine = drives.machine
     assert machine is not None, "of emulated machines"

@@ -1,4 +1,4 @@
-"""What no process data carry, asked for by SDO while cycles pass: each row has what was told last.
+"""Objects that no process data carry, read by SDO while cycles pass: each row has the value that was read last.
 
 For states alone, which change seldom: of a position a row would be wrong by what is some milliseconds old.
 """
@@ -44,11 +44,11 @@ class AskedRows:
                 # What comes belongs to the row that is next when it is there.
                 values = [self._read(entry) for entry in self._entries]
                 self._told.append((self._passed(), values))
-        except BaseException as error:  # told by whoever waits for the rows
+        except BaseException as error:  # raised where the rows are waited for
             self._error = error
 
     def rows(self, count: int) -> dict[Key, Integers]:
-        """Return each object of shape (count, num_axes); raises what kept it from being asked."""
+        """Return each object of shape (count, num_axes); raises the error that ended the reads."""
         if self._error is not None:
             raise self._error
         # The first answer stands for the rows before it, too.

@@ -125,7 +125,7 @@ class BusDrives:
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
             SafetyError: If a limit does not; NoAnswerError if a node is silent.
-            ValueError: For a quantity that the object is none of.
+            ValueError: For a quantity of another kind than the object's.
         """
         self._enter()
         entry = self._description.dictionary.find(name)
@@ -212,7 +212,7 @@ class BusDrives:
         return Trace(times, values, self._description.dictionary, lambda: scales_of(self))
 
     def can_record(self, objects: Sequence[ObjectName]) -> bool:
-        """Return whether objects can be recorded together; what would be mapped for it is not."""
+        """Return whether objects can be recorded together; nothing is mapped for it."""
         self._enter()
         return self._cycle_runner.can_record(objects)
 
@@ -255,7 +255,7 @@ class BusDrives:
             self.safety.after_reset(chosen)
 
     def close(self) -> None:
-        """Stop what still runs, put process data and watchdogs back, and close the bus, after which nothing works."""
+        """Stop axes that still run, put process data and watchdogs back, and close the bus, which ends its use."""
         if self._closed:
             return
         if self.safety is not None:
@@ -302,7 +302,7 @@ class BusDrives:
     # --- what the envelope and the tools use ----------------------------------------------------------------------
     @property
     def description(self) -> Description:
-        """What is known of the device."""
+        """The description of the device."""
         return self._description
 
     @property
@@ -320,7 +320,7 @@ class BusDrives:
         return self._link.sdo(node)
 
     def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, past what is lent to it."""
+        """Write an object of one axis, past lent values."""
         node, index, sub, label = self._place_of(entry, axis)
         data = self._description.encode(entry, value)
         self._link.sdo(node).write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
@@ -332,20 +332,20 @@ class BusDrives:
         return self._description.decode(entry, data)
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes, by position, were configured to: they have restarted."""
+        """Forget the configuration of nodes (by position) that have restarted."""
         self._link.process.forget(nodes)
         self._started = False
 
     def must_start(self) -> None:
-        """Take note that a node is not operational any more: the next command starts it."""
+        """Note that a node is not operational any more: the next command starts it."""
         self._started = False
 
     def prepare_watch(self, envelope: Envelope) -> None:
-        """Have mapped what an envelope watches."""
+        """Map the objects that an envelope watches."""
         self._cycle_runner.prepare(envelope)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every SYNC."""
+        """Return the objects that are sampled with every SYNC."""
         return self._cycle_runner.mapped()
 
     def poll(self, envelope: Envelope) -> bool | None:
@@ -354,7 +354,7 @@ class BusDrives:
 
     @property
     def is_dry(self) -> bool:
-        """Whether what would be sent is printed, and nobody is there."""
+        """Whether this is a dry run: frames are printed, and no drive is connected."""
         return self._link.is_dry
 
     def start(self) -> None:
@@ -400,7 +400,7 @@ class BusDrives:
         return node, *self._description.key(entry, part), self._description.label(entry, part)
 
     def _addressed(self, entry: Entry, axis: int, value: int) -> tuple[int, Key, bytes]:
-        """Return the node of an axis by its position, an object there, and what it gets as bytes."""
+        """Return the node of an axis by its position, an object there, and its value as bytes."""
         node, index, sub, _ = self._place_of(entry, axis)
         return node, (index, sub), self._description.encode(entry, value)
 
@@ -424,7 +424,7 @@ class BusDrives:
             self._link.welcome(k)
 
     def _who_it_is(self, kind: int, axis: int) -> str:
-        """Return what to open a node as that is another device."""
+        """Return the advice for a message: as which device, or with which EDS, this node should be opened."""
         vendor, product = (self.read_axis(self._description.dictionary.find(key), axis) for key in list(_IDENTITY)[:2])
         other = device_of(kind, vendor, product)
         if other is None:
@@ -478,15 +478,15 @@ class BusDrives:
 
 
 def checked_limits(safety: Limits | bool) -> Limits | None:
-    """Return the limits that hold, None for none at all; TypeError for what is neither."""
-    if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that nobody watches
+    """Return the limits in force, None for no envelope; TypeError for a value of another type."""
+    if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that there is no envelope
         raise TypeError(f"safety = {safety!r} must be Limits, True for those of the drives, or False for an emulator")
     return (Limits() if safety is True else safety) or None
 
 
 @contextlib.contextmanager
 def _logged(consequence: str) -> Any:
-    """Log a failure to tidy up, and go on: what remains must be tried, too."""
+    """Log a failure to tidy up, and go on: the other steps must be tried, too."""
     try:
         yield
     except (BusError, ObjectAccessError) as error:

@@ -1,4 +1,4 @@
-"""Objects of a node that have another value while this master is there, and get back what they had."""
+"""Objects of a node that have another value while this master is there, and then get their own back."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REMEDY = "to move it without that, open it with Limits(silence=None) and keep th
 
 
 class ChangedObjects:
-    """What a node's watchdog over its master needs changed, and what was there before.
+    """Objects changed for a node's watchdog over its master, with their values of before.
 
     Args:
         node: The node's address, for messages.
@@ -50,7 +50,7 @@ class ChangedObjects:
             key: The object.
             data: What it gets.
             only_from: What it must have now, or else it is left alone.
-            before: What it gets back afterwards, if not what it has now.
+            before: The value that it gets back afterwards, by default its present one.
 
         Raises:
             NoWatchdogError: If the node takes them and has others.
@@ -82,7 +82,7 @@ class ChangedObjects:
             self.change(self._description.key(entry, part), _QUICK_STOP, only_from=_NO_ACTION)
 
     def are_in_force(self) -> bool:
-        """Return whether the node, asked, still has what was set.
+        """Return whether the node, asked, still has the values that were set.
 
         Raises:
             BusError: If it does not answer.
@@ -109,6 +109,6 @@ class ChangedObjects:
             raise BusError(f"node {self._node}: {label} should have {data.hex()} again, and has {now.hex()}")
 
     def forget(self) -> None:
-        """Forget what was: the node was reset."""
+        """Forget the values of before: the node was reset."""
         self._before.clear()
         self._set.clear()

@@ -18,7 +18,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.master.parameters import command, read_parameters
 
 Key = tuple[int, int]
-CAN_KBIT = 1000  # kbit/s, where nobody says another bit rate
+CAN_KBIT = 1000  # kbit/s, unless another bit rate is given
 
 
 def commissioned_values(drives: Drives, node: int = 0, axis: int | None = None) -> dict[Key, int]:

@@ -36,7 +36,7 @@ _NOW = 0
 
 @dataclass(eq=False)
 class RecordCall:
-    """What `record` must know of its objects: found out once, for a policy makes the same call every millisecond.
+    """The entries of a call of `record`, looked up once: a policy makes the same call every millisecond.
 
     sampled: Entries to return.
     played: Entries to write, in the order given.
@@ -55,7 +55,7 @@ class RecordCall:
 
     @property
     def mapped(self) -> tuple[Entry, ...]:
-        """What process data are to carry of `sampled`."""
+        """Those of `sampled` that process data are to carry."""
         return tuple(entry for entry in self.sampled if entry not in self.asked)
 
     def ask_for_states(self) -> bool:
@@ -106,16 +106,16 @@ class CycleRunner:
             self._pace.end(self._link.receive)
 
     def prepare(self, envelope: Envelope) -> None:
-        """Have mapped what the envelope watches, as far as it fits."""
+        """Map the objects that the envelope watches, as far as they fit."""
         with self._running:
             self._map(self._nothing, envelope)
 
     def mapped(self) -> tuple[Entry, ...]:
-        """Return what comes with every SYNC."""
+        """Return the objects that are sampled with every SYNC."""
         return self._process.sampled_entries()
 
     def poll(self, envelope: Envelope) -> bool | None:
-        """Send a SYNC of the supervisor's own and look at what comes back.
+        """Send a SYNC of the supervisor's own and process its samples.
 
         Returns whether all of it came; None where the program's own cycles are under way, or nothing is mapped.
         """
@@ -138,7 +138,7 @@ class CycleRunner:
         return True
 
     def call(self, objects: Sequence[ObjectName], play: Sequence[ObjectName]) -> RecordCall:
-        """Return what is known of a call.
+        """Return the entries of a call, looked up once for equal names.
 
         Raises:
             ObjectAccessError: For an object that cannot be recorded or played.
@@ -147,7 +147,7 @@ class CycleRunner:
         try:
             if (known := self._calls.get(names)) is not None:
                 return known
-        except TypeError:  # a name that is none, as `find` says
+        except TypeError:  # a name of a wrong type, about which `find` has its message
             pass
         entries = self._description.dictionary
         sampled = tuple(dict.fromkeys(entries.find(name) for name in objects))
@@ -172,7 +172,7 @@ class CycleRunner:
         return True
 
     def rows(self, call: RecordCall, given: Sequence[ArrayLike], cycles: int) -> dict[Entry, Integers]:
-        """Return what is played, each of shape (cycles, num_axes).
+        """Return the integers to play by entry, each of shape (cycles, num_axes).
 
         Raises:
             ValueError: For another shape; ObjectAccessError for a value out of range.
@@ -193,7 +193,7 @@ class CycleRunner:
     def record(
         self, call: RecordCall, played: Mapping[Entry, Integers], cycles: int, envelope: Envelope | None
     ) -> dict[Key, Integers]:
-        """Let cycles pass and return what was sampled, each object of shape (cycles, num_axes)."""
+        """Let cycles pass and return the samples of each object, shape (cycles, num_axes)."""
         if envelope is not None:
             envelope.before_play(played)
         with self._running:
@@ -218,7 +218,7 @@ class CycleRunner:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _map(self, call: RecordCall, envelope: Envelope | None) -> None:
-        """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
+        """Map a call's objects, and those that the envelope watches if they fit besides, from now on."""
         watched = NOTHING if envelope is None else envelope.watched()
         played = tuple(dict.fromkeys(call.played))
         if call.watched is not watched:
@@ -246,7 +246,7 @@ class CycleRunner:
         return not self._pace.time_waits and call.ask_for_states()
 
     def _choose(self, call: RecordCall, watched: Sequence[Entry], played: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """Return what is sampled; states are asked for where not all that a call wants fits."""
+        """Return the entries to sample; states are read by SDO where not all that a call wants fits."""
         try:
             return self._process.choose(call.mapped, watched, played)
         except ObjectAccessError:

@@ -1,4 +1,4 @@
-"""What the master knows of a device: its dictionary, data types, axes, time-outs and emergencies.
+"""Description of a device for the master: its dictionary, data types, axes, time-outs and emergencies.
 
 A known device brings its own; any other CiA 402 drive is described by its EDS and CiA's defaults.
 """
@@ -46,7 +46,7 @@ EMERGENCY_NAMES = {
 # synchronous RPDOs takes. CiA 402: maximum current 6073h, in the thousandths of 6077h. Stores and restores erase flash,
 # for which users of python-canopen report up to seconds.
 MODE, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
-LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and a wait of 1e300 s is none that an operating system knows
+LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and an operating system refuses a wait of 1e300 s
 CIA_402 = MasterHints(rpdo_type=1, timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
 CIA_402_ROLES = {Role.CURRENT_LIMIT: (cia402.MAX_CURRENT, 0)}
 
@@ -108,7 +108,7 @@ class Description:
         return entry
 
     def label(self, entry: Entry, axis: int) -> str:
-        """Return what a message calls the object of an axis."""
+        """Return the name of an axis' object in messages."""
         index, sub = self.key(entry, axis)
         return f"{index:04X}h:{sub:02X} {entry.name}"
 

@@ -1,4 +1,4 @@
-"""What can go wrong on a bus."""
+"""Errors of a bus."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ABORTS = {
 
 
 class BusError(Exception):
-    """The bus, or what came over it, is not as it must be; the message says what to try."""
+    """The bus, or an answer over it, is not as it must be; the message says what to try."""
 
 
 class OpenError(BusError):

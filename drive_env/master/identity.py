@@ -1,4 +1,4 @@
-"""Which drive it is: what a node says of itself in 1008h to 100Ah and 1018h, so that a file is not written to another.
+"""Which drive it is: a node's identity in 1008h to 100Ah and 1018h, so that a file is not written to another drive.
 
 A serial number is asked for also where the EDS lists none: later firmware of the same device has it.
 """
@@ -23,7 +23,7 @@ class OtherDriveError(ValueError):
 
 
 class Identity(NamedTuple):
-    """What a node says of itself; None, or "", where it says nothing.
+    """A node's identity; None, or "", for an entry that it lacks.
 
     Attributes:
         device: Name of the device, or of the EDS.
@@ -43,13 +43,13 @@ class Identity(NamedTuple):
     serial: int | None = None
 
     def to_toml(self) -> list[str]:
-        """Return the lines of a TOML table; what the node does not say is left out."""
+        """Return the lines of a TOML table; entries that the node lacks are left out."""
         rows = {name: value for name, value in self._asdict().items() if value not in (None, "")}
         return [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in rows.items()]
 
 
 def read_identity(drives: BusDrives, node: int = 0) -> Identity:
-    """Return what a node says of itself.
+    """Read a node's identity.
 
     Args:
         drives: Drives on a bus.
@@ -111,7 +111,7 @@ def check_same_drive(file: object, written: Identity | None, found: Identity, *,
     """
     if other_drive or written is None:
         return
-    by_node = written.serial is None and found.serial is None  # its node-ID is all that tells it from its neighbours
+    by_node = written.serial is None and found.serial is None  # only the node-ID distinguishes it from its neighbours
     pairs = [
         ("device", written.device, found.device),
         ("vendor", _hex(written.vendor), _hex(found.vendor)),

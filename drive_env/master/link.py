@@ -1,4 +1,4 @@
-"""What drives need of a fieldbus: objects of its nodes, process data, cycles, states, and a watch over the master.
+"""A fieldbus as drives need it: objects of its nodes, process data, cycles, states, and a watch over the master.
 
 `BusDrives`, the safety envelope and the tools ask a link for these and know no fieldbus. CAN is one
 (`can/can_link.py`); another one is a class with these methods and a constructor like `CanDrives`.
@@ -22,7 +22,7 @@ Integers = NDArray[np.int64]
 
 
 class NoWatchdogError(BusError):
-    """A drive cannot watch over its master; the message says why and what to do."""
+    """A drive cannot watch over its master; the message gives the reason and the remedy."""
 
 
 class ReceivedEmergency(NamedTuple):
@@ -35,7 +35,7 @@ class ReceivedEmergency(NamedTuple):
 
 
 class Wording(NamedTuple):
-    """What messages call things on a link.
+    """Names of things on a link, for messages.
 
     Attributes:
         operational: The state in which nodes exchange process data.
@@ -49,7 +49,7 @@ class Wording(NamedTuple):
 
 
 class ObjectClient(Protocol):
-    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
+    """Reads and writes objects of a node, as bytes, for any thread; one transfer at a time."""
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
         """Return the bytes of an object.
@@ -68,7 +68,7 @@ class ObjectClient(Protocol):
         """
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write what an object had before; a node that is silent is woken and waited for longer.
+        """Write an object's value of before; a silent node is woken and gets more time to answer.
 
         Raises:
             ObjectAccessError, NoAnswerError: As `write` does.
@@ -133,7 +133,7 @@ class ProcessData(Protocol):
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
     ) -> tuple[Entry, ...]:
-        """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+        """Return the objects to sample: the wanted ones, then as many of the welcome ones, in their order, as fit.
 
         Args:
             wanted: To be sampled.
@@ -145,26 +145,26 @@ class ProcessData(Protocol):
         """
 
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
-        """Return whether cycles carry these already: just what is played, if anything is, and at least the samples."""
+        """Return whether cycles carry these already: exactly the played ones, if any are, and at least the samples."""
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
-        """Have cycles carry entries of every axis; what is mapped into the drives stays where nothing is played.
+        """Have cycles carry entries of every axis; the mapping into the drives stays if nothing is played.
 
         Raises:
             ObjectAccessError: If they do not fit or a drive refuses them.
         """
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every cycle."""
+        """Return the objects that come with every cycle."""
 
     def outputs(self, played: Mapping[Entry, Integers]) -> Outputs | None:
-        """Return rows to send, of integers of shape (cycles, num_axes) for all that is mapped; None of nothing."""
+        """Return rows to send, of integers of shape (cycles, num_axes) for all mapped objects; None without any."""
 
     def samples(self) -> Samples | None:
-        """Begin to collect what is mapped out of the drives; None where nothing is, or nobody is there."""
+        """Begin to collect what is mapped out of the drives. None if nothing is mapped, or in a dry run."""
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes were configured to: they have restarted, and nothing counts as mapped."""
+        """Forget the configuration of nodes that have restarted: nothing counts as mapped."""
 
     def restore(self, node: int) -> None:
         """Put a node's configuration back as it was found.
@@ -190,19 +190,19 @@ class MasterWatch(Protocol):
         """
 
     def keep(self) -> None:
-        """Be heard, if it is due; called every few milliseconds whatever the program does, by the supervisor's thread.
+        """Send a sign of life if it is due. The supervisor's thread calls this every few milliseconds.
 
-        What comes back is no sample of a run that is under way.
+        Images that come back here are not samples of a run.
         """
 
     def cease(self) -> None:
-        """Be heard a last time, from which every node watches, and never again, so that the drives stop by themselves.
+        """Send a last heartbeat and stop, so that each node's watchdog expires and the drives stop by themselves.
 
         Called again after nodes were started that had missed this process.
         """
 
     def end(self) -> None:
-        """Be heard no more, since the watchdogs are given up or were not wanted."""
+        """Stop the signs of life, since the watchdogs are given up or were not wanted."""
 
     def is_set(self, node: int) -> bool:
         """Return whether a node's watchdog was set and not put back."""
@@ -215,17 +215,17 @@ class MasterWatch(Protocol):
         """
 
     def holds(self, key: Key) -> bool:
-        """Return whether the watchdogs that are set depend on an object, which nobody else may change meanwhile."""
+        """Return whether the watchdogs in force depend on an object, so that the program must not change it."""
 
     def restore(self, node: int) -> None:
-        """Put a node's watchdog back as it was found. Whoever calls has proved that its axes are off.
+        """Put a node's watchdog back as it was found. The caller has proved that its axes are off.
 
         Raises:
             BusError: If the node did not take all of it.
         """
 
     def forget(self, node: int) -> None:
-        """Forget what was found: the node was reset."""
+        """Forget the watchdog found: the node was reset."""
 
     def take_rival(self) -> str:
         """Return, once, which other program keeps the nodes from noticing this one's death; "" if none does."""
@@ -235,7 +235,7 @@ class OtherMastersHeard(Protocol):
     """Tells whether another master commands the nodes."""
 
     def check(self) -> None:
-        """Raise BusError, with what was heard, if one does."""
+        """Raise BusError, with the frame that was heard, if one does."""
 
 
 class Link(Protocol):
@@ -251,11 +251,11 @@ class Link(Protocol):
 
     @property
     def is_dry(self) -> bool:
-        """Whether what would be sent is printed, and nobody is there."""
+        """Whether this is a dry run: frames are printed, and no drive is connected."""
 
     @property
     def wording(self) -> Wording:
-        """What messages call things here."""
+        """Names of things here, for messages."""
 
     @property
     def process(self) -> ProcessData:
@@ -266,11 +266,11 @@ class Link(Protocol):
         """The nodes' watch over this master."""
 
     def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
-        """Take whom to tell.
+        """Set the callbacks.
 
         Args:
             alive: Called again and again while an answer is waited for.
-            restarted: Called with a node that has booted though nobody here has reset it.
+            restarted: Called with a node that booted unasked.
         """
 
     # --- objects and states -----------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ class Link(Protocol):
         """Have a node answer about its objects that may be stopped, as it is after a master died."""
 
     def welcome(self, node: int) -> None:
-        """Take note that a node is there and is what it was taken for; read what the link must know of it."""
+        """Note that a node is there and is of the expected kind; read what the link must know of it."""
 
     def start(self) -> None:
         """Take the nodes to where they exchange process data."""
@@ -320,7 +320,7 @@ class Link(Protocol):
         """
 
     def sync(self) -> None:
-        """Begin a cycle: the drives take what was handed out since the one before, and sample.
+        """Begin a cycle: the drives take the values handed out since the one before, and sample.
 
         Raises:
             BusError: If the bus does not take it.
@@ -337,7 +337,7 @@ class Link(Protocol):
         """Receive until `done()` or until `timeout` [s] has passed; return done()."""
 
     def drain(self) -> None:
-        """Take what has arrived, without waiting."""
+        """Process the received frames, without waiting."""
 
     def close(self) -> None:
         """Let go of the bus."""

@@ -17,7 +17,7 @@ def is_ethercat(interface: str | None) -> bool:
 
 
 def default_nodes(interface: str | None) -> tuple[int, ...]:
-    """Return the nodes where nobody names one: node-ID 1 on CAN, the first position on EtherCAT."""
+    """Return the nodes by default: node-ID 1 on CAN, the first position on EtherCAT."""
     return (0,) if is_ethercat(interface) else (1,)
 
 

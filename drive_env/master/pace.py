@@ -10,7 +10,7 @@ from drive_env.drives.arguments import whole_cycles
 
 MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
 CATCH_UP = 0.02  # of a cycle, by which a SYNC is moved to suit the drives' clocks
-LONGEST_CYCLE = 0.1  # s: slower, nobody watches
+LONGEST_CYCLE = 0.1  # s: a slower cycle would leave the drives without monitoring
 Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
 
 
@@ -23,14 +23,14 @@ class Timing(NamedTuple):
 
 
 def _take_in(receive: Receive) -> None:
-    """Receive what has come, but not for ever where more comes than can be received."""
+    """Receive waiting frames, but not for ever where more come than can be received."""
     for _ in range(MOST_FRAMES):
         if not receive(0.0):
             return
 
 
 class Pace(Protocol):
-    """What a run of cycles asks of a pace."""
+    """The calls of a run of cycles to its pace."""
 
     window: int  # SYNCs that may be out before their samples are in
     time_waits: bool  # whether no time passes while no SYNC is sent
@@ -116,7 +116,7 @@ class LockstepPace:
         self.timing = Timing(0, 0, 0.0)
 
     def wait(self, receive: Receive) -> int:
-        """Take in what has come; there is nothing to wait for, and nothing to miss."""
+        """Receive waiting frames; in lockstep there is no time to wait for, and none to miss."""
         _take_in(receive)
         self.timing, self.total = (Timing(one.cycles + 1, 0, 0.0) for one in (self.timing, self.total))
         return 0
@@ -126,7 +126,7 @@ class LockstepPace:
 
 
 def cycles_per_sync(cycle: float, least: float, pace: str) -> int:
-    """Return how many communication cycles [s] pass from SYNC to SYNC [s]; ValueError for what cannot be."""
+    """Return how many communication cycles [s] pass from SYNC to SYNC [s]; ValueError for an impossible ratio."""
     if pace == "lockstep":
         raise ValueError(f"cycle={cycle:g} s is for real time: in lockstep each SYNC is a cycle of {least:g} s")
     if not least <= cycle <= LONGEST_CYCLE:

@@ -51,7 +51,7 @@ _ASSIGNMENTS = {0x1C12: range(0x1600, 0x1800), 0x1C13: range(0x1A00, 0x1C00)}
 
 
 class Difference(NamedTuple):
-    """A parameter that is not as it should be; `found` is None where the drive does not have it."""
+    """A parameter with another value than it should have; `found` is None where the drive lacks it."""
 
     entry: Entry
     wanted: int
@@ -63,15 +63,15 @@ class CommandObjectError(ValueError):
 
 
 class RollbackError(BusError):
-    """A write failed and what was written before could not be taken back: the drive holds a mixture."""
+    """A write failed and earlier writes could not be taken back: the drive holds a mixture."""
 
 
 class NotRestoredError(BusError):
-    """A write failed; what was written before was taken back."""
+    """A write failed; earlier writes were taken back."""
 
 
 def command(index: int, hints: MasterHints) -> str:
-    """Return what command or service an object of a device is, "" for none; those of further axes are the same."""
+    """Return the name of the command or service that an object is, "" for parameters; also for further axes."""
     return COMMANDS.get(cia402.of_first_axis(index)) or hints.commands.get(index, "")
 
 
@@ -85,7 +85,7 @@ def check_no_commands(keys: Iterable[Key], where: object, hints: MasterHints) ->
 
 
 def restorable(values: Mapping[Key, int], hints: MasterHints) -> dict[Key, int]:
-    """Return the values that are ever written back to a device: not what makes a node somebody else, or mute."""
+    """Return the values that may be written back to a device: without node-ID, bit rate and the like."""
     return {key: value for key, value in values.items() if key[0] not in hints.addresses}
 
 
@@ -106,7 +106,7 @@ def parameters(drives: BusDrives) -> list[Entry]:
 
 
 def read_parameters(drives: BusDrives, axis: int = 0) -> dict[Key, int]:
-    """Return all parameters of an axis that the drive has; what it refuses to show is left out."""
+    """Return all parameters of an axis that the drive has; those that it refuses to show are left out."""
     found = {}
     for entry in parameters(drives):
         with contextlib.suppress(ObjectAccessError):
@@ -129,12 +129,12 @@ def compare(drives: BusDrives, wanted: Mapping[Key, int], axis: int = 0) -> list
 
 
 def write_all_or_none(drives: BusDrives, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
-    """Write what differs, read everything back, and take it all back if anything fails; return what was changed.
+    """Write what differs, read all back, and undo all of it if anything fails; return the changes.
 
     Raises:
         CommandObjectError: If there is a command or a service among them; nothing was written.
         NotRestoredError: If the drive refused or holds something else than was written; it is as it was before.
-        RollbackError: If it could not be brought back; the message says what is left.
+        RollbackError: If the values before could not be written back; the message lists them.
     """
     hints = drives.description.hints
     check_no_commands(wanted, "what is to be written", hints)

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 
 class EnteredUnit(NamedTuple):
-    """A unit: what it measures, and how many of the dimension's own unit it is (rev, rev/s, rev/s^2, A, V, s)."""
+    """A unit: its dimension, and its size in the dimension's own unit (rev, rev/s, rev/s^2, A, V, s)."""
 
     dimension: str
     factor: float
 
 
 class AxisScale(NamedTuple):
-    """What units of an axis follow, each None where it is not known.
+    """The scales of an axis' units, each None if it is not known.
 
     These are position increments of a revolution, rpm of a velocity unit, and the motor's peak current [A].
     """
@@ -79,7 +79,7 @@ _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*
 
 
 def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
-    """Return a unit by name, None of one that there is not, or whose scale is not known."""
+    """Return a unit by name, None for an unknown unit, or one whose scale is not known."""
     known = scale if isinstance(scale, AxisScale) else AxisScale(scale)
     if name in _INCREMENTAL:
         return EnteredUnit(_INCREMENTAL[name], 1.0 / known.increments) if known.increments else None
@@ -101,7 +101,7 @@ def follows_scale(name: str) -> bool:
 
 
 def scales_of(drives: BusDrives) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it.
+    """Return the scales of every axis, as far as the drive has them.
 
     Args:
         drives: On a bus.

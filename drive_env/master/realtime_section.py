@@ -1,4 +1,4 @@
-"""What a program does that has to be punctual to a millisecond: keep the interpreter from taking turns of its own."""
+"""A section of a program that is punctual to a millisecond: the interpreter takes no turns of its own in it."""
 
 from __future__ import annotations
 

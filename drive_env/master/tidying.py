@@ -1,4 +1,4 @@
-"""Putting a drive back as it was: every step is tried, whatever became of the others, and what failed is told."""
+"""Putting a drive back as it was: every step is tried, also after a failure of others, and failures are reported."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Tidying:
         self._silent = 0
 
     def step(self, act: Callable[[], None]) -> None:
-        """Do a step; what fails is remembered."""
+        """Take a step; a failure is remembered."""
         if self._silent >= SILENT:
             return
         try:
@@ -29,7 +29,7 @@ class Tidying:
             self._silent = self._silent + 1 if isinstance(error, NoAnswerError) else 0
 
     def end(self) -> None:
-        """Raise BusError with what failed, in one line, if anything did."""
+        """Raise BusError with all failures in one line, if there were any."""
         if self._failures:
             more = f" (and {len(self._failures) - 1} more)" if len(self._failures) > 1 else ""
             raise BusError(f"{self._failures[0]}{more}")

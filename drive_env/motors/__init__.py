@@ -95,7 +95,7 @@ class Motor(NamedTuple):
 
     @property
     def copper_resistance(self) -> float:
-        """What the winding loses at 25 degC over the square of its peak current [ohm]."""
+        """The winding's losses at 25 degC over the square of its peak current [ohm]."""
         return self._phase_factor * self.R_s
 
     @property
@@ -129,7 +129,7 @@ RANGES = {
 
 
 class Number(NamedTuple):
-    """A number that a file may hold: unit, what it is, least and greatest, and whether that end is a value itself."""
+    """A number in a file: unit, meaning, least and greatest, and whether that end is a value itself."""
 
     unit: str
     meaning: str

@@ -1,1 +1,1 @@
-"""What the node of every fieldbus has."""
+"""The parts of a node of any fieldbus."""

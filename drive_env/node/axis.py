@@ -32,11 +32,11 @@ from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
 
 class ObjectPort(NamedTuple):
-    """The way to one object: what it is, its value, the check of a new value, the write of a checked one.
+    """Access to one object: its entry, its value, the check of a new value, the write of a checked one.
 
-    `event` names what a write sets off, as in a binding. `write_text` takes a text or a domain, each byte of which is a
-    character; None where it cannot be written. `fit` returns what a value of process data is taken as, where the device
-    takes more of them than the object's range; None of others.
+    `event` names the event of a write, as in a binding. `write_text` takes a text or a domain, each byte of which is a
+    character; None where it cannot be written. `fit` returns the value that data beyond the object's range become, if
+    the device takes such; None for other objects.
     """
 
     entry: Entry
@@ -114,7 +114,7 @@ class Axis:
         return [QueuedEmergency((word & 0xFF) - 1, word >> 8) for word in words]
 
     def store(self, values: Mapping[tuple[int, int], int]) -> None:
-        """Set what a restart restores; the values are those of objects that exist, within their range."""
+        """Set the values that a restart restores; those of existing objects, within their range."""
         self._objects.store(self.number, values)
 
     def forget_texts(self) -> None:
@@ -152,7 +152,7 @@ class Axis:
         return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event, fit=fit)
 
     def _fit(self, entry: Entry) -> Callable[[int], int] | None:
-        """Return what makes a value of process data one of the object's range, None where the device has no rule."""
+        """Return the function that fits process data into the object's range, None without a rule of the device."""
         rule, highest = self._device.beyond_range.get((entry.index, entry.sub)), entry.high
         if rule is None or highest is None:
             return None
@@ -234,7 +234,7 @@ class Axis:
         return float(code.factor(context))
 
     def _factor_now(self, code: Code) -> Callable[[], float]:
-        """Return what gives a code's factor as the scales are now, which seldom change."""
+        """Return a function of a code's present factor, which depends on scales that seldom change."""
         if not code.follows_scale:
             fixed = self._factor(code)
             return lambda: fixed
@@ -280,7 +280,7 @@ class Axis:
         return write
 
     def _scale_writer(self, entry: Entry) -> Callable[[int], None] | None:
-        """Return how an object of the scale of positions is written, since much follows it; None of another one."""
+        """Return the writer of an object of the scale of positions, on which much depends; None for other objects."""
         if (entry.index, entry.sub) not in self._objects.scale_keys:
             return None
         return lambda raw: self._objects.write_checked(entry, raw, self.number)

@@ -1,6 +1,6 @@
 """Block transfers of the SDO server: a sub-block of up to 127 segments goes before the other side answers (CiA 301).
 
-A lost segment costs its sub-block's rest: whoever receives says the last segment that came in order, and the next
+A lost segment costs its sub-block's rest: the receiver says the last segment that came in order, and the next
 sub-block begins after it. A CRC over all data closes the transfer, where both sides have one.
 """
 
@@ -35,7 +35,7 @@ def crc(data: bytes) -> int:
 
 
 class Received(NamedTuple):
-    """What a download's end brings: the data, once they are whole."""
+    """The result of a download: the data, once they are whole."""
 
     data: bytes
 
@@ -177,7 +177,7 @@ class BlockUpload:
             self._block_size = _checked_size(data[2])
             self._sent, self.is_sending = 0, True
             return None
-        checksum = crc(self._content)  # also for who has none: python-canopen looks at it all the same
+        checksum = crc(self._content)  # also for clients without one: python-canopen looks at it all the same
         unused = self._done - len(self._content)
         return bytes((UPLOAD_RESPONSE | unused << 2 | END,)) + checksum.to_bytes(2, "little") + bytes(5)
 

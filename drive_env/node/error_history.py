@@ -1,4 +1,4 @@
-"""What a node remembers of errors: the error history (1003h), and the conditions of its communication."""
+"""A node's memory of errors: the error history (1003h), and the conditions of its communication."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ class ErrorHistory:
         self._errors: deque[int] = deque(maxlen=depth)
 
     def add(self, code: int, axis: int = 0, number: int = 0) -> None:
-        """Note an error; code 0000h is none. `number` is the device's own of the error."""
+        """Note an error; code 0000h is ignored. `number` is the device's own of the error."""
         if code:
             self._errors.appendleft(code | axis << 16 | (number & 0x3F) << 24)
 
     def read(self, sub: int) -> int:
-        """Return a sub-index; 08000024h of one that holds no error yet."""
+        """Return a sub-index; 08000024h for one that holds no error yet."""
         if sub == 0:
             return len(self._errors)
         if sub > len(self._errors):

@@ -34,7 +34,7 @@ class PackedFields:
         self._fields = ReceivedFields([one for one in self._ports if one is not None])
 
     def pack(self) -> bytes:
-        """Return their values as they are now; 0 of what is reserved."""
+        """Return their present values; 0 for reserved fields."""
         return self._layout.pack(
             *(self._read(k) % (1 << bits) for k, bits in enumerate(self._bits))  # negative ones as their bits
         )
@@ -52,7 +52,7 @@ class PackedFields:
         return self._named(value) if self._is_name[k] else value
 
     def _named(self, entry: int) -> int:
-        """Return the object that a mapping entry names; 0 of none, and of one that is not there."""
+        """Return the object that a mapping entry names; 0 for an entry without one, and for a missing object."""
         index, sub, _ = mapping.parse(entry)
         try:
             value = self._find(index, sub).read()

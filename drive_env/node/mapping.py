@@ -1,4 +1,4 @@
-"""PDO mapping: what an entry of 1600h...17FFh and 1A00h...1BFFh means, and the rule by which it is changed.
+"""PDO mapping: the meaning of an entry of 1600h...17FFh and 1A00h...1BFFh, and the rule by which it is changed.
 
 The rule is the manual's (sections 3.1.18 and 3.1.20): switch the PDO off (bit 31 of its COB-ID), set the number of
 entries to 0, write entries, set their number, switch the PDO on. What breaks it is refused with the codes that CiA 301

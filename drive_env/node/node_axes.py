@@ -1,4 +1,4 @@
-"""The axes of one node: which of the emulated drives' they are, and what is done to all of them together."""
+"""The axes of one node: which of the emulated drives' they are, and actions on all of them together."""
 
 from __future__ import annotations
 
@@ -71,11 +71,11 @@ class NodeAxes(Sequence[Axis]):
         return any(tripped)
 
     def engrave(self, key: tuple[int, int], raw: int) -> None:
-        """Set what the factory wrote into an object of all axes: a serial number."""
+        """Set a factory value of an object of all axes: a serial number."""
         for objects, mask in self._sets:
             objects.engrave(key, raw, mask)
 
     def store(self, values: Sequence[Mapping[tuple[int, int], int]]) -> None:
-        """Set what a restart restores, axis by axis; the values are those of objects that exist, within their range."""
+        """Set the values that a restart restores, axis by axis; those of existing objects, within their range."""
         for axis, stored in zip(self._axes, values, strict=True):
             axis.store(stored)

@@ -60,7 +60,7 @@ class NodeDictionary:
         return port
 
     def section(self, entry: Entry) -> str | None:
-        """Return the section of the store that a parameter belongs to; None of what is no parameter.
+        """Return the section of the store that a parameter belongs to; None for an object that is not a parameter.
 
         What a receive PDO can carry is a command or a set-point: a drive that found an old one after power-on would
         act on it. Nor is it one what the firmware itself sets: a counter, or a latch that is armed.

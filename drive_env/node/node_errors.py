@@ -1,7 +1,7 @@
-"""What a node does of errors, whatever its fieldbus: error register (1001h), history (1003h), emergencies, reactions.
+"""A node's errors on any fieldbus: error register (1001h), history (1003h), emergencies, reactions.
 
 An emergency is an event here: code, error register and additional bytes. How it travels, and when it may, is the
-fieldbus' own, and so is what becomes of the node's state.
+fieldbus' own, and so is the change of the node's state.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NETWORK_LOST = ("communication_error", "heartbeat_lost")  # conditions that may 
 
 
 class EmergencySink(Protocol):
-    """What takes a node's emergencies.
+    """Takes a node's emergencies.
 
     Attributes:
         told: Error register of the last message that was queued; 0 before the first.
@@ -34,7 +34,7 @@ class EmergencySink(Protocol):
         """Queue a message."""
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Drop waiting emergencies."""
 
 
 class NodeErrors:
@@ -84,12 +84,12 @@ class NodeErrors:
             objects.commands[ERROR_HISTORY, 0] = self.history.write
 
     def restart(self) -> None:
-        """Forget what was to be told, and all conditions; the history stays."""
+        """Forget waiting emergencies, and all conditions; the history stays."""
         self._sink.clear()
         self.conditions.clear()
 
     def register(self, without: Axis | None = None) -> int:
-        """Return 1001h: what the axes and the node's communication have."""
+        """Return 1001h: the errors of the axes and of the node's communication."""
         register = 0
         for number, axis in enumerate(self._axes):
             if axis is not without:
@@ -104,9 +104,9 @@ class NodeErrors:
         return register | bit if number and register else register
 
     def condition(self, name: str, now: float, key: Hashable = None) -> None:
-        """Tell of a condition of the bus at `now` [s], unless it is known already; `key` says whose it is.
+        """Report a condition of the bus at `now` [s], unless it is known already; `key` says whose it is.
 
-        CiA 301: 1003h notes what the emergencies tell.
+        CiA 301: 1003h has the errors of the emergencies.
         """
         condition = CONDITIONS.get(name) or OPTIONAL_CONDITIONS[name]
         key = name if key is None else key
@@ -127,17 +127,17 @@ class NodeErrors:
         self._flush(now)
 
     def condition_if_known(self, name: str, now: float) -> None:
-        """Tell of a condition that a device's table of emergencies may lack, since the standard leaves it open."""
+        """Report a condition that a device's table of emergencies may lack, since the standard leaves it open."""
         if name in self._device.emergencies:
             self.condition(name, now)
 
     def collect(self, now: float) -> None:
-        """Tell of what the axes had since the last call; call it after each cycle of the drives."""
+        """Queue the axes' emergencies since the last call; call it after each cycle of the drives."""
         for axis, take in self._queues:
             for emergency in take():
                 self._tell_of(axis, emergency, now)
         if self._sink.told and not self.register():
-            # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
+            # CiA 301: masters that were sent an error are sent 0000h when no error is left, however it ended.
             reset = self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name]
             self._sink.push(reset.of_axis(self._told_last), 0)
 

@@ -1,6 +1,6 @@
-"""The objects that a node has once, whatever its axes: 1000h to 1FFFh, and what else its device's data name.
+"""The objects that a node has once for all axes: 1000h to 1FFFh, and others that its device's data name.
 
-Each write is checked by the rule of its object before it changes anything; whoever owns the service behind an object is
+Each write is checked by the rule of its object before it changes anything; the owner of the service behind an object is
 notified of the change. Which rules there are is the fieldbus' own.
 """
 
@@ -77,7 +77,7 @@ class NodeObjects:
         self._values[self._device.canopen.objects[role]] = raw
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Return a number; 0 of an object that this device does not have."""
+        """Return a number; 0 for an object that this device does not have."""
         raw: int | str = self._values.get((index, sub), 0)
         assert isinstance(raw, int), "a text is not a number"
         return raw
@@ -117,7 +117,7 @@ class NodeObjects:
         return raw
 
     def find(self, index: int, sub: int) -> Entry:
-        """Return an entry of the device's dictionary; 06020000h or 06090011h if there is none."""
+        """Return an entry of the device's dictionary; 06020000h or 06090011h without such an entry."""
         return self._entries.find((index, sub))
 
     def has(self, index: int) -> bool:
@@ -129,7 +129,7 @@ class NodeObjects:
         return [entry.sub for entry in self._entries if entry.index == index and entry.sub > 0]
 
     def _rule(self, entry: Entry) -> Callable[[int], None] | None:
-        """Return what the fieldbus checks beyond the object's limits before a write, None: nothing."""
+        """Return the fieldbus' check of a value before a write, beyond the object's limits; None for no check."""
         return None
 
     def _fixed(self, entry: Entry) -> int:

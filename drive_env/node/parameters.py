@@ -1,4 +1,4 @@
-"""What a node keeps without power (1010h, 1011h): sections of its dictionary, saved or back to the factory's values."""
+"""Parameters that a node keeps without power (1010h, 1011h): sections of its dictionary, saved or at factory values."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Parameters:
             commands[RESTORE, sub] = signed_command(canopen.load_signature, CANNOT_BE_STORED, load)
 
     def save(self, names: tuple[str, ...]) -> None:
-        """Save sections as they are now; what has its factory value follows the factory, so COB-IDs the node ID."""
+        """Save sections as they are now; values equal to the factory's follow the factory, so COB-IDs the node ID."""
         factory = self._objects.factory(self._node_id())
         changed: dict[str, Section] = {name: {} for name in names}
         for entry in self._dictionary.entries:
@@ -78,7 +78,7 @@ class Parameters:
         self._commit({name: {} for name in names})
 
     def prepare_restart(self) -> None:
-        """Tell the axes what a restart restores."""
+        """Give the axes the values that a restart restores."""
         values: list[dict[tuple[int, int], int]] = [{} for _ in self._axes]
         for entry in self._dictionary.entries:
             section = self._store.sections.get(self._dictionary.section(entry) or "")

@@ -19,7 +19,7 @@ _RANK = {"mode": 1, "controlword": 2}  # all else is 0
 
 
 class ReceivedFields:
-    """Fields of what a node receives, and the objects behind them.
+    """Fields of the data that a node receives, and the objects behind them.
 
     Args:
         ports: The way to the object of each field.
@@ -27,7 +27,7 @@ class ReceivedFields:
 
     def __init__(self, ports: Sequence[ObjectPort]) -> None:
         order = sorted(range(len(ports)), key=lambda k: _RANK.get(ports[k].event, 0))
-        # Masters repeat the mode in every frame: what it is already is no write, which some drives would refuse.
+        # Masters repeat the mode in every frame: the present mode again is no write, which some drives would refuse.
         rows = [(k, ports[k], ports[k].read if ports[k].event == "mode" else None) for k in order]
         self._plan = [(k, port.fit, repeats, port.check, port.write) for k, port, repeats in rows]
         self._controlwords = [k for k in order if ports[k].event == "controlword"]

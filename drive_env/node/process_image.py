@@ -1,4 +1,4 @@
-"""Process data as one packed image in each direction, and the objects that say what is in it (ETG.1000.6, 5.6.7.4).
+"""Process data as one packed image in each direction, and the objects of its mapping (ETG.1000.6, 5.6.7.4).
 
 Sync manager 2 carries what the master sends (outputs), sync manager 3 what the drive answers (inputs). 1C12h and 1C13h
 name the mapping objects that each carries, and those the objects, one behind the other without gaps. An image is not
@@ -82,16 +82,16 @@ class ImageObjects:
     # --- the image --------------------------------------------------------------------------------------------------
     @property
     def output_size(self) -> int:
-        """Length of what the master sends [bytes]."""
+        """Length of the output image, from the master [bytes]."""
         return self._images[OUTPUTS].size
 
     @property
     def input_size(self) -> int:
-        """Length of what the drive answers [bytes]."""
+        """Length of the input image, from the drive [bytes]."""
         return self._images[INPUTS].size
 
     def write_outputs(self, data: bytes) -> bool:
-        """Let what the master sent take effect; an object that does not take its value stays as it was.
+        """Let the master's outputs take effect; an object that does not take its value stays as it was.
 
         Returns:
             Whether each took its value.
@@ -105,7 +105,7 @@ class ImageObjects:
         return image.write(data)
 
     def read_inputs(self) -> bytes:
-        """Return what the drive answers, as it is now."""
+        """Return the present input image, which the drive sends."""
         return self._images[INPUTS].pack()
 
     def restart(self) -> None:
@@ -157,7 +157,7 @@ class ImageObjects:
         return index in ASSIGNMENTS or index in self._mappings
 
     def mapped(self, direction: int) -> list[tuple[int, list[int]]]:
-        """Return what `OUTPUTS` or `INPUTS` carry: mapping objects, and the entries of each as they are written.
+        """Return the mapping objects of `OUTPUTS` or `INPUTS`, with the entries of each as integers.
 
         A ready-made image has no mapping object, and so no entries.
         """
@@ -168,7 +168,7 @@ class ImageObjects:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _configure(self) -> None:
-        """Take over what the objects say."""
+        """Read the settings from the objects."""
         self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
 
     def _image(self, direction: int) -> MappedObjects | PackedFields:

@@ -1,7 +1,7 @@
 """The SDO server: expedited, segmented and block transfers (CiA 301, 7.2.4).
 
 A request and the time go in, the response comes out: eight bytes, or None where the protocol has no response. The
-segments of a block upload are fetched one by one, by whoever knows when the bus takes them.
+segments of a block upload are fetched one by one, when the bus can take them.
 """
 
 from __future__ import annotations
@@ -109,13 +109,13 @@ class SdoServer:
             multiplexor = self._open.multiplexor if is_segment and self._open else bytes(3) if is_segment else data[1:4]
             self._open = None
             return _abort(multiplexor, error.abort_code)
-        # Block transfer where the server has none, a step of one that is not open, or a specifier that nobody has.
+        # Block transfer where the server has none, a step of one that is not open, or an unknown specifier.
         self._open = None
         names_object = self._block_size == 0 or specifier not in (BLOCK_UPLOAD, BLOCK_DOWNLOAD)
         return _abort(data[1:4] if names_object else bytes(3), UNKNOWN_COMMAND)
 
     def next_segment(self, now: float) -> bytes | None:
-        """Return the next segment of a block upload, to be sent at `now` [s]; None where there is none to send."""
+        """Return the next segment of a block upload, to be sent at `now` [s]; None without a segment to send."""
         if not isinstance(self.block, BlockUpload):
             return None
         segment = self.block.next_segment()
@@ -124,7 +124,7 @@ class SdoServer:
         return segment
 
     def expire(self, now: float) -> bytes | None:
-        """Return the abort of a transfer whose client has been silent for too long, None as long as there is none."""
+        """Return the abort of a transfer whose client has been silent for too long, None without such a transfer."""
         if self.block is not None:
             if now - self._last < self._timeout - EPSILON:
                 return None
@@ -294,7 +294,7 @@ def encode(entry: Entry, value: int | str) -> bytes:
 
 
 def size_of(entry: Entry) -> int:
-    """Return the length [bytes] of an object; 0 of a text, which is as long as it is."""
+    """Return the length [bytes] of an object; 0 for a text, which is as long as it is."""
     return 0 if entry.bits is None else (entry.bits + 7) // 8
 
 
@@ -309,7 +309,7 @@ def check_length(entry: Entry, size: int) -> None:
 
 
 def take(port: ObjectPort, content: bytes) -> None:
-    """Write what the wire carries, of the object's length, to an object; ObjectAccessError if it does not take it."""
+    """Write received bytes, of the object's length, to an object; ObjectAccessError if it does not take them."""
     if port.entry.bits is None:
         if port.write_text is None:
             raise ObjectAccessError(CANNOT_BE_STORED, f"{port.entry.label} is a text that cannot be written")

@@ -35,7 +35,7 @@ class Store:
         device: Name of the device, which the file must be of.
 
     Raises:
-        ValueError: If the file is none that this class wrote for this device.
+        ValueError: If the file was not written by this class for this device.
     """
 
     def __init__(self, path: Path | None, device: str) -> None:
@@ -79,7 +79,7 @@ def _unfinished(path: Path) -> Path:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file so that whoever kills the process or the power finds the old content or the new, never a mixture."""
+    """Write a file so that after a kill or a power failure it has the old content or the new, never a mixture."""
     new = _unfinished(path)
     with new.open("w", encoding="utf-8") as file:
         file.write(text)

@@ -104,7 +104,7 @@ def load_demonstration(config: str | Path | None = None, **overrides: Any) -> De
 
 
 def perform(demonstration: Demonstration, progress: Callable[[float], None] | None = None) -> Recording:
-    """Run one emulated machine through the demonstration and return what passed.
+    """Run one emulated machine through the demonstration and return the recording.
 
     A drive that ends in fault, or that does not reach a set-point, is no error: the recording shows it.
 
@@ -224,7 +224,7 @@ def _load_torque(row: Demonstration, drives: EmulatedDrives) -> float:
 
 
 def rated_load_torque(drives: EmulatedDrives) -> float:
-    """Return the torque on the load [N*m; N on what moves in a line] that takes the rated torque of a motor."""
+    """Return the torque on the load [N*m; N on a load that moves in a line] that takes the rated torque of a motor."""
     from mechanics.shaft import way
 
     packed = drives.inside.groups[0].load

@@ -38,7 +38,7 @@ CYCLE = 0.001  # s between two samples
 
 
 class Recording(NamedTuple):
-    """A run of one machine: n samples of D joints and A axes. Motor side, SI; what there is not is nan."""
+    """A run of one machine: n samples of D joints and A axes. Motor side, SI; nan for missing values."""
 
     load: Load
     title: str
@@ -59,7 +59,7 @@ class Recording(NamedTuple):
 
 
 class Recorder:
-    """Emulated drives that remember what passes while time advances.
+    """Emulated drives that record while time advances.
 
     Args:
         drives: The drives.
@@ -129,11 +129,11 @@ class Recorder:
         self._rows.append(np.array([self.drives.read(name)[self._axes] for name in self._names], np.float64))
 
     def mark(self, text: str) -> None:
-        """Remember what happens from now on; it is shown beside the machine."""
+        """Add a remark from this time on; it is shown beside the machine."""
         self._events.append((self.now, text))
 
     def recording(self, title: str = "") -> Recording:
-        """Return what has passed so far.
+        """Return the recording so far.
 
         Raises:
             ValueError: If no time has passed.

@@ -227,7 +227,7 @@ def reachable_poses(load: Load) -> NDArray[np.float64]:
 
 
 def _with_text(frame: Image, layout: Layout, recording: Recording, t: float, slow: float | None, grid: float) -> Image:
-    """Return the frame with the run's name, time and pace above, and below what happens and the grid's size."""
+    """Return the frame with the run's name, time and pace above, and the remarks and the grid's size below."""
     from PIL import Image as Pillow
     from PIL import ImageDraw
 

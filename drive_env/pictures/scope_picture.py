@@ -37,7 +37,7 @@ RPM = 30.0 / math.pi
 
 
 class Panel(NamedTuple):
-    """One set of axes: what it shows, its unit, demand and actual in that unit, each of shape (n, A)."""
+    """One set of axes: its title, its unit, demand and actual in that unit, each of shape (n, A)."""
 
     name: str
     unit: str
@@ -46,7 +46,7 @@ class Panel(NamedTuple):
 
 
 def panels(recording: Recording) -> list[Panel]:
-    """Return what the scope shows; positions as the load's axes have them."""
+    """Return the scope's panels; positions as the load's axes have them."""
     if all(recording.linear):
         factor, unit = 1e3 / recording.gears, "mm"
     elif not any(recording.linear):

@@ -1,1 +1,1 @@
-"""What protects the motor on a bus: limits, the envelope that watches them, and what the drive does by itself."""
+"""Protection of the motor on a bus: limits, the envelope that monitors them, and the drive's own watchdogs."""

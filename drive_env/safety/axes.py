@@ -1,4 +1,4 @@
-"""What is known of the axes: whether they are live, where they are, how fast, and since when."""
+"""The present knowledge of the axes: whether they are live, where they are, how fast, and since when."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ CURRENT_MEMORY = 0.03  # s
 
 
 class Axes:
-    """What is known of every axis; arrays have shape (num_axes,).
+    """The present knowledge of every axis; arrays have shape (num_axes,).
 
     Args:
         drives: The drives.
 
     Attributes:
-        lock: Held by whoever changes what is known, or begins or steps a stop.
+        lock: Held while what is known changes, and while a stop begins or takes a step.
         epoch: Grows with every controlword: samples from before tell nothing of what it did.
         is_armed: Whether everything is ready for motion: watchdogs on, limits lent, every axis seen.
         live: Whether an axis may turn, by its statusword, or by a frame that could have enabled it.
         assumed: Live, until a sample of this epoch shows otherwise.
-        in_flight: An enabling frame is out, and nobody has said that it came.
+        in_flight: An enabling frame was sent, and nothing confirms yet that the drive received it.
         lost: Axes that could not be proved off.
         outside: How far outside its limits an axis was when it became live, or since [inc]; -1: not seen yet.
         aim: Axis to the target of pp before, from which relative moves go on [inc].
@@ -143,7 +143,7 @@ class Axes:
             self.live |= axes
 
     def forget_motion(self, axes: Mask) -> None:
-        """Take note that no set-point of a position moves some axes any more: a new one must be given."""
+        """Note that no set-point of a position moves some axes any more: a new one must be given."""
         self.moves = self.moves & ~axes
         self.led = np.where(axes, math.nan, self.led)
 
@@ -158,7 +158,7 @@ class Axes:
         self._kept = self.rotor.turns(self.position)
 
     def place(self, position: Integers, scale: Floats) -> None:
-        """Take positions [inc] and scales [inc/rev] that were read: what moved scale or zero has not moved the rotors.
+        """Take positions [inc] and scales [inc/rev] that were read: changes of scale or zero have not moved the rotors.
 
         Args:
             position: What 6064h shows now.
@@ -174,7 +174,7 @@ class Axes:
         self._placed[:] = True
 
     def take(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> bool:
-        """Keep what the newest samples say.
+        """Keep the newest samples.
 
         Args:
             rows: The samples, each object of shape (rows, num_axes).

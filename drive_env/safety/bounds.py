@@ -96,7 +96,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class RotorLimits:
-    """The user's limits as the rotor's own, which no scale moves, shape (num_axes,) each; nan where there are none.
+    """The user's limits in revolutions of the rotor, which no scale moves, shape (num_axes,) each; nan without a limit.
 
     Attributes:
         low: Lowest place [rev].
@@ -112,7 +112,7 @@ class RotorLimits:
 
 
 def rotor_limits(limits: Limits, drives: BusDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
-    """Return what the user's limits are of the rotors now.
+    """Convert the user's limits to places and speeds of the rotors.
 
     Args:
         limits: The user's.
@@ -166,7 +166,7 @@ def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors:
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
     braking = _rate(drives, QUICK_STOP_DECELERATION, rotor)
-    # What a revolution counts may be mistaken: a speed in rpm is told by positions, too.
+    # The scale of a revolution may be mistaken: a speed in rpm is checked by positions, too.
     by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
     return Bounds(
@@ -236,7 +236,7 @@ REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filt
 
 
 def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
-    """Return 607Dh, corrected by the home offset (CiA 402); what is no range is none."""
+    """Return 607Dh, corrected by the home offset (CiA 402); +-NO_LIMIT for an empty range or the ends of the type."""
     low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
     # The ends of the type, which are the factory's, are no limits; neither is an empty range.
     empty = low >= high
@@ -248,7 +248,7 @@ def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
 
 
 def read_own(drives: BusDrives, key: Key, absent: int) -> Integers:
-    """Return an object of every axis, or what stands for it where the drive does not have it, whatever its EDS says."""
+    """Return an object of every axis, or the default where the drive does not have it, whatever its EDS says."""
     if drives.description.has(key):
         with contextlib.suppress(RefusedError):
             found: Integers = drives.read_entry(drives.description.dictionary.find(key))

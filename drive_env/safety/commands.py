@@ -1,4 +1,4 @@
-"""What a program is about to write or play, held against the limits before it is sent."""
+"""Checks of a program's writes and played rows against the limits, before they are sent."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ _PARTNERS = {
 
 
 class Commands:
-    """The set-points of some drives, and whether what is commanded next would lead beyond a limit.
+    """The set-points of some drives, and the checks whether the next command would lead beyond a limit.
 
     Args:
         drives: The drives.
@@ -94,7 +94,7 @@ class Commands:
         self._set_points: dict[Key, Integers] = {}  # as they were written or read last
 
     def check_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Raise SafetyError for a value that would pass a limit, or change what positions mean at the wrong time."""
+        """Raise SafetyError for a value that would pass a limit, or redefine positions at the wrong time."""
         self._check_value(entry, raw, where)
         self._check_meaning(entry, where)
 
@@ -136,7 +136,7 @@ class Commands:
         return np.rint(raw * scale - 2.0**32 * np.rint(above / 2.0**32)).astype(np.int64)
 
     def note(self, key: Key, raw: Integers, where: Mask) -> None:
-        """Take note of a set-point that was written."""
+        """Note a set-point that was written."""
         if self._is_other_target(key):
             self.forget(TARGET_POSITION)
             self._axes.led = np.where(where, math.nan, self._axes.led)
@@ -150,7 +150,7 @@ class Commands:
             self.note_running(where, (key,))
 
     def note_running(self, where: Mask, keys: tuple[Key, ...] = (TARGET_VELOCITY, TARGET_TORQUE)) -> None:
-        """Take note that axes act on the set-points of speed and torque that they have, by default on both."""
+        """Note that axes act on the set-points of speed and torque that they have, by default on both."""
         for key in keys:
             asked = self._set_points.get(key, 0) + self._set_points.get(_PARTNERS[key], 0)
             if _MAGNITUDES[key] == "velocity":
@@ -163,14 +163,14 @@ class Commands:
         return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
-        """Forget a set-point, by default all: a node was reset, or nobody knows whether it took the last one."""
+        """Forget a set-point, all by default, after a node reset or where the last write may not have arrived."""
         if key is None:
             self._set_points.clear()
         else:
             self._set_points.pop(key, None)
 
     def note_start(self, words: Integers, where: Mask) -> None:
-        """Take note of where moves in pp lead that a controlword has started."""
+        """Note where moves in pp lead that a controlword has started."""
         starts = where & cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0) & (self._axes.mode == PP)
         target = self._set_points.get(TARGET_POSITION)
         for axis in np.flatnonzero(starts).tolist() if target is not None else ():
@@ -235,7 +235,7 @@ class Commands:
             self._check_position(target, base + np.cumsum(steps, axis=0), (rises & relative).any(axis=0), (PP,))
 
     def _check_sum(self, entry: Entry, rows: Integers, played: Mapping[Entry, Integers]) -> None:
-        """Check target and offset of csp as what they add up to; of a target in pp it is the target alone."""
+        """Check the sum of target and offset in csp; in pp the target alone."""
         by_key = {(other.index, other.sub): values for other, values in played.items()}
         if (entry.index, entry.sub) == POSITION_OFFSET and TARGET_POSITION in by_key:
             return  # with the target
@@ -269,7 +269,7 @@ class Commands:
             self._check_magnitude(entry, raw, where, played or {})
 
     def _check_meaning(self, entry: Entry, where: Mask, *, is_played: bool = False) -> None:
-        """Raise SafetyError for what would change the meaning of positions at the wrong time."""
+        """Raise SafetyError for a write that would change the meaning of positions at the wrong time."""
         key = (entry.index, entry.sub)
         moves_scale = key in self._scale_objects
         if moves_scale and is_played:
@@ -466,7 +466,7 @@ class Commands:
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
 
     def check_turning(self, axes: Mask) -> None:
-        """Raise SafetyError for axes that turn, though nobody drives them, faster than they may be once enabled.
+        """Raise SafetyError for axes that turn while switched off, faster than they may once they are enabled.
 
         What coasts or is pulled has a speed that no set-point tells, and a quick stop's ramp may be too slow for it.
         """

@@ -110,7 +110,7 @@ class Envelope:
 
     @property
     def limits(self) -> Limits:
-        """What the program may do."""
+        """The limits of the program."""
         return self._limits.user
 
     @limits.setter
@@ -119,7 +119,7 @@ class Envelope:
 
     @property
     def epoch(self) -> int:
-        """What samples are asked for in: it grows with every controlword."""
+        """The number by which samples are requested: it grows with every controlword."""
         return self._axes.epoch
 
     # --- what BusDrives calls -------------------------------------------------------------------------------------
@@ -129,18 +129,18 @@ class Envelope:
         self._limits.change(limits)
 
     def leave_alone(self, axes: Iterable[int]) -> None:
-        """Take note of axes that the program never moves: their drives are lent nothing."""
+        """Note axes that the program never moves: their drives are lent nothing."""
         self._lending.left_alone = frozenset(axes)
 
     def enter(self) -> None:
-        """Take note that the program does something; raise once what the supervisor had to do meanwhile."""
+        """Begin a call of the program; raise once for a stop that the supervisor made meanwhile."""
         self.alive()
         if self._watch.booted:
             self._after_restart()
         self._watch.raise_pending()
 
     def alive(self) -> None:
-        """Take note that the program waits for an answer."""
+        """Note that the program waits for an answer."""
         self._watch.alive()
 
     def before_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
@@ -173,7 +173,7 @@ class Envelope:
             self._limits.keep_place()
 
     def after_failed_write(self, entry: Entry) -> None:
-        """Take note that a drive may have taken what was written, or not."""
+        """Note that a drive may or may not have taken a write."""
         key = (entry.index, entry.sub)
         self._commands.forget(key)
         if key in scale_objects(self._drives.description):
@@ -185,7 +185,7 @@ class Envelope:
                 self._lend()
 
     def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Take note of what was written."""
+        """Note a write."""
         key = (entry.index, entry.sub)
         self._note_mode(key, where)
         if key == CONTROLWORD:
@@ -209,13 +209,13 @@ class Envelope:
         return key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT) or key in gains
 
     def _note_mode(self, key: Key, where: Mask) -> None:
-        """Take note of what may make an axis ignore commands for a moment, until it has both of its modes."""
+        """Note that an axis may ignore commands for a moment, until both of its modes have changed."""
         if key in (MODE, self._drives.description.role(Role.MODE_GATE)):
             self._axes.forget_motion(where)
             self._axes.mode_written = np.where(where, self._axes.now(), self._axes.mode_written)
 
     def write_lent(self, entry: Entry, axis: int, value: int) -> bool:
-        """Take a value for an object that has another one meanwhile; False if it has not."""
+        """Store the user's value of an object that the envelope has overridden. False if it is not overridden."""
         key = (entry.index, entry.sub)
         if not self._lending.is_lent(key, axis):
             return False
@@ -230,7 +230,7 @@ class Envelope:
         return True
 
     def own(self, entry: Entry, axis: int, found: int) -> int:
-        """Return what the program sees of an object that has `found`: its own value where another is lent."""
+        """Return the program's own value of an object that reads `found`: the one before where another is lent."""
         return self._lending.own((entry.index, entry.sub), axis, found)
 
     def before_play(self, played: Mapping[Entry, Integers]) -> None:
@@ -323,14 +323,14 @@ class Envelope:
             )
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Take note of what was played."""
+        """Note played rows."""
         self._played = {}
         for entry, rows in played.items():
             if len(rows):
                 self.after_write(entry, rows[-1], self._axes.everywhere)
 
     def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Take note that the drives may have taken any of the rows."""
+        """Note that the drives may have taken any of the rows."""
         self._played = {}
         for entry in played:
             self.after_failed_write(entry)
@@ -345,7 +345,7 @@ class Envelope:
         self._axes.take_for_off(axes)
 
     def after_reset(self, nodes: Sequence[int]) -> None:
-        """Take note that nodes, by position, were reset: their error control is their own again."""
+        """Note that nodes, by position, were reset: their error control is their own again."""
         for k in nodes:
             self._watchdogs.forget(k)
             self._watch.booted.discard(k)
@@ -359,12 +359,12 @@ class Envelope:
             self._limits.place()
 
     def restarted(self, node: int) -> None:
-        """Take note that a node, by position, has booted though nobody here has reset it."""
+        """Note that a node (by position) has booted without a reset of ours."""
         if self._is_ours():
             self._watch.note_restart(node)
 
     def _after_restart(self) -> None:
-        """Take down what was known of nodes that restarted, and have the program told."""
+        """Forget the state of nodes that restarted, and have the program informed."""
         nodes = sorted(self._watch.booted)
         self._drives.forget(nodes)
         self.after_reset(nodes)  # a boot-up says nothing of the axes: reset communication leaves them running
@@ -379,11 +379,11 @@ class Envelope:
         return bool(self._axes.lost & set(np.flatnonzero(self._axes.of_nodes([node])).tolist()))
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        """Return the objects to sample at every SYNC, most important first; the same list until the limits change."""
         return self._watch.looks.watched()
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
-        """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
+        """Note the objects that come with every SYNC; the other watched ones are read."""
         self._watch.looks.sampled(chosen)
 
     def observe(
@@ -402,7 +402,7 @@ class Envelope:
         self._watch.observe(rows, epoch, where)
 
     def _note_rows(self, coming: int) -> None:
-        """Take note of the mode that axes have by the newest row, and of the set-points of the one that comes."""
+        """Note the axes' mode from the newest played row, and the set-points from the row that comes."""
         for key, rows in self._played.items():
             if key != MODE:
                 self._commands.note(key, rows[min(coming, len(rows) - 1)], self._axes.everywhere)
@@ -411,10 +411,10 @@ class Envelope:
                 self._axes.mode = rows[coming - 1].copy()
 
     def stop(self, reason: str) -> None:
-        """Bring what is live to rest by grades and switch it off; what fails is logged.
+        """Bring live axes to rest by grades and switch them off; failures are logged.
 
-        Axes that nobody has armed were neither enabled nor commanded by this program, and are left alone. Neither
-        Ctrl-C nor SIGTERM cuts the stop short.
+        Axes that this program has not armed are left alone: it neither enabled nor commanded them. Neither Ctrl-C nor
+        SIGTERM cuts the stop short.
         """
         if not self._is_ours():
             return
@@ -427,7 +427,7 @@ class Envelope:
             self._watch.await_stop(ends=True)
 
     def stop_at_once(self, reason: str) -> None:
-        """Have what is live quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
+        """Have live axes quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
 
         Any thread may call it; it returns at once. The program gets a SafetyError at its next call, or in the one that
         is under way. An axis that a weight pulls is held, as after a limit was passed.
@@ -438,7 +438,7 @@ class Envelope:
         self._watch.ask_to_stop(reason)
 
     def close(self) -> None:
-        """Stop what is live; give the drives back what they had, and their watchdogs, once they are proved off."""
+        """Stop live axes; give the drives their lent values and watchdogs back, once they are proved off."""
         if self._is_ours():
             with self._uninterrupted():
                 self.stop("the drives are closed while enabled")
@@ -526,7 +526,7 @@ class Envelope:
             self._arm()
 
     def _finds_live(self, where: Mask) -> bool:
-        """Return whether an axis that is about to be changed is live: somebody else has enabled it."""
+        """Return whether an axis that is about to be changed is live, enabled by another program or master."""
         status = self._known.find(STATUSWORD)
         return any(cia402.is_live(self._drives.read_raw(status, int(axis))) for axis in np.flatnonzero(where))
 
@@ -578,7 +578,7 @@ class Envelope:
         rest = self._limits.bounds().rest
         turning = axes & self._axes.live & (np.maximum(np.abs(self._axes.speed), np.abs(self._axes.velocity)) > rest)
         if turning.any():
-            self._arm()  # also what somebody else has enabled, once it is ours to stop
+            self._arm()  # also axes that another program has enabled, once they are ours to stop
             with self._axes.lock:
                 self._stops.begin(turning, holds=False)
             self._watch.await_stop()

@@ -1,4 +1,4 @@
-"""What the envelope raises, and what it logs and goes on after."""
+"""Errors of the envelope, raised or logged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SafetyError(RuntimeError):
 
 @contextlib.contextmanager
 def logged() -> Iterator[None]:
-    """Log what fails while stopping, and go on: the other axes must be stopped, too."""
+    """Log a failure while stopping, and go on: the other axes must be stopped, too."""
     try:
         yield
     except (BusError, ObjectAccessError) as error:

@@ -1,4 +1,4 @@
-"""What the drives do, held against the limits: speed, position, following error, current and its swings."""
+"""Checks of samples against the limits: speed, position, following error, current and its swings."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Judging:
             self._judge_current(judged, rows[CURRENT], bounds)
 
     def judge_heard(self, rows: Mapping[Key, Integers], were_judged: Mask) -> None:
-        """Stop for axes that have ceased to take commands by themselves: somebody has changed one of their modes.
+        """Stop axes that have ceased to take commands because another program has changed one of their modes.
 
         Such an axis stops by itself, or runs on: the manual of a drive may not say which.
 

@@ -1,4 +1,4 @@
-"""Limits that the drives hold themselves while they are moved, and get back what they had.
+"""Limits that the drives hold themselves while they are moved; afterwards they get their own back.
 
 A limit that lives in this process alone dies with it. What is tighter here than in a drive is lent to it: the drive
 holds it, and the program goes on reading and writing its own value, which the drive has again afterwards.
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 class Loan(NamedTuple):
-    """What an object had, and what it may have meanwhile: several values where an answer was lost."""
+    """An object's own value, and the values that it may have meanwhile: several where an answer was lost."""
 
     own: int
     lent: frozenset[int]
@@ -35,7 +35,7 @@ class Lending:
         drives: The drives.
 
     Attributes:
-        left_alone: Axes that nobody moves here: they keep what they have.
+        left_alone: Axes that are not moved here: they keep their values.
     """
 
     def __init__(self, drives: BusDrives) -> None:
@@ -76,12 +76,12 @@ class Lending:
         return False
 
     def own(self, key: Key, axis: int, found: int) -> int:
-        """Return what the program sees of an object that has `found`."""
+        """Return the program's own value of an object that reads `found`: where another is lent, the one before."""
         loan = self._loans.get((key, axis))
         return loan.own if loan is not None and found in loan.lent else found
 
     def owned(self, key: Key, axis: int) -> int:
-        """Return what an object had that has another value meanwhile."""
+        """Return the own value of an object that has a lent one; KeyError if none is lent."""
         return self._loans[key, axis].own
 
     def is_lent(self, key: Key, axis: int) -> bool:
@@ -89,11 +89,11 @@ class Lending:
         return (key, axis) in self._loans
 
     def settle(self, key: Key, axis: int, value: int) -> None:
-        """Take note of what the program wants an object to have afterwards."""
+        """Note the value that the program wants an object to have afterwards."""
         self._loans[key, axis] = self._loans[key, axis]._replace(own=value)
 
     def pass_on(self, key: Key, axis: int, value: int) -> None:
-        """Write what the program wants an object to have, now and afterwards, that had another value meanwhile.
+        """Write the program's value of an object that had a lent one: it has it now and afterwards.
 
         Raises:
             ObjectAccessError: If the drive refuses it; BusError if it does not answer.
@@ -102,7 +102,7 @@ class Lending:
         self._loans[key, axis] = Loan(value, frozenset({value}))
 
     def give_back(self, axes: set[int]) -> None:
-        """Give axes what they had.
+        """Give axes their own values back.
 
         Raises:
             BusError: If not all of it could be.
@@ -115,7 +115,7 @@ class Lending:
         tidying.end()
 
     def give_back_one(self, key: Key, axis: int) -> None:
-        """Give an object of an axis what it had."""
+        """Give an object of an axis its own value back."""
         self._return(self._drives.description.dictionary.find(key), axis, self._loans[key, axis])
 
     def has_lent(self, axes: set[int]) -> bool:
@@ -123,7 +123,7 @@ class Lending:
         return any(axis in axes for _, axis in self._loans)
 
     def forget(self, axes: set[int]) -> None:
-        """Forget what axes had: their node was reset."""
+        """Forget the own values of axes whose node was reset."""
         for key, axis in list(self._loans):
             if axis in axes:
                 del self._loans[key, axis]

@@ -1,4 +1,4 @@
-"""Limits of what a program may do to drives of a bus, as the user states them."""
+"""Limits of a program on drives of a bus, as the user states them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DEFAULT_SPEED = 100.0  # rev/s of the rotor (6,000 rpm), of a drive that has no 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a program may do to drives, in the drive's units; None takes the drive's own limit.
+    """The limits of a program, in the drive's units; None takes the drive's own limit.
 
     Each limit is one number for all axes, or a sequence with one per axis, of which None takes the drive's own.
 
@@ -76,7 +76,7 @@ class Limits:
 
 
 def given(value: PerAxis | None, num_axes: int) -> NDArray[np.float64]:
-    """Return what the user gave for each axis, nan where the drive's own limit counts, shape (num_axes,)."""
+    """Return the user's limit of each axis, shape (num_axes,); nan where only the drive's own limit holds."""
     return np.broadcast_to(_values(value, math.nan), (num_axes,)).astype(float)
 
 

@@ -76,7 +76,7 @@ class LimitsInForce:
             self.lend()
 
     def forget(self) -> None:
-        """Read anew what the limits depend on before they are used again."""
+        """Read anew the values that the limits depend on, before they are used again."""
         self._generation += 1
         self.latest = None
 
@@ -90,7 +90,7 @@ class LimitsInForce:
             self._axes.keep_place()
 
     def place_again(self) -> None:
-        """Have the rotors placed before a limit is used again: nobody knows which scale a drive has."""
+        """Have the rotors placed again before a limit is used: the scale of a drive may have changed."""
         self._must_place = True
         self.forget()
 
@@ -102,7 +102,7 @@ class LimitsInForce:
         return rotor_limits(user, self._drives, self._axes.rotor, self._axes.position)
 
     def place(self) -> None:
-        """Read where the rotors are and what a revolution counts; what moved scale or zero has not moved them."""
+        """Read where the rotors are and the scale of a revolution; changes of scale or zero have not moved them."""
         position = read_own(self._drives, POSITION, 0)
         scale, ratio = read_scale(self._drives), read_ratio(self._drives)
         with self._axes.lock:
@@ -114,7 +114,7 @@ class LimitsInForce:
             self.lend()
 
     def bounds(self) -> Bounds:
-        """Return the limits of every axis as integers of its drive; what the user left open is read from the drives."""
+        """Return the limits of every axis as integers of its drive; those left open by the user are the drives' own."""
         bounds, generation = self.latest, self._generation
         if bounds is None:
             if self._must_place or not self._axes.rotor.is_placed:
@@ -175,7 +175,7 @@ class LimitsInForce:
             self._lending.lend(key, axis, own)
 
     def _has_no_range(self, axis: int) -> bool:
-        """Return whether an axis' own range is empty, which is none: any travel is tighter."""
+        """Return whether the range of an axis is empty, so that any travel is tighter."""
         known = self._drives.description.dictionary
         if not all(self._drives.description.has(key) for key in (POSITION_LOW, POSITION_HIGH)):
             return False
@@ -191,5 +191,5 @@ class LimitsInForce:
         return read_own(self._drives, HOME_OFFSET, 0)
 
     def origin(self, value: object, name: str, own: str) -> str:
-        """Return what sets a limit, for a message: the user's `value` by `name`, or the object of the drive."""
+        """Return the source of a limit, for a message: the user's `value` by `name`, or the object of the drive."""
         return f"Limits({name}=...)" if value is not None else f"the drive's own limit, {own}"

@@ -1,4 +1,4 @@
-"""What is watched: sampled with every SYNC as far as it fits, and otherwise asked for."""
+"""The objects that the envelope watches: sampled with every SYNC as far as they fit, the others read."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def answer_time(drives: BusDrives, usual: float = ASK) -> float:
 
 
 class Looks:
-    """What comes with every SYNC, and what is asked for besides.
+    """The objects that come with every SYNC, and those that are read besides.
 
     Args:
         drives: The drives.
@@ -58,22 +58,22 @@ class Looks:
         self._watched: tuple[Bounds, list[Entry]] | None = None
         self._unsampled: list[Entry] = []
         self._unsampled_at = 0.0
-        self._silent: dict[int, float] = {}  # node, by position -> until when nobody asks it again
+        self._silent: dict[int, float] = {}  # node, by position -> time [s] before which it is not asked again
 
     @property
     def is_short(self) -> bool:
-        """Whether some of what is watched does not come with SYNC."""
+        """Whether some of the watched objects do not come with SYNC."""
         return bool(self._unsampled)
 
     def ask_unsampled(self) -> None:
-        """Ask for what no PDO carries, when it is due."""
+        """Read the objects that no PDO carries, when they are due."""
         now = time.monotonic()
         if self._unsampled and now >= self._unsampled_at:
             self._unsampled_at = now + UNSAMPLED
             self.ask(self._unsampled)
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        """Return the objects to sample at every SYNC, most important first; the same list until the limits change."""
         bounds = self._limits.bounds()
         if self._watched is not None and self._watched[0] is bounds:
             return self._watched[1]
@@ -87,14 +87,14 @@ class Looks:
         return entries
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
-        """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
+        """Note the objects that come with every SYNC; the other watched ones are read."""
         self._unsampled = [entry for entry in self.watched() if entry not in chosen]
         keys = [(entry.index, entry.sub) for entry in self._unsampled]
-        if DEMAND in keys and POSITION not in keys:  # a following error is told by both of a moment
+        if DEMAND in keys and POSITION not in keys:  # a following error needs both of the same moment
             self._unsampled.insert(0, self._known.find(POSITION))
 
     def with_unsampled(self, rows: Mapping[Key, Integers]) -> Mapping[Key, Integers]:
-        """Return samples and what no PDO carries, which is asked for now and then: no time passes in lockstep."""
+        """Return samples with the objects that no PDO carries, read now and then: no time passes in lockstep."""
         count = len(next(iter(rows.values()))) if rows else 1
         if self._axes.clock + count * self._drives.description.cycle < self._unsampled_at:
             return rows
@@ -108,7 +108,7 @@ class Looks:
     def ask(self, entries: Sequence[Entry]) -> bool:
         """Read objects of every axis; return whether all came. Beyond a limit the drives are stopped.
 
-        Nodes that have not answered come last, one of them at a time: nobody else waits for them.
+        Nodes that have not answered come last, one of them at a time, so that the others do not wait for them.
         """
         now = self._axes.now()
         due = [node for node, until in self._silent.items() if until <= now][:1]
@@ -138,7 +138,7 @@ class Looks:
         return True
 
     def _ask_axis(self, node: int, axis: int, entries: Sequence[Entry], timeout: float) -> dict[Key, Integers]:
-        """Return what came of objects of an axis, up to the first that did not."""
+        """Read objects of an axis until one does not answer; return the values that came."""
         rows: dict[Key, Integers] = {}
         for entry in entries:
             index, sub = self._drives.description.key(entry, axis % self._drives.description.num_axes)

@@ -34,7 +34,7 @@ DISABLE_OPERATION_OPTION, HALT_OPTION, FAULT_REACTION_OPTION = (
     (cia402.HALT_OPTION, 0),
     (cia402.FAULT_REACTION_OPTION, 0),
 )
-# What makes an axis move, or changes how far; whoever writes it arms.
+# What makes an axis move, or changes how far: writing one arms the envelope.
 SET_POINTS = (
     TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
     INTERPOLATED_POSITION,

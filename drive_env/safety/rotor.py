@@ -1,4 +1,4 @@
-"""Where the rotors are, in revolutions since the drives were opened: what scale and zero of 6064h do not move."""
+"""Where the rotors are, in revolutions since the drives were opened: independent of scale and zero of 6064h."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def wrapped(difference: Integers) -> Integers:
 class RotorAngle:
     """The way between increments of 6064h and revolutions of the rotors.
 
-    Positions are those of a moment (`place`) and the increments since; whoever moves scale or zero takes another.
+    Positions are those of a moment (`place`) and the increments since; place rotors anew after scale or zero changed.
 
     Args:
         num_axes: How many.
@@ -44,7 +44,7 @@ class RotorAngle:
         self.is_placed = False
 
     def place(self, increments: Integers, scale: Floats, turns: Floats | None = None) -> None:
-        """Take note that rotors are at `turns` where 6064h shows `increments`; where they were believed by default."""
+        """Note that rotors are at `turns` where 6064h shows `increments`; where they were believed by default."""
         if turns is None:
             turns = self.turns(increments) if self.is_placed else np.zeros(len(increments))
         self._increments, self._turns, self.scale = increments.copy(), turns.copy(), scale.copy()
@@ -62,7 +62,7 @@ class RotorAngle:
 
 
 def _own_scale(description: Description) -> PositionScale | None:
-    """Return the objects of the drive's own that say it, None of a drive that has CiA 402's."""
+    """Return the objects of the drive's own scale, None for a drive with CiA 402's."""
     own = position_scale(description.dictionary.roles)
     return own if own is not None and all(description.has(key) for key in own.keys) else None
 

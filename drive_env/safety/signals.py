@@ -14,7 +14,7 @@ NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Guarded(Protocol):
-    """What hears of signals."""
+    """Receives signals."""
 
     def interrupt(self) -> bool:
         """Begin to stop; return whether a stop that a signal before began is still under way."""

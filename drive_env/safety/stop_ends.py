@@ -102,7 +102,7 @@ def outside(bounds: Bounds, position: Floats | Integers) -> Floats:
 
 
 class StopEnds:
-    """Where stops would end that begin now, by what the axes were seen to do.
+    """Where stops would end that begin now, from the axes' motion.
 
     Args:
         axes: What is known of the axes.
@@ -122,7 +122,7 @@ class StopEnds:
         self._current = np.zeros(count)
 
     def take(self, rows: Mapping[Key, Integers], bounds: Bounds) -> None:
-        """Take note of samples, each object of shape (rows, num_axes)."""
+        """Note samples, each object of shape (rows, num_axes)."""
         axes, now = self._axes, self._axes.now()
         self.speed = axes.newest_speed()
         if CURRENT in rows:
@@ -136,14 +136,14 @@ class StopEnds:
             self._before, self._before_at = self.speed, now
 
     def ways(self, bounds: Bounds) -> tuple[Floats, Floats]:
-        """Return how far the axes go on by the speed that they have, and by what was asked for [inc]."""
+        """Return how far the axes go on by their speeds, and by their commands [inc]."""
         axes = self._axes
         own = stop_way(axes, bounds, self.speed) + self._held(bounds)
         asked = ramp_way(bounds, axes.asked_speed) + axes.asked_speed * LATENCY + self._short
         return own, np.where(axes.mode == CSV, asked, own)
 
     def _held(self, bounds: Bounds) -> Floats:
-        """Return what the current that the integral of the velocity loop holds adds to the way [inc]."""
+        """Return the extra way [inc] that comes from the current held in the velocity loop's integral."""
         axes, way = self._axes, np.sign(self.speed)
         torque = np.isin(axes.mode, TORQUE_MODES)
         asked = np.where(torque, axes.asked_current, 0.0)

@@ -1,4 +1,4 @@
-"""Stops of some drives: which axes, what their drives must be told meanwhile, and what is left to the watchdogs."""
+"""Stops of some drives: which axes, their drives' settings meanwhile, and the cases left to the watchdogs."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class StopRunner:
 
     Args:
         drives: The drives.
-        axes: What is known of them; its lock is held by whoever begins or steps a stop.
+        axes: What is known of them; hold its lock to begin or step a stop.
         limits: Those that hold.
         lending: Lends the drives another quick stop option.
         cease: Ends the heartbeats, so that what is lost stops by itself.
@@ -95,7 +95,7 @@ class StopRunner:
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
     def make_sure_of_ramps(self) -> None:
-        """Have quick stops ramp by 6085h, and what else stops an axis ramp: an option code of 0 would let it coast.
+        """Make quick stops ramp by 6085h, and other stops ramp, too: an option code of 0 would let an axis coast.
 
         Raises:
             SafetyError: If a drive takes no other option for its quick stop.
@@ -114,7 +114,7 @@ class StopRunner:
                 logger.warning("axis %d: %s = 0 lets it coast", axis, self._known.find(key).label)
 
     def keep_ramps(self, key: Key, raw: Integers, where: Mask) -> None:
-        """Lend axes a stop's ramp where an option code that is none is about to be written, as theirs for afterwards.
+        """Lend axes a stop's ramp in place of an option without one that is about to be written; it is theirs later.
 
         Raises:
             SafetyError: If a drive does not take the ramp.
@@ -130,7 +130,7 @@ class StopRunner:
                 )
 
     def lends_ramps(self) -> bool:
-        """Return whether a drive whose own option lets an axis coast has another one meanwhile."""
+        """Return whether an axis would coast by the drive's own option, and has a ramp lent instead."""
         return any(
             self._lending.is_lent(key, axis) and self._lending.owned(key, axis) == COASTS
             for key in RAMPS
@@ -200,7 +200,7 @@ class StopRunner:
                 self._lending.lend(QUICK_STOP_OPTION, axis, ramp)
 
     def stop_for(self, what: str, remedy: str) -> NoReturn:
-        """Stop all axes that count as live, and raise SafetyError with what is wrong and what to do."""
+        """Stop all axes that count as live, and raise SafetyError with the cause and the remedy."""
         with self._axes.lock:
             self.begin(self._axes.may_turn, holds=True)
         raise SafetyError(f"{what}: the drives were quick-stopped; {remedy}")
@@ -326,7 +326,7 @@ class StopRunner:
             self._drives.sdo(node).command(*known.key(entry, part), known.encode(entry, value))
 
     def _own_mode(self, axis: int) -> int | None:
-        """Return the drive's own mode with which an axis that ignores commands takes them; None of one that does."""
+        """Return the drive's own mode with which an axis that ignores commands takes them; None if it takes them."""
         device = self._drives.device
         if device is None or not self._ignores(axis):
             return None
@@ -372,7 +372,7 @@ class StopRunner:
         judged[list(self._axes.lost)] = False
         if self.current is not None:
             for axis, stop in self.current.axes.items():
-                # What somebody else has enabled since is no longer ours to hold.
+                # An axis that another program has enabled since is no longer ours to hold.
                 is_enabled = stop.is_over and cia402.matches(int(self._axes.status[axis]), cia402.OPERATION_ENABLED)
                 judged[axis] &= is_enabled
         return judged

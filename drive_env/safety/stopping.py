@@ -17,7 +17,7 @@ ANSWER = 0.1  # s within which a drive must have begun its ramp
 GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
 SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
 LONGEST_FOLLOWING = 0.5  # s until the ramp of an axis begins that ends by itself
-LONGEST = 1.0  # s; whoever would stand by then at the present deceleration is slowing down well, too
+LONGEST = 1.0  # s; an axis that would be at rest by then at the present deceleration slows down well enough, too
 # Measurements of the deceleration, one after the other, that must be too low before one was enough: a loop that was at
 # its limit of current goes on as before until the ramp has come down to the speed that there is.
 MEASUREMENTS = 2
@@ -42,7 +42,7 @@ class Phase(Enum):
 
 
 class Sample(NamedTuple):
-    """What is known of an axis: when it was seen [s], statusword, speed [inc/s]."""
+    """The present knowledge of an axis: when it was seen [s], statusword, speed [inc/s]."""
 
     time: float
     status: int
@@ -92,7 +92,7 @@ class AxisStop:
         return self.phase in (Phase.OFF, Phase.LOST) or (self.phase is Phase.REST and self.holds)
 
     def step(self, now: float, sample: Sample) -> int | None:
-        """Take what is known now; return the controlword to send, None for none."""
+        """Take the newest sample; return the controlword to send, None for none."""
         fresh = sample.time > self._seen
         if fresh:
             self._seen = sample.time
@@ -117,7 +117,7 @@ class AxisStop:
         return now - self._since if self.phase is Phase.REST else 0.0
 
     def is_unseen(self, now: float) -> bool:
-        """Return whether the voltage should go, and nobody answers."""
+        """Return whether the voltage should be cut, and the drive does not answer."""
         return self.phase is Phase.CUT and now - self._seen > ANSWER
 
     def release(self) -> None:
@@ -223,7 +223,7 @@ class Stop:
         return all(axis.is_over for axis in self.axes.values())
 
     def step(self, now: float) -> None:
-        """Send what each axis needs at `now` [s]."""
+        """Send the controlword that each axis needs at `now` [s]."""
         for number, axis in self.axes.items():
             if axis.phase not in (Phase.OFF, Phase.LOST) and (word := axis.step(now, self._sample(number))) is not None:
                 self._send(number, word)

@@ -48,7 +48,7 @@ class Supervisor:
         self._wake.set()
 
     def is_this_thread(self) -> bool:
-        """Return whether whoever asks is the thread itself."""
+        """Return whether the caller runs in this thread."""
         return threading.get_ident() == self._thread.ident
 
     def close(self) -> None:
@@ -60,7 +60,7 @@ class Supervisor:
         sys.setswitchinterval(self._interval)
 
     def _run(self) -> None:
-        told = ""  # a bus that is gone is told once, not with every turn
+        told = ""  # a bus that is gone is reported once, not with every turn
         while not self._ended.is_set():
             begun = time.monotonic()
             try:

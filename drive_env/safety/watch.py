@@ -40,13 +40,13 @@ STALE, STALE_OFF = 0.008, 0.015  # s after which drives that are live, or off, a
 BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, until it is stopped
 MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no samples: it is not operational
 MOST_STOP_CYCLES = 5000  # in lockstep
-SILENT_CYCLE = 0.1  # s of lockstep that count as passed where nobody answers
+SILENT_CYCLE = 0.1  # s of lockstep that count as passed where no node answers
 LONGEST_STOP = LONGEST_FOLLOWING + RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
 AT_ONCE = 0.1  # s after a signal within which another one means the same
 
 
 class Watch:
-    """Sees what the drives do, and what the program fails to do.
+    """Watches the drives, and whether the program goes on.
 
     Args:
         drives: The drives.
@@ -107,7 +107,7 @@ class Watch:
             self._supervisor.start()
 
     def end(self) -> None:
-        """End the thread, and whatever was under way: nobody watches any more."""
+        """End the thread and any stop under way: the drives are not watched any more."""
         if self._supervisor is not None:
             self._supervisor.close()
             self._supervisor = None
@@ -118,13 +118,13 @@ class Watch:
         self._asked = None
 
     def raise_pending(self) -> None:
-        """Raise once what the supervisor had to do meanwhile."""
+        """Raise once for a stop that the supervisor made meanwhile."""
         pending, self._pending = self._pending, None
         if pending is not None:
             raise pending
 
     def note_restart(self, node: int) -> None:
-        """Take note that a node, by position, has booted though nobody here has reset it."""
+        """Note that a node (by position) has booted without a reset of ours."""
         self.booted.add(node)
         self._told_of.discard(node)
 
@@ -135,7 +135,7 @@ class Watch:
             self._supervisor.wake()
 
     def ask_to_stop(self, reason: str) -> None:
-        """Have what is live stopped at the supervisor's next turn; callable from any thread."""
+        """Have live axes stopped at the supervisor's next turn; callable from any thread."""
         supervisor = self._supervisor
         if supervisor is not None:  # without one nothing is live, and what is enabled later is not meant
             self._asked = reason
@@ -147,7 +147,7 @@ class Watch:
             self._pending = SafetyError("the drives were stopped, since a signal ended the program")
 
     def forget_signal(self) -> None:
-        """Take note that the program goes on after a signal: it enables an axis."""
+        """Note that the program goes on after a signal: it enables an axis."""
         self._told_at = -math.inf
 
     @property
@@ -158,7 +158,7 @@ class Watch:
         return math.isfinite(self._told_at) and self._stops.current is not None and not self._stops.current.is_over
 
     def alive(self) -> None:
-        """Take note that the program waits for an answer."""
+        """Note that the program waits for an answer."""
         if not self._is_supervisor():
             self._alive = time.monotonic()
 
@@ -172,7 +172,7 @@ class Watch:
         return self._axes.mode
 
     def first_look(self) -> None:
-        """See every axis once, or raise SafetyError: what cannot be seen is not moved."""
+        """See every axis once, or raise SafetyError: an axis that cannot be seen is not moved."""
         if self._drives.is_dry:
             return
         missing = [
@@ -247,16 +247,16 @@ class Watch:
             self._judging.judge(seen, self._stops.judged() & where)
 
     def look_for_live(self) -> bool:
-        """Return whether an axis is live, by what the drives say now; one that says nothing is what it was."""
+        """Return whether an axis is live, by the drives' present statuswords; one that does not answer is as before."""
         entries = (
             self._known.find(key) for key in (STATUSWORD, POSITION, VELOCITY) if self._drives.description.has(key)
         )
-        with contextlib.suppress(SafetyError):  # whoever asks is about to stop; beyond a limit that has begun
+        with contextlib.suppress(SafetyError):  # the caller is about to stop; beyond a limit the stop has begun
             self.looks.ask(list(entries))
         return bool(self._axes.may_turn.any())
 
     def await_stop(self, *, ends: bool = False) -> None:
-        """Return when a stop that is under way is over: what the program does next must not cut it short."""
+        """Return when a stop that is under way is over: the program's next call must not cut it short."""
         stop = self._stops.current
         if stop is None:
             return
@@ -300,7 +300,7 @@ class Watch:
 
     # --- the supervisor's thread -------------------------------------------------------------------------------------
     def _turn(self) -> None:
-        """Do what is due: a sign of life, a look at the drives, a step of a stop, the program's pulse.
+        """Take a turn: a sign of life, a look at the drives, a step of a stop, the program's pulse.
 
         Raises:
             BusError: If the bus failed in one of them; the others are done all the same.
@@ -364,7 +364,7 @@ class Watch:
             self._missed += 1
 
     def _look_after(self) -> None:
-        """Stop what cannot be seen, what lost its state, and what a program that stalls has left."""
+        """Stop axes that cannot be seen or lost their state, and those of a program that stalls."""
         now = time.monotonic()
         live = self._stops.judged()
         if not live.any():

@@ -31,7 +31,7 @@ ROUNDING = 0.001  # s by which a drive may act later than asked: watchdogs count
 
 
 class Watchdogs:
-    """What the drives do by themselves when this process dies.
+    """The drives' own reaction when this process dies.
 
     Args:
         drives: The drives.
@@ -85,7 +85,7 @@ class Watchdogs:
         self._is_set = False
 
     def forget(self, node: int) -> None:
-        """Take note that a node, by position, was reset: its watchdog is its own again."""
+        """Note that a node, by position, was reset: its watchdog is its own again."""
         self._watch.forget(node)
 
     def take_rival(self) -> str:
@@ -171,7 +171,7 @@ class Watchdogs:
         self._is_lockstep_proved = True
 
     def give_up(self) -> None:
-        """Give drives back what they had and their watchdogs; what is not proved off keeps them and hears no more."""
+        """Give drives their settings and watchdogs back; those that are not proved off keep them, and hear no more."""
         per_node, heard = self._drives.description.num_axes, self._drives.link.wording.sign_of_life
         for k, node in enumerate(self._drives.nodes):
             axes = range(k * per_node, (k + 1) * per_node)
@@ -186,7 +186,7 @@ class Watchdogs:
                 self._axes.take_for_off(self._axes.of_nodes([k]))
                 continue
             self._axes.lost.update(axes)
-            self.cease()  # again, if need be: for the proof the node was started, and would wait for nobody
+            self.cease()  # again, if need be: for the proof the node was started, and would wait for no heartbeat
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,

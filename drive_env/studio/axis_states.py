@@ -1,4 +1,4 @@
-"""What is known of every axis, for people: state, mode, motion, faults, switches, temperatures."""
+"""The state of every axis, for people: mode, motion, faults, switches, temperatures."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NO_FAULT = ("fault_reset", "error_reset")
 
 @dataclass(frozen=True)
 class ShownQuantity:
-    """A value of an object as people read it: label, number, unit; the number is None where it is not known."""
+    """An object's value for display: label, number, unit; the number is None if it is not known."""
 
     label: str
     value: float | None
@@ -61,7 +61,7 @@ class AxisFault:
 
 @dataclass(frozen=True)
 class AxisState:
-    """What is known of an axis.
+    """The present knowledge of an axis.
 
     Attributes:
         axis: Its number, from 0.
@@ -110,7 +110,7 @@ class AxisState:
 
 
 class AxisStates:
-    """Keeps what is known of the axes; refreshed by the thread of the drives, read by any.
+    """Keeps the present knowledge of the axes; refreshed by the thread of the drives, read by any.
 
     Args:
         drives: The drives.
@@ -138,7 +138,7 @@ class AxisStates:
         )
 
     def refresh(self, drives: Drives, recorder: ScopeRecorder) -> list[str]:
-        """Look at the newest samples, and read what is due besides; return what there is to tell."""
+        """Process the newest samples, and read other values that are due; return the messages to show."""
         now = time.monotonic()
         if now - self._slow_at > SLOW:
             self._slow_at = now
@@ -149,7 +149,7 @@ class AxisStates:
         return []
 
     def hear(self, message: EmergencyMessage) -> tuple[str, str]:
-        """Take note of an emergency; return how grave it is, and what it says."""
+        """Note an emergency; return its severity and its text."""
         text = fault_text(message.name)
         axis = self.axes[message.axis]
         if message.code == 0 or message.name in NO_FAULT:
@@ -161,7 +161,7 @@ class AxisStates:
         return "error", f"{axis.name}: {message.code:04X}h {text.name}. {text.cause} {text.remedy}"
 
     def forget_faults(self, axis: int) -> None:
-        """Take note that the faults of an axis were reset."""
+        """Note that the faults of an axis were reset."""
         self._replace(axis, faults=())
 
     # --- inside ---------------------------------------------------------------------------------------------------
@@ -189,7 +189,7 @@ class AxisStates:
         return self._note_limits(newest)
 
     def _note_limits(self, newest: Mapping[Key, Any]) -> list[str]:
-        """Take note of axes whose current is at its limit though they do not turn; return what is new of that."""
+        """Note axes at their current limit that do not turn; return messages about new ones."""
         current, speed = newest.get((cia402.TORQUE_ACTUAL, 0)), newest.get((cia402.VELOCITY_ACTUAL, 0))
         if self._limit is None or current is None or speed is None:
             return []
@@ -219,7 +219,7 @@ class AxisStates:
             self._replace(axis, mode=mode, inputs=switches, slow=values)
 
     def _try(self, drives: Drives, key: Key) -> Any:
-        """Return an object of every axis, None of one that the drive does not have."""
+        """Return an object of every axis, None if the drive does not have it."""
         if key in self._unreadable:
             return None
         try:
@@ -242,7 +242,7 @@ def quantity_of(entry: Entry, raw: int, scale: Scale) -> ShownQuantity:
 
 
 def axis_label(drives: Drives, description: Description, axis: int) -> str:
-    """Return what people call an axis: its node and its number there, or its number alone."""
+    """Return the axis' name for display: node and axis there, or the axis' number alone."""
     if drives.bus is None:
         return f"axis {axis}"
     node, part = divmod(axis, description.num_axes)
@@ -250,7 +250,7 @@ def axis_label(drives: Drives, description: Description, axis: int) -> str:
 
 
 def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
-    """Return what an emulated machine tells besides the drive, nothing of a real one."""
+    """Return an emulated machine's temperatures and supply; () for a real one."""
     if drives.machine is None:
         return ()
     winding, stage = drives.machine.temperatures

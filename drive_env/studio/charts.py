@@ -39,7 +39,7 @@ class ChartLine:
 
 @dataclass(frozen=True)
 class ChartPanel:
-    """A panel: what is on its y axis with the unit, and fixed ends of it."""
+    """A panel: title and unit of its y axis, and fixed ends of it."""
 
     title: str
     low: float | None = None
@@ -49,7 +49,7 @@ class ChartPanel:
 def options(
     panels: Sequence[ChartPanel], x_title: str, lines: Sequence[ChartLine], *, logarithmic: bool = False
 ) -> dict[str, Any]:
-    """Return what ECharts takes; panels share their x axis."""
+    """Return the option object of ECharts; panels share their x axis."""
     count = max(1, len(panels))
     x_axis, y_axis, grid = [], [], []
     top, room = 10.0, 100.0 - 10.0 - 5.0
@@ -100,7 +100,7 @@ def _series(line: ChartLine) -> dict[str, Any]:
 
 
 def points(x: ArrayLike, y: ArrayLike) -> list[list[float | None]]:
-    """Return points of a line as JSON has them, thinned; what is not finite is a gap."""
+    """Return points of a line for JSON, thinned; non-finite values are gaps."""
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     every = max(1, math.ceil(len(xs) / MOST_POINTS))
     return [
@@ -110,7 +110,7 @@ def points(x: ArrayLike, y: ArrayLike) -> list[list[float | None]]:
 
 
 def chart(label: str, name: str, height: str = "clamp(280px, 42vh, 560px)") -> ui.echart:
-    """Return an empty chart; `label` says for screen readers what it shows, `name` is for tests."""
+    """Return an empty chart; `label` is its description for screen readers, `name` is for tests."""
     made = ui.echart(options([ChartPanel("")], "", []), renderer="svg")
     made.classes("studio-chart w-full").style(f"height: {height}")
     made.props(f'role="img" aria-label="{label}" data-test="{name}"')

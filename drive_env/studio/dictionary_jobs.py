@@ -1,4 +1,4 @@
-"""What the page Dictionary asks of the drives: values, writes, comparisons, backups, restores."""
+"""The jobs of the page Dictionary: values, writes, comparisons, backups, restores."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ AREAS = {
 
 
 class ShownValue(NamedTuple):
-    """A value as it is shown: raw, None where it cannot be read, and as text with its unit."""
+    """A value for display: raw, None where it cannot be read, and as text with its unit."""
 
     raw: int | str | None
     text: str
@@ -56,7 +56,7 @@ class ShownValue(NamedTuple):
 
 @dataclass(frozen=True)
 class Checked:
-    """What was entered for an object: the integer that it means, and how that reads."""
+    """A value entered for an object: its integer, and its text."""
 
     raw: int
     text: str
@@ -111,7 +111,7 @@ def shown(entry: Entry, raw: int | str, scale: Scale) -> str:
 
 
 def checked(entry: Entry, text: str, scale: Scale) -> Checked:
-    """Return what a text means for an object, before anything is sent.
+    """Convert a text to an object's value, checked before anything is sent.
 
     Raises:
         ValueError: For a text that is not a number, or a unit that does not fit.
@@ -126,7 +126,7 @@ def checked(entry: Entry, text: str, scale: Scale) -> Checked:
 
 
 def write(entry: Entry, raw: int, axis: int) -> Callable[[Drives], int]:
-    """Return the job that writes an object of an axis, and returns what it reads back."""
+    """Return the job that writes an object of an axis, and returns the value read back."""
 
     def job(drives: Drives) -> int:
         key = (entry.index, entry.sub)
@@ -155,7 +155,7 @@ def factory(known: Description) -> dict[Key, int]:
 
 
 class _DescriptionAlone:
-    """What `parameters` asks of drives: their description."""
+    """The part of drives that `parameters` needs: their description."""
 
     def __init__(self, description: Description) -> None:
         self.description = description
@@ -177,7 +177,7 @@ def backup(known: Description, axis: int) -> Callable[[Drives], str]:
 
 
 def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
-    """Return the parameters of a file that was handed in; ValueError for what is none."""
+    """Return the parameters of an uploaded file; ValueError if it has none or is damaged."""
     with _as_file(content, name) as path:
         return load_parameters(path, known.dictionary)
 
@@ -185,7 +185,7 @@ def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
 def restore(
     known: Description, content: bytes, name: str, axis: int, *, unchecked: bool, other_drive: bool
 ) -> Callable[[Drives], list[Difference]]:
-    """Return the job that writes a backup, all or none, as `drive-env restore` does; it returns what was changed.
+    """Return the job that writes a backup, all or none, as `drive-env restore` does; it returns the changes.
 
     Args:
         known: The device.
@@ -212,7 +212,7 @@ def restore(
 
 @contextmanager
 def _as_file(content: bytes, name: str) -> Iterator[Path]:
-    """Yield what was handed in as a file of its name."""
+    """Yield an uploaded content as a file of its name."""
     with tempfile.TemporaryDirectory(prefix="drive-env-studio-") as folder:
         path = Path(folder) / (Path(name).name or "parameters.toml")
         path.write_bytes(content)

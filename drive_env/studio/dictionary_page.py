@@ -178,7 +178,7 @@ class DictionaryPanel:
             self._draw()
 
     async def _read_visible(self) -> None:
-        """Read what can be seen, some at a time."""
+        """Read the visible objects, some at a time."""
         visible = [key for key in self._visible if key in self._rows]
         if self._is_reading or not visible or self._session.job is not None or self._session.state != "open":
             return

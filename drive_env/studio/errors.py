@@ -1,11 +1,11 @@
-"""What jobs of the studio end with."""
+"""Errors that end jobs of the studio."""
 
 from __future__ import annotations
 
 
 class JobStoppedError(KeyboardInterrupt):
-    """Raised in a job that was stopped from a page; as after Ctrl-C, what it changed is put back on its way out."""
+    """Raised in a job that was stopped from a page; as after Ctrl-C, the job puts its changes back on its way out."""
 
 
 class JobEndedError(RuntimeError):
-    """What whoever waits for a job gets that was stopped."""
+    """A job was stopped; raised where its result is waited for."""

@@ -15,7 +15,7 @@ _PLACES = (_PACKAGE / "messages.toml", _PACKAGE.parent / "docs" / "messages.toml
 
 
 class FaultText(NamedTuple):
-    """What an emergency is called, why it comes, and what to do."""
+    """An emergency's name, cause and remedy."""
 
     name: str
     cause: str

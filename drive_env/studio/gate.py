@@ -1,8 +1,8 @@
 """Who may use the studio: the host that is asked for, where a page comes from, and the token of other addresses.
 
-A page of another site must not command drives by the browser of whoever visits it: its requests carry its own Origin,
-and a name that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show a page of ours in a
-frame, where a click meant for it would be one of ours. Where the studio is open to the network a token is asked for
+A page of another site must not command drives by a visitor's browser: its requests carry its own Origin, and a name
+that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show a page of ours in a frame,
+where a click meant for it would be one of ours. Where the studio is open to the network a token is asked for
 once, by the address that is printed, and kept in a cookie.
 """
 
@@ -49,8 +49,8 @@ def checked_token(token: str) -> str:
     """Return a token; ValueError for one that is too short, or that an address cannot carry."""
     if len(token) < LEAST_TOKEN or not all(letter.isalnum() or letter in "-_" for letter in token):
         raise ValueError(
-            f"a token of {len(token)} characters is none: it takes {LEAST_TOKEN} or more letters, digits, - and _; "
-            "leave --token out, and one is made"
+            f"a token of {len(token)} characters is not valid: it takes {LEAST_TOKEN} or more letters, digits, - and "
+            "_; leave --token out, and one is made"
         )
     return token
 
@@ -123,7 +123,7 @@ class StudioGate:
 
 
 def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
-    """Return why a request is refused by its shape: what browsers never send, and others may read differently."""
+    """Return why a request is refused by its shape: browsers never send it, and others may read it differently."""
     if twice := [name for name in ONCE if names.count(name) > 1]:
         return 400, f"The request has {names.count(twice[0])} {twice[0].capitalize()} headers; it may have one."
     if path.startswith("//") or "\\" in path or not path.isprintable():

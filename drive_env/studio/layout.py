@@ -1,4 +1,4 @@
-"""What every page has around its content: navigation, the state of the axis, the present job, and the quick stop."""
+"""The frame of every page: navigation, the state of the axis, the present job, and the quick stop."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _axis_choice(session: Session, visitor: Visitor, page: StudioPage) -> None:
 
 
 def _job_chip(session: Session) -> None:
-    """Show what is under way, with a button that ends it."""
+    """Show the present job, with a button that ends it."""
     with ui.row().classes("studio-job") as row:
         ui.spinner(size="sm").props('aria-hidden="true"')
         text = ui.label("")
@@ -166,7 +166,7 @@ def _stop_button() -> None:
 
 
 def _tell_events(session: Session, visitor: Visitor) -> None:
-    """Show on this page what happens from now on."""
+    """Show events on this page from now on."""
     seen = session.num_events
 
     def look() -> None:

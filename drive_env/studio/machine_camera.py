@@ -1,4 +1,4 @@
-"""The picture of the emulated machine as it moves: drawn in a thread of its own, only while somebody looks.
+"""The picture of the emulated machine as it moves: drawn in a thread of its own, only while a page shows it.
 
 Without a graphics card a picture costs some milliseconds of a core; the time between two of them follows what they
 cost, so that drawing takes a set share of a core at most. A machine that stands still costs nothing.

@@ -1,4 +1,4 @@
-"""What the page Machine asks of emulated machines, each a job: parameters, torque, supply, faults."""
+"""The jobs of the page Machine on emulated machines: parameters, torque, supply, faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page Machine: the emulated load as it moves, its parameters, what acts on it, and what fails."""
+"""The page Machine: the emulated load as it moves, its parameters, loads, supply and faults."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _cameras: weakref.WeakKeyDictionary[Session, MachineCamera] = weakref.WeakKeyDic
 
 
 class KnownMachine(NamedTuple):
-    """What is read of the machine once: rows of parameters, meanings, faults it can have, torque's unit and range."""
+    """Properties of the machine read once: rows of parameters, meanings, possible faults, torque's unit and range."""
 
     rows: dict[str, Any]
     meanings: dict[str, str]
@@ -80,7 +80,7 @@ async def _until_closed(line: WebSocket) -> None:
 
 
 def know(machine: Machines) -> KnownMachine:
-    """Return what is read of a machine once."""
+    """Read the properties of a machine that do not change."""
     from drive_env.pictures.demonstration import rated_load_torque
 
     made = machine.drives

@@ -1,4 +1,4 @@
-"""What the page Axes asks of the drives, each a job: a function of the drives."""
+"""The jobs of the page Axes, each a function of the drives."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def end_turn(axis: int) -> MotionJob:
 
 
 def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
-    """Return the integer that a text means for an object of an axis, within its range; ValueError for what is none."""
+    """Parse a text as an object's integer of an axis; ValueError for a text that is not one, or beyond its range."""
     known: Description = session.description
     entry = known.dictionary.find(name)
     raw = quantities.parse(text, entry, session.scales[axis])

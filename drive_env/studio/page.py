@@ -1,4 +1,4 @@
-"""A page of the studio, as a row: where it is, what it is called, and what makes it."""
+"""A page of the studio, as a row: its address, its title, and the function that makes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The thread of the pages: what a page computes delays other pages, but neither the quick stop nor a page's life line.
+"""The thread of the pages: a page's computation delays other pages, but neither the quick stop nor a page's life line.
 
 The web server takes requests in one event loop, in which nothing is computed; the pages live in another one, of a
 thread of its own.
@@ -45,7 +45,7 @@ class PagesThread:
             await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(there, self.loop))
 
     def close(self) -> None:
-        """End the thread once it is through with what it does; nobody waits for it."""
+        """End the thread after its current work, without waiting for it."""
         self.loop.call_soon_threadsafe(self.loop.stop)
 
 

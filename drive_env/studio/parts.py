@@ -20,7 +20,7 @@ class StudioPart:
     Attributes:
         page: Path of the page.
         order: Its place among the parts, from above.
-        build: Makes it into the present element; what it is given is said by the page that takes parts.
+        build: Makes it into the present element; the page that takes parts defines the arguments.
     """
 
     page: str

@@ -1,4 +1,4 @@
-"""Which browser pages are there, and what each has set in motion: a motion lasts as long as its page says so.
+"""The open browser pages, and their motions: a motion lasts as long as its page says so.
 
 A page sends a beat every tenth of a second, and which button it holds. A page that is closed says goodbye, or its
 connection ends; one whose browser sleeps, or whose computer does, is silent. What moves by a job lasts as long as the
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 Mask = NDArray[np.bool_]
 
 HOLD = 0.5  # s without a beat after which what a page holds is stopped
-ASLEEP = 2.0  # s without a beat after which what a page has set in motion for as long as it is there is stopped
+ASLEEP = 2.0  # s without a beat after which a page's motions that last as long as it is there are stopped
 ABANDONED = 5.0  # s without any page after which an axis that is enabled is stopped and disabled
 
 
 @dataclass
 class PageMotion:
-    """What a page has set in motion.
+    """A motion of a page.
 
     Attributes:
         number: Of this motion.
@@ -54,7 +54,7 @@ class Presence:
         self._last = time.monotonic()
 
     def beat(self, page: str, held: int = 0) -> None:
-        """Take note that a page is there, and which motion it holds, 0 for none."""
+        """Note that a page is there, and which motion it holds, 0 for none."""
         now = time.monotonic()
         with self._lock:
             self._beats[page] = self._last = now
@@ -63,7 +63,7 @@ class Presence:
                     motion.beat = now
 
     def leave(self, page: str) -> None:
-        """Take note that a page is gone: what it has set in motion is overdue at once."""
+        """Expire the page's motions immediately."""
         with self._lock:
             self._beats.pop(page, None)
             for motion in self._motions.values():
@@ -86,7 +86,7 @@ class Presence:
             return motion
 
     def end_of_page(self, page: str, axes: Mask) -> None:
-        """Take note that a page has ended what it had set in motion for as long as it is there, on some axes."""
+        """Note that the end of a page ended its motions that last as long as it is there, on some axes."""
         with self._lock:
             for number, motion in list(self._motions.items()):
                 if motion.page == page and not motion.held and np.any(motion.axes & axes):
@@ -94,7 +94,7 @@ class Presence:
                     motion.why = motion.why or "ended"
 
     def end_all(self, axes: Mask) -> None:
-        """Take note that axes are stopped: nothing of them goes on."""
+        """Note that axes are stopped: nothing of them goes on."""
         with self._lock:
             for number in [n for n, motion in self._motions.items() if np.any(motion.axes & axes)]:
                 motion = self._motions.pop(number)

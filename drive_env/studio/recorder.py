@@ -1,4 +1,4 @@
-"""What is sampled of the drives, in a ring: the newest minutes of some objects, at every communication cycle."""
+"""Samples of the drives, in a ring: the newest minutes of some objects, at every communication cycle."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class SampleRing:
 
 
 class ScopeRecorder:
-    """Keeps what is sampled, whoever lets time pass; read by any thread.
+    """Keeps the samples of every call that lets time pass; read by any thread.
 
     Args:
         num_axes: Of the drives.
@@ -108,7 +108,7 @@ class ScopeRecorder:
 
     @property
     def objects(self) -> tuple[Key, ...]:
-        """What is wanted of each cycle."""
+        """The objects to sample in each cycle."""
         return self._objects
 
     @objects.setter

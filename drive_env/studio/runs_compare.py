@@ -1,4 +1,4 @@
-"""Two runs side by side: what their settings and certificates say, and where they differ."""
+"""Two runs side by side: the entries of their settings and certificates, and the differences."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Run:
 
 
 def kind_of(path: Path) -> str:
-    """Return what a file is, by its ending."""
+    """Return a file's kind by its ending: report, picture, film, text or other."""
     ending = path.suffix.lower()
     for kind, endings in (("report", REPORTS), ("picture", PICTURES), ("film", FILMS), ("text", TEXTS)):
         if ending in endings:
@@ -85,7 +85,7 @@ def list_runs(root: Path = RUNS) -> list[Run]:
 
 
 def find_run(name: str, root: Path = RUNS) -> Run | None:
-    """Return the run of a name, None if there is none."""
+    """Return the run of a name, None if there is no such run."""
     try:
         path = confined(name, root)
     except ValueError:

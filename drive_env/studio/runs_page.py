@@ -1,4 +1,4 @@
-"""The page Runs: what tuners, sweeps and trainings left in `runs/`; reports, pictures, films, comparisons."""
+"""The page Runs: results of tuners, sweeps and trainings in `runs/`; reports, pictures, films, comparisons."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class RunsPanel:
         ui.timer(REFRESH, self._look, immediate=True)
 
     async def _look(self) -> None:
-        """Look at the folder, and show what is new."""
+        """Look at the folder, and show its changes."""
         found = await run.io_bound(list_runs, RUNS)
         wanted = str(self._find.value or "").lower()
         runs = [one for one in found or [] if wanted in one.name.lower()]
@@ -157,7 +157,7 @@ class RunsPanel:
 
 
 def _what(run: Run) -> str:
-    """Return what a run has, in a few words."""
+    """Summarise a run's files in a few words."""
     found = [
         f"{len(run.of(kind))} {kind}{'s' * (len(run.of(kind)) > 1)}"
         for kind in ("report", "picture", "film")

@@ -1,4 +1,4 @@
-"""What the units of each axis follow, of emulated drives and of those of a bus alike."""
+"""The scales of each axis' units, of emulated drives and of those of a bus alike."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class _Described:
-    """Emulated drives with what `scales_of` asks of those of a bus."""
+    """Emulated drives with the parts that `scales_of` needs of those of a bus."""
 
     def __init__(self, drives: Drives, description: Description) -> None:
         self.description = description
@@ -21,5 +21,5 @@ class _Described:
 
 
 def axis_scales(drives: Drives, description: Description) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it; it is asked."""
+    """Read the scales of every axis from the drives, as far as they have them."""
     return scales_of(cast(Any, _Described(drives, description)))

@@ -208,7 +208,7 @@ class ScopePanel:
             ui.run_javascript(f"studioScope.keep({json.dumps(names)})")
 
         def kept(event: GenericEventArguments) -> None:
-            """Show what this browser showed last, as far as the drive has it."""
+            """Show the channels that this browser showed last, as far as the drive has them."""
             keys = [(int(name[:4], 16), int(name[5:], 16)) for name in event.args]
             there = [key for key in keys if key in self._entries][:MOST_CHANNELS]
             if there:

@@ -19,7 +19,7 @@ _STATES = np.array([-1 if (state := cia402.state_of(word)) is None else int(stat
 
 @dataclass(frozen=True)
 class ScopeTrigger:
-    """What starts a picture.
+    """The condition that starts a picture.
 
     Attributes:
         kind: A name of `EDGES`.

@@ -1,4 +1,4 @@
-"""What one page's scope shows: channels in their units, rolling or from a trigger on, and recordings to keep.
+"""The scope of one page: channels in their units, rolling or from a trigger on, and recordings to keep.
 
 It reads the recorder, and touches no drive.
 """
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 MOST_CHANNELS = 8
 WINDOWS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0)  # s
 MODES = {"roll": "rolling", "auto": "auto", "normal": "normal", "single": "single"}
-AUTO_WAIT = 1.0  # s without a trigger after which auto shows what there is
+AUTO_WAIT = 1.0  # s without a trigger after which auto shows the samples there are
 STEPS = 65_000  # of the integers that a value becomes on its way to the page
 
 
@@ -108,7 +108,7 @@ class ScopeView:
         self.arm()
 
     def halt(self) -> None:
-        """Keep what is shown."""
+        """Keep the recording on display."""
         if self.is_running and self.kept is None:
             self.kept = self._rolling()
         self.is_running = False
@@ -120,18 +120,18 @@ class ScopeView:
         self._fired_at = self._recorder.now
 
     def keep_as_reference(self) -> bool:
-        """Lay what is shown under what comes; return whether there was something."""
+        """Keep the current traces as dashed reference; return whether there were any."""
         shown = self.shown()
         self.reference = shown if len(shown.t) else None
         return self.reference is not None
 
     def shown(self) -> ScopeRecording:
-        """Return what is shown, at every sample."""
+        """Return the recording on display, at every sample."""
         return self.kept if self.kept is not None else self._rolling()
 
     @property
     def status(self) -> str:
-        """What it is doing, in a word or two."""
+        """Its state, in a word or two."""
         if not self.is_running:
             return "halted"
         if self.mode == "roll":
@@ -228,7 +228,7 @@ class ScopeView:
         return struct.pack("<I", len(text)) + text + b"".join([*blobs, *more])
 
     def _traces(self, recording: ScopeRecording, first: int) -> tuple[list[dict[str, Any]], list[bytes]]:
-        """Return what the header says of each channel's trace, and its integers."""
+        """Return each channel's trace as entries of the header and as integers."""
         traces, blobs = [], []
         stride = stride_of(len(recording.t), self.columns)
         for channel, values in recording.values:

@@ -1,4 +1,4 @@
-"""What went wrong as one plain sentence with its remedy, for people at a web page."""
+"""Errors as one plain sentence with the remedy, for people at a web page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 
 logger = logging.getLogger(__name__)
 
-# Remedies that are Python's, and what they are on a page.
+# Remedies for Python, and their forms on a page.
 _REMEDIES = (
     ("; see emergencies(), then reset_fault()", "; see the faults on the page Axes, then reset them"),
     ("; see emergencies()", "; see the faults on the page Axes"),

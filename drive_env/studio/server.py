@@ -78,7 +78,7 @@ class Studio:
             return Response(status_code=307, headers={"location": first})
 
     async def live(self, line: WebSocket, page: str) -> None:
-        """Hear a page's beats until it is gone: what it has set in motion ends with it."""
+        """Receive a page's beats until it is gone: its motions end with it."""
         await line.accept()
         held: dict[int, int] = {}  # the page's number of a button that is held -> of its motion
         presence = self.session.presence
@@ -143,7 +143,7 @@ class StudioServer(uvicorn.Server):
         self._stop = stop
 
     def handle_exit(self, sig: int, frame: FrameType | None = None) -> None:
-        """Stop the drives, then end; a second Ctrl-C waits for nobody.
+        """Stop the drives, then end; a second Ctrl-C ends without waiting.
 
         Uvicorn would raise the signal once more at its end: the process would die before the drives are closed.
         """
@@ -152,13 +152,13 @@ class StudioServer(uvicorn.Server):
         self.should_exit = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End the connections and the pages, and go on without what does not end."""
+        """End the connections and the pages, and go on without those that do not end."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(super().shutdown(sockets), LONGEST_END)
 
 
 def web_app(studio: Studio, host: str, port: int, token: str | None) -> StudioGate:
-    """Return the whole application: behind the gate, what waits for no page, and the pages."""
+    """Return the whole application: behind the gate, quick stop and life lines, and the pages."""
     own, pages = _stops(studio), PagesThread(_pages(studio))
 
     async def behind(scope: Scope, receive: Receive, send: Send) -> None:
@@ -168,7 +168,7 @@ def web_app(studio: Studio, host: str, port: int, token: str | None) -> StudioGa
 
 
 def _stops(studio: Studio) -> FastAPI:
-    """Return what waits for no page: the quick stop, and the life lines."""
+    """Return the web application that does not wait for pages: quick stop and life lines."""
     web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @web.post(QUICK_STOP)
@@ -229,7 +229,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def address(host: str, port: int, token: str | None) -> str:
-    """Return what a browser opens."""
+    """Return the address to open in a browser."""
     shown = f"[{host}]" if ":" in host else host
     if not is_loopback(host) and host in ("0.0.0.0", "::"):
         shown = socket.gethostname()
@@ -251,7 +251,7 @@ def serve_studio(
 
     Args:
         session: The drives; they are opened here.
-        pages: What there is to see.
+        pages: The pages.
         sock: Listens already.
         terms: How.
         ready: Called before the first request is served.

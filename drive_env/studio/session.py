@@ -57,7 +57,7 @@ WATCH = 0.2  # s between two looks whether the drives' thread has stopped what i
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """Something that happened: when (time of day [s]), how grave (info, warning, error), and what."""
+    """An event: when (time of day [s]), how grave (info, warning, error), and its text."""
 
     at: float
     level: str
@@ -66,7 +66,7 @@ class SessionEvent:
 
 @dataclass(eq=False)
 class Job:
-    """A function of the drives, and what becomes of it.
+    """A function of the drives, and its result.
 
     Attributes:
         title: What it does, in a few words.
@@ -90,7 +90,7 @@ class Job:
     is_told: bool = False  # whether it has been stopped by an exception: what it puts back then must get through
 
     def refuse(self, error: BaseException) -> None:
-        """End it before it begins; whoever asked for it may have given it up."""
+        """End it before it begins; the page that asked for it may have given it up."""
         if self.future.set_running_or_notify_cancel():
             self.future.set_exception(error)
 
@@ -100,7 +100,7 @@ class Session:
 
     Args:
         open_drives: Opens the drives, in the thread that will use them.
-        title: What they are, for people.
+        title: Their name, for people.
         description: Of the device.
         address: How drives of a bus were opened: interface, channel, nodes, bitrate; empty for emulated ones.
 
@@ -157,7 +157,7 @@ class Session:
         self._watch.start()
 
     def close(self) -> None:
-        """Stop what moves, close the drives, end the thread."""
+        """Stop moving axes, close the drives, end the thread."""
         if self.state == "closed":
             return
         self.stop_now("the studio ends")
@@ -174,9 +174,9 @@ class Session:
         """Have a function of the drives run in their thread, after those that were asked for before.
 
         Args:
-            function: What to do; it may let time pass, and is ended by an exception when somebody stops it.
+            function: What to do; it may let time pass, and is ended by an exception when the job is stopped.
             title: What it does, in a few words: "Move axis 0".
-            page: Who wants it; what moves by it stops when that page is gone. "" for no page.
+            page: Who wants it: its motion stops when that page is gone. "" for no page.
             paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
             quiet: Whether pages do not show it: one of many that only read.
 
@@ -212,7 +212,7 @@ class Session:
         """Quick-stop every axis at once, and end the job that is under way and those that wait.
 
         It does not wait for the job, nor long for anything else: those of a bus are commanded by the supervisor of
-        their envelope; emulated axes here, or by whoever lets their time pass, before the next piece of it.
+        their envelope; emulated axes here, or by the thread that lets their time pass, before the next piece of it.
         """
         with self._waiting:
             self._stop_asked = reason
@@ -250,7 +250,7 @@ class Session:
         self._look()
 
     def glimpse(self, function: Callable[[Machines], T], patience: float = 1.0) -> T | None:
-        """Return what a function reads of emulated machines between two pieces of time; None if there is no moment.
+        """Return the result of a function of emulated machines between two pieces of time; None if there is no moment.
 
         Any thread may call it. It only looks: what changes a machine is a job.
 
@@ -267,13 +267,13 @@ class Session:
             shared.lock.release()
 
     def say(self, level: str, text: str) -> None:
-        """Add to what happened: level info, warning or error."""
+        """Add an event: level info, warning or error."""
         self.events.append(SessionEvent(time.time(), level, text))
         self.num_events += 1
 
     @property
     def job(self) -> Job | None:
-        """What is under way."""
+        """The present job, None without one."""
         return self._current
 
     @property
@@ -288,16 +288,16 @@ class Session:
 
     @property
     def axes(self) -> Sequence[AxisState]:
-        """What is known of every axis; empty before the drives are open."""
+        """The state of every axis; empty before the drives are open."""
         return () if self._states is None else self._states.axes
 
     @property
     def scales(self) -> Sequence[Scale]:
-        """What the units of each axis follow; empty before the drives are open."""
+        """The scales of each axis' units; empty before the drives are open."""
         return () if self._states is None else self._states.scales
 
     def forget_faults(self, axis: int) -> None:
-        """Take note that the faults of an axis were reset."""
+        """Note that the faults of an axis were reset."""
         if self._states is not None:
             self._states.forget_faults(axis)
 
@@ -350,7 +350,7 @@ class Session:
             self._end()
 
     def _read_stored(self) -> None:
-        """Read the parameters of every axis: after a start they are what the drive has stored."""
+        """Read the parameters of every axis: after a start they are the stored ones."""
         assert self._drives is not None
         drives = self._drives
         self.stored = {axis: {} for axis in range(self.num_axes)}
@@ -432,7 +432,7 @@ class Session:
                 self.say("error", told)
 
     def _tell_stop(self, error: SafetyError) -> None:
-        """Say why the envelope has stopped the drives, unless that was asked for a moment ago, and is told."""
+        """Report why the envelope has stopped the drives, unless a requested stop was reported a moment ago."""
         if time.monotonic() - self._told_at > STOP_WAIT or not str(error).startswith(self._told_reason):
             self.say("error", sentence(error))
 
@@ -456,7 +456,7 @@ class Session:
             raise JobStoppedError(job.stopped)
 
     def _end_if_left(self, job: Job) -> None:
-        """End a job that moves axes and whose page is gone, or silent, and stop what it moves."""
+        """End a job that moves axes and whose page is gone, or silent, and stop these axes."""
         if why := self._why_left(job):
             assert self._drives is not None
             job.stopped = why
@@ -470,7 +470,7 @@ class Session:
         return self.presence.why_gone(job.page) if moves and job is not None and job.page else ""
 
     def _watch_pages(self) -> None:
-        """Stop everything where the drives' thread does not stop what is overdue: a call of its takes too long.
+        """Stop everything where the drives' thread does not stop overdue motions: a call of its takes too long.
 
         On a bus set-points are played in one call, however long that takes.
         """
@@ -489,7 +489,7 @@ class Session:
         return "" if self._current is None else self._current.stopped
 
     def _await_rest(self) -> None:
-        """Let emulated axes come to rest: what a stopped job puts back takes their voltage away, and they would coast.
+        """Let emulated axes come to rest: a stopped job's clean-up takes their voltage away, and they would coast.
 
         Drives of a bus are brought to rest by the supervisor of their envelope.
         """
@@ -504,7 +504,7 @@ class Session:
                 waited += PIECE
 
     def _obey(self) -> None:
-        """Do what `stop_now` asks of this thread."""
+        """Carry out a `stop_now` in this thread."""
         reason, self._stop_asked = self._stop_asked, ""
         now = time.monotonic()
         if now - self._told_at > TOLD_ONCE:  # a page has two ways to ask
@@ -513,7 +513,7 @@ class Session:
         self._stop(np.ones(self.num_axes, bool))
 
     def _leave_alone(self, job: Job | None) -> None:
-        """Stop and disable everything, since nobody looks at an axis that is enabled."""
+        """Stop and disable everything, since no page shows an axis that is enabled."""
         if not self._is_left:
             self._is_left = True
             self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")

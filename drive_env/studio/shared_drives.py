@@ -73,7 +73,7 @@ class SharedDrives:
         drives: The drives, emulated or on a bus.
         recorder: Keeps what is sampled.
         look: Called between two pieces of time, by the thread whose calls these are; it may raise, which ends them.
-        hear: Called with emergencies, whoever asked for them.
+        hear: Called with all emergencies that were read.
         moves: Returns whether a page moves an axis by a button that it holds, or as long as it is there.
         stopped: Returns why the job under way was stopped, "" if it was not. It hears of that once, by `look`, so that
             it can put back what it changed. Until it has ended it has no axis operate any more, and the envelope's own
@@ -118,7 +118,7 @@ class SharedDrives:
 
     @property
     def device(self) -> Device | None:
-        """What the drives are."""
+        """The device that the drives are."""
         return self._drives.device
 
     @property
@@ -133,12 +133,12 @@ class SharedDrives:
 
     @property
     def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
+        """The envelope around drives that may be real."""
         return self._drives.safety
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called."""
+        """Each axis' number."""
         return self._drives.axis_numbers
 
     @property
@@ -201,7 +201,7 @@ class SharedDrives:
         return self._in_pieces(asked, duration, play, period, duration if play else BUS_PIECE)
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies of the drives since the last call."""
         with self.lock:
             found = self._drives.emergencies()
         if found:
@@ -227,7 +227,7 @@ class SharedDrives:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _calling(self, call: Callable[[], T]) -> T:
-        """Return what a call of the drives returns; it is made again if the envelope tells what a job knows already."""
+        """Call a function of the drives and return its result; again if the envelope reports what the job knows."""
         try:
             return call()
         except SafetyError:
@@ -266,7 +266,7 @@ class SharedDrives:
         play: Mapping[Any, ArrayLike] | None,
         period: float,
     ) -> Trace:
-        """Let a piece of time pass, with as much of what the recorder wants as can be sampled besides."""
+        """Let a piece of time pass, with as many of the recorder's objects as can be sampled besides."""
         wanted = self._recorder.objects
         while (chosen := (*asked, *wanted)) in self._refused and wanted:
             wanted = wanted[:-1]
@@ -288,7 +288,7 @@ class SharedDrives:
         return trace
 
     def _begin(self) -> float:
-        """Return when what passes now begins [s]: right after what passed before, unless there was a gap."""
+        """Return when the time that passes now begins [s]: right after the last piece, unless there was a gap."""
         before = self._recorder.now
         if self._drives.time_waits:
             return before

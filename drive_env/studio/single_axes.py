@@ -1,4 +1,4 @@
-"""Drives, emulated or on a bus, with what the commands for parameters ask of those of a bus: one axis at a time.
+"""Drives, emulated or on a bus, with the parts that commands for parameters need of a bus: one axis at a time.
 
 What is written goes through the Drives interface, and so through its envelope.
 """
@@ -51,16 +51,16 @@ class SingleAxes:
         self._drives.write((entry.index, entry.sub), value, where=np.arange(self.num_axes) == axis)
 
     def sdo(self, node: int) -> _Objects:
-        """Return what reads the objects of a node as bytes."""
+        """Return the reader of a node's objects as bytes."""
         return _Objects(self, node)
 
     def as_bus(self) -> BusDrives:
-        """Return these as what the functions of `master/parameters.py` take."""
+        """Return these for the functions of `master/parameters.py`."""
         return cast("BusDrives", self)
 
 
 class _Objects:
-    """Reads objects of a node as bytes: for what a node says of itself."""
+    """Reads objects of a node as bytes: for its identity."""
 
     def __init__(self, axes: SingleAxes, node: int) -> None:
         self._axes = axes

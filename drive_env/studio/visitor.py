@@ -37,19 +37,19 @@ class Visitor:
 
     @property
     def id(self) -> str:
-        """What tells it from other pages."""
+        """The page's identifier."""
         return self.client.id
 
     @property
     def state(self) -> AxisState | None:
-        """What is known of its axis; None before the drives are open."""
+        """The state of its axis; None before the drives are open."""
         axes = self.session.axes
         return axes[self.axis] if self.axis < len(axes) else None
 
     async def do(
         self, function: Callable[[Drives], T], title: str, *, paced: bool = True, quiet: bool = False
     ) -> T | None:
-        """Have a job run and return what it returns; None where it failed, which the page shows then."""
+        """Run a job and return its result; None if it failed, which the page then shows."""
         future = self.session.do(function, title, page=self.id, paced=paced, quiet=quiet)
         try:
             return await asyncio.wrap_future(future)

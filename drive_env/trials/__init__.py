@@ -1,1 +1,1 @@
-"""Moves and trials, and what they are worth: environments and tuning stand on these."""
+"""Moves and trials, and their scores: environments and tuning stand on these."""

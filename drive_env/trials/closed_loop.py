@@ -69,7 +69,7 @@ def swing_change(motor: Motor, inertia: Floats, current: Floats) -> Floats:
 
 
 class ClosedLoopTrial(NamedTuple):
-    """What a trial showed, as `gain_trial.Trial` has it."""
+    """The result of a trial, as `gain_trial.Trial` has it."""
 
     terms: Terms  # its disturbance is (1 + b/t_0): b is how long the axis is behind its demand
     following: Floats
@@ -235,7 +235,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > most)
 
     def _following_scale(self, move: Move) -> Floats:
-        """Return over what the integral of |demand - encoder| counts [inc]."""
+        """Return the scale of the integral of |demand - encoder| [inc]."""
         return np.maximum(np.abs(move.distance), 1).astype(float)
 
     def _close(self, where: Mask, longest: float) -> None:

@@ -1,7 +1,7 @@
-"""The position demand of a move in pp: as the drive has it, or as it follows from what was written to it.
+"""The position demand of a move in pp: as the drive has it, or computed from the profile written to it.
 
 Some drives have no 6062h among their process data. Their demand is computed then, from the profile that was written. It
-is that of the drive to about a millisecond: when exactly a set-point that is written by SDO began to act, nobody tells.
+is that of the drive to about a millisecond: the moment at which a set-point written by SDO takes effect is not known.
 """
 
 from __future__ import annotations

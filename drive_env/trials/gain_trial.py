@@ -54,7 +54,7 @@ LAG = 3  # ms by which a filtered speed may lag behind its rotor: a move has beg
 
 
 class Identified(NamedTuple):
-    """What a drive's own signals say of its machine, each of shape (num_axes,).
+    """Properties of a machine by the drive's own signals, each of shape (num_axes,).
 
     Inertia is measured over the torque constant, and given with that of the data sheet.
     """
@@ -66,7 +66,7 @@ class Identified(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What a trial showed; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
+    """The result of a trial; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
 
     following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
     error: demand less actual of the move over its size, shape (TRIAL, num_axes).
@@ -91,7 +91,7 @@ class Trial(NamedTuple):
 
 
 def softness(known: GainSet, gains: Integers) -> Floats:
-    """Return what the integral of the error after a load step is proportional to, (num_axes,).
+    """Return a number proportional to the integral of the error after a load step, (num_axes,).
 
     No load step exists on a bus; but the integrators of a P-PI cascade leave it no choice: for a current i that the
     load takes, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
@@ -131,7 +131,7 @@ class Trials(Saved):
         self._t_0 = t_0
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the gains that are; return what that says, and where the axes began [inc].
+        """Move there and back with the present gains; return the identified axes, and where they began [inc].
 
         Args:
             reach: How far the rotors may turn from here, with the sign [rad], shape (num_axes,).
@@ -232,7 +232,7 @@ class Trials(Saved):
         start(self._drives, _on_the_counter(target), where)
 
     def leave(self) -> None:
-        """Give the drives back what trials have changed besides gains and profiles; the axes must be disabled."""
+        """Put back all that trials have changed in the drives besides gains and profiles; the axes must be disabled."""
 
     def down(self) -> Mask:
         """Return which axes are not enabled."""
@@ -278,7 +278,7 @@ class Trials(Saved):
         return np.asarray(shakes(current, self._motor.rated_current))
 
     def _prepare(self, objects: list[Any]) -> None:
-        """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""
+        """Have a bus map the objects of a recording: in real time the 10 ms for it would miss samples of a move."""
         if not self._drives.time_waits:
             self._drives.record(objects, 0.0)
 

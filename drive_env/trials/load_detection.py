@@ -1,7 +1,7 @@
 """One trial of StallGuard threshold and CoolStep: moves at a working speed, without CoolStep, with it, and a probe.
 
 What is wanted of them is no false stall of the axis' own load, a stall that is seen before steps are lost, and less
-current. Nobody need push at the axis for it: the load reading is all but linear in cos d - sin d of the load angle d
+current. The axis need not be pushed for it: the load reading is all but linear in cos d - sin d of the load angle d
 (`load_reading.py`), so that a move tells the angle at which it would fall to 0; and the torque being the same, the
 current that CoolStep leaves is to the other as the sines of their load angles. Stop on stall is off meanwhile.
 
@@ -157,7 +157,7 @@ class LoadDetectionTrials(OpenLoopTrials):
         return np.where(seen, angle_of(np.where(seen, left, 0.0)), np.nan)
 
     def _terms(self, gains: Integers, plain: Steady, cooled: Steady, seen: Floats) -> OpenLoopTerms:
-        """Return the terms of a phase, (num_axes,) each; where nothing was seen the worst of what could be."""
+        """Return the terms of a phase, (num_axes,) each; without samples the worst that they could be."""
         one = np.ones(len(gains))
         angle = np.nan_to_num(cooled.settled, nan=0.5 * math.pi)
         left = np.sin(np.abs(plain.settled)) / np.maximum(np.sin(np.clip(np.abs(angle), 1e-3, 0.5 * math.pi)), 1e-3)

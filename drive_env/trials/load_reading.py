@@ -1,4 +1,4 @@
-"""What a stepper's load reading says in spread cycle: all but linear in the voltage that a falling phase gives back.
+"""A stepper's load reading in spread cycle: all but linear in the voltage that a falling phase gives back.
 
 Against its current i, at speed w, with the load angle d (electrical):
 
@@ -29,7 +29,7 @@ LIFT = 16  # steps of the threshold, by which a reading of 0 is lifted
 
 
 def lacks_load_detection(device: Device) -> str:
-    """Return what a device lacks for its load detection to be set, "" for nothing."""
+    """Return the parts that a device lacks for setting its load detection, "" for none."""
     if device.gains.column(*THRESHOLD) is None:
         return "its gains.toml has no threshold of a load detection"
     missing = [role.value for role in (Role.LOAD_VALUE, Role.STALL_SPEED) if role not in device.roles]
@@ -48,17 +48,17 @@ def flux(motor: Motor, run: Floats) -> Floats:
 
 
 def volts(motor: Motor, run: Floats, speed: float, angle: Floats) -> Floats:
-    """Return what a falling phase gives back [V], but for the resistance, which is alike at all speeds."""
+    """Return the voltage that a falling phase gives back [V], without the resistance's, equal at all speeds."""
     return np.asarray(speed * (motor.L_q * run * motor.n_p + flux(motor, run) * falls(angle)))
 
 
 def falls(angle: Floats | float) -> Floats:
-    """Return what of the reading is left at a load angle [rad]: 1 without load, 0 at 45 degrees, -1 at 90."""
+    """Return the share of the reading that is left at a load angle [rad]: 1 without load, 0 at 45 degrees, -1 at 90."""
     return np.asarray(np.cos(angle) - np.sin(angle))
 
 
 def angle_of(left: Floats) -> Floats:
-    """Return the load angle [rad] of which `falls` is so much; nan where it never is."""
+    """Return the load angle [rad] at which `falls` has a value; nan if it never has."""
     share = np.asarray(left, float) / math.sqrt(2.0)
     inside = np.abs(share) <= 1.0
     return np.where(inside, np.arccos(np.where(inside, share, 0.0)) - 0.25 * math.pi, np.nan)

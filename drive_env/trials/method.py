@@ -103,7 +103,7 @@ class Cascade(NamedTuple):
         return gains
 
     def trials(self, drives: Drives, axes: int) -> Trials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         return Trials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
@@ -161,7 +161,7 @@ class OpenLoop(NamedTuple):
         return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return the move of trials: with what friction and a constant load leave of the torque."""
+        """Return the move of trials, with the torque that friction and a constant load leave."""
         speed = SPEED_SHARE * self.motor.rated_speed
         taken = self.motor.torque_constant * (found.coulomb + np.abs(found.offset) + found.viscous * speed)
         share = acceleration_share(self.device, self.motor, taken)
@@ -188,7 +188,7 @@ class OpenLoop(NamedTuple):
         return kept
 
     def trials(self, drives: Drives, axes: int) -> OpenLoopTrials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         return OpenLoopTrials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
@@ -230,7 +230,7 @@ class ClosedStepper(NamedTuple):
         return OpenLoop(self.device, self.motor).highest()
 
     def first(self, supply: Floats) -> Integers:
-        """Return the rated current, and the loop's first values, or what the device is commissioned with for it."""
+        """Return the rated current with the loop's first values, or the commissioned values for it."""
         gains = OpenLoop(self.device, self.motor).first(supply)
         dictionary = self.device.new_dictionary()
         entries = [(dictionary.find(name), value) for name, value in self.device.preset(self.motor).items()]
@@ -247,7 +247,7 @@ class ClosedStepper(NamedTuple):
         return plan_overload(self.device, self.motor, found, scaler, reach)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return what the device is commissioned with: no rule knows such a loop."""
+        """Return the commissioned gains: no rule knows such a loop."""
         return self.first(supply)
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
@@ -266,7 +266,7 @@ class ClosedStepper(NamedTuple):
         return kept
 
     def trials(self, drives: Drives, axes: int) -> ClosedLoopTrials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         kind = PidTrials if self.loop.is_pid else ClosedLoopTrials
         return kind(drives, self.motor, axes, self.t_0(), self.loop)
 
@@ -289,7 +289,7 @@ class ClosedStepper(NamedTuple):
 
 
 class LoadSettings(NamedTuple):
-    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or what a load needs."""
+    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or that of a load."""
 
     device: Device
     motor: Motor
@@ -341,7 +341,7 @@ class LoadSettings(NamedTuple):
         return kept
 
     def trials(self, drives: Drives, axes: int) -> LoadDetectionTrials:
-        """Return what runs trials."""
+        """Return the trials of these drives."""
         return LoadDetectionTrials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
@@ -353,7 +353,7 @@ class LoadSettings(NamedTuple):
         return np.asarray(open_loop_cost(terms))
 
     def current(self, terms: Any) -> Floats:
-        """Return what CoolStep leaves of the rated current."""
+        """Return the share of the rated current that CoolStep leaves."""
         return np.asarray(np.sqrt(terms.effort))
 
     @property
@@ -374,7 +374,7 @@ def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Meth
 
 
 def check_tried(device: Device, names: tuple[str, ...]) -> None:
-    """Raise ValueError unless trials can tell what gains of these names do, before anything moves."""
+    """Raise ValueError, before anything moves, unless trials can show the effect of gains of these names."""
     if not names and not device.gains.outer:
         raise ValueError(
             f"{device.name} has no gains of a velocity or position loop and no phase currents, which trials could "
@@ -413,7 +413,7 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
 def new_score(
     device: str, load: Any, motor: Any, num_machines: int, *, gains: tuple[str, ...] = (), **options: Any
 ) -> RobustScore:
-    """Return what scores gains of a device on emulated machines; arguments as `RobustScore` has.
+    """Return the score of a device's gains on emulated machines; arguments as `RobustScore` has.
 
     With `gains`, names, that act in a closed loop alone it is closed.
     """

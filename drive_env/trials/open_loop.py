@@ -149,7 +149,7 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
 
 
 class OpenLoopTrial(NamedTuple):
-    """What a trial showed, as `gain_trial.Trial` has it; where an axis was stopped, it had lost steps or tripped.
+    """The result of a trial, as `gain_trial.Trial` has it; where an axis was stopped, it had lost steps or tripped.
 
     lost: Whether steps were lost, (phases, num_axes).
     """
@@ -179,7 +179,7 @@ def unmeasured(device: Device) -> str:
 
 
 def _highest(drives: Drives, name: int) -> float:
-    """Return the highest value of an object that drives take, less what a profile may be short of it."""
+    """Return the highest value of an object that drives take, less the shortfall that a profile may have."""
     high = device_of(drives).new_dictionary().find(name).high
     assert high is not None, "ramps and speeds are numbers"
     return HIGHEST_SHARE * high
@@ -191,7 +191,7 @@ def encoder_age(device: Device) -> float:
 
 
 def open_loop_softness(device: Device, gains: Integers) -> Floats:
-    """Return what the deflection by a load at rest is proportional to, (num_axes,): one over the standby current.
+    """Return a number proportional to the deflection by a load at rest, (num_axes,): one over the standby current.
 
     No load step exists on a bus; but a rotor in its field gives way by T / (n_p T_hold), and the holding torque follows
     from the current.
@@ -262,7 +262,7 @@ class OpenLoopTrials(Trials):
         super().recover(where)
 
     def _recorded(self) -> list[Any]:
-        """Return what trials record, all together: some drives change nothing of it while an axis is enabled."""
+        """Return the objects of a trial, all together: some drives change no mapping while an axis is enabled."""
         objects: list[Any] = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
         return [*objects, cia402.TORQUE_ACTUAL] if device_of(self._drives).gains.closed_loops else objects
 
@@ -288,7 +288,7 @@ class OpenLoopTrials(Trials):
                     drives.write(role, off, where=acting)
 
     def _watch_no_window(self) -> None:
-        """Take 6065h away, which drives have again that were switched on: what falls behind is seen by the encoder."""
+        """Switch 6065h off, which drives have again that were switched on: the encoder shows axes that fall behind."""
         drives = self._drives
         if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
             drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
@@ -302,7 +302,7 @@ class OpenLoopTrials(Trials):
                 drives.write(Role.LOOP_MODE, OPEN, where=closed)
 
     def leave(self) -> None:
-        """Give 606Ah and the loop's mode back what they were; the axes must be disabled."""
+        """Put 606Ah and the loop's mode back; the axes must be disabled."""
         if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
             self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
         for role, values in self._speeds.items():
@@ -321,9 +321,9 @@ class OpenLoopTrials(Trials):
         start(self._drives, wrapped(target + self.shift()).astype(np.int64), where)
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the currents that are; return what the load angle says, and where the axes began.
+        """Move there and back with the present currents; return the axes by their load angles, and their starts [inc].
 
-        How heavy the load is nobody knows: an axis that loses steps in moves for a light one makes slower ones, while
+        The weight of the load is unknown: an axis that loses steps in moves for a light one makes slower ones, while
         the others stand.
 
         Raises:
@@ -369,7 +369,7 @@ class OpenLoopTrials(Trials):
         self._zero = np.where(where, now, 0.0 if self._zero is None else self._zero)
 
     def _identify_by(self, move: Move, origin: Integers, reach: Floats, where: Mask) -> tuple[Identified, Floats, Mask]:
-        """Move there and back, and swing; return what was identified, the way of the encoder, and who lost steps."""
+        """Move there and back, and swing; return the identified axes, the encoder's way, and which axes lost steps."""
         drives, motor = self._drives, self._motor
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]
@@ -509,9 +509,9 @@ class OpenLoopTrials(Trials):
         self._fell = False
 
     def shift(self) -> Floats:
-        """Return what the step counter has more than the encoder [inc], by whole teeth of what it had at first.
+        """Return the step counter's lead over the encoder [inc], by whole teeth of its lead at first.
 
-        Only steps that were lost are made up for: what load and friction turn the rotor by in the field is not.
+        Only lost steps are made up for, not the angle by which load and friction turn the rotor in the field.
         """
         drives = self._drives
         now = wrapped(drives.read(cia402.POSITION_DEMAND) - drives.read(cia402.POSITION_ACTUAL))

@@ -119,7 +119,7 @@ def steps_of(move: Move, motor: Motor) -> Floats:
 
 
 def following_scale(move: Move, motor: Motor, loop: ClosedLoop) -> Floats:
-    """Return over what |demand - encoder| counts [inc]: a full step, of a PID alone the move."""
+    """Return the scale of |demand - encoder| [inc]: a full step, for a PID alone the move."""
     if loop.kind == PID_ALONE:
         return np.maximum(np.abs(move.distance), 1).astype(float)
     return steps_of(move, motor)

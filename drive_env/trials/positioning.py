@@ -40,7 +40,7 @@ BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is 
 
 
 class Move(NamedTuple):
-    """A positioning move: 607Ah from rest at 0, its speed and ramp, and what it is in SI, each of shape (num_axes,).
+    """A positioning move: 607Ah from rest at 0, its speed and ramp, and the same in SI, each of shape (num_axes,).
 
     share: Run current of the move over the rated one, of a stepper that is to be overloaded.
     """

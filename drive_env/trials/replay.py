@@ -102,7 +102,7 @@ class LogFit(NamedTuple):
         return self.narrowed[name] < UNSEEN
 
     def to_toml(self) -> str:
-        """Return the fitted set as `Distributions.load` reads it, with what was found as comments."""
+        """Return the fitted set as `Distributions.load` reads it, with the results of the fit as comments."""
         lines = [
             "# Fitted to a recorded move: the range of the machines that respond like it, 5th to 95th percentile.",
             f"# Distance (mean NRMSE): nominal machine {self.nominal:.4f}, best {self.distance[0]:.4f}, "
@@ -121,7 +121,7 @@ def read_log(path: str | Path) -> Log:
     """Return the log in a CSV of `drive-env scope`.
 
     Raises:
-        ValueError: For a file that is none, with the line.
+        ValueError: For an invalid file, with the line.
     """
     file = Path(path)
     if not file.is_file():
@@ -216,7 +216,7 @@ def command_of(log: Log) -> tuple[Key, str, Key]:
     """Return which object of a log is the command, the mode that plays it, and the object that it is played as.
 
     Raises:
-        ValueError: If there is none, naming those that can be, or if the log begins in the middle of a move.
+        ValueError: If it has no such object, naming the possible ones, or begins in the middle of a move.
     """
     speed = log.objects.get((cia402.VELOCITY_ACTUAL, 0))
     if speed is not None and np.any(np.abs(speed[0]) > AT_REST * np.maximum(np.ptp(speed, axis=0), 1)):

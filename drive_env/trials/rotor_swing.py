@@ -34,7 +34,7 @@ EXPLAINED = 0.85  # of the variance of a swing, that its fit must explain
 
 
 class FreeSwing(NamedTuple):
-    """What free swings say, (num_axes,) each: the inertia [kg m^2], and the least share of variance explained."""
+    """Results of free swings, (num_axes,) each: the inertia [kg m^2], and the least share of variance explained."""
 
     inertia: Floats
     explained: Floats
@@ -57,7 +57,7 @@ def inertia_of_swings(demand: Floats, position: Floats, held: Floats, age: float
 
 
 def _fit(motor: Motor, demand: Floats, position: Floats, held: Floats, age: float) -> tuple[Floats, Floats]:
-    """Return the angular frequency of small swings [rad/s], and what share of the variance it explains."""
+    """Return the angular frequency of small swings [rad/s], and the share of the variance that it explains."""
     axes = demand.shape[1]
     stiff = motor.n_p * float(np.mean(held)) / motor.inertia
     low, high = np.sqrt(stiff / MOST_INERTIA / STIFFNESS), np.sqrt(stiff / LEAST_INERTIA * STIFFNESS)
@@ -76,7 +76,7 @@ def _fit(motor: Motor, demand: Floats, position: Floats, held: Floats, age: floa
 
 
 def _errors(motor: Motor, omega: Floats, field: Floats, seen: Floats, held: float, age: float) -> Floats:
-    """Return the variance of the difference between swings of frequencies and what was seen, (omega, _PAIRS)."""
+    """Return the variance of the difference between swings of frequencies and the samples, (omega, _PAIRS)."""
     dt = 0.001 / SUBSTEPS
     square = omega[:, None] ** 2
     drag = motor.viscous * square / (motor.n_p * held)

@@ -102,7 +102,7 @@ class Variant(NamedTuple):
 
 
 def servo_variants(inertia_range: tuple[float, float] = INERTIA_RANGE) -> tuple[Variant, ...]:
-    """Return the variants of a servo's machine, whose load inertia may become these multiples of what it is."""
+    """Return the variants of a servo's machine, whose load inertia may become these multiples of its own."""
     low, high = inertia_range
     return (
         Variant("nominal"),
@@ -160,7 +160,7 @@ def cost(terms: Terms) -> Floats:
 
 
 def below_trip(raw: Floats, tripped: Mask) -> Floats:
-    """Return J below what a trip scores, or tripping early would pay, but so that what is worse still costs more."""
+    """Return J below the score of a trip, or tripping early would pay, but so that a worse result still costs more."""
     with np.errstate(divide="ignore"):
         bent = np.where(raw <= BENT, raw, TRIP - BENT**2 / raw)
     # Not finite: the axis left physics.
@@ -215,8 +215,8 @@ class CurrentSwings(NamedTuple):
 class RobustScore(Saved):
     """Scores gains on emulated machines: every variant of every machine is a machine of one set, run side by side.
 
-    The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
-    is none on this load (a stiffness where nothing is elastic) is left out.
+    The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant
+    without effect on this load (a stiffness where nothing is elastic) is left out.
 
     With one run of each variant, what is scored is partly the noise and the place: an axis that stands between two
     counts of its encoder may hunt where it rests in the middle of one. `repeats` runs of each, every one with a noise
@@ -348,7 +348,7 @@ class RobustScore(Saved):
         return self._constrained(self._scores(*self._run(gains)), gains)
 
     def _constrained(self, scores: Scores, gains: Integers) -> Scores:
-        """Return scores with what the constraints make of their performance."""
+        """Return scores with the constraints applied to their performance."""
         if not self._has_loops:
             return scores
         clearance, overshoot = self._clearance(gains, len(self.variants))
@@ -475,7 +475,7 @@ class RobustScore(Saved):
 
 
 class StepperScore(RobustScore):
-    """As `RobustScore`, of steppers: no loop tells what E_0 could be, so it is E_d with the baseline rule's gains."""
+    """As `RobustScore`, of steppers: no loop gives E_0, so it is E_d with the baseline rule's gains."""
 
     def score_rule(self, gains: Integers, where: Mask | None = None) -> Scores:
         """Take the baseline rule's gains for E_0 of the machines `where`; return their scores, with E_d/E_0 1."""

@@ -35,7 +35,7 @@ LATE = 0.02  # s: a load reading that is read by SDO in real time may be so much
 
 
 class Steady(NamedTuple):
-    """What the steady parts of moves there and back showed, of shape (num_axes,); nan where nothing was seen.
+    """The steady parts of moves there and back, of shape (num_axes,); nan where there were no samples.
 
     reading, lowest, spread: Mean, lowest and standard deviation of the load reading. angle, settled: Mean load angle
     against the motion, electrical [rad], and that of the last quarter. lost: Steps were lost. stopped: In fault.

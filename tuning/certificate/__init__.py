@@ -1,1 +1,1 @@
-"""What was found and changed, with the proof."""
+"""Certificates: results and changes of a tuning, with the proof."""

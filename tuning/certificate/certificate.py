@@ -1,4 +1,4 @@
-"""The certificate of a tuning: what was identified, changed and measured, with a hash that shows later changes.
+"""The certificate of a tuning: identified values, changes and measurements, with a hash that shows later changes.
 
 The hash is over the content, not over the file: indented otherwise or with its keys in another order it is the same
 certificate. It shows accidental changes; it is not a signature.
@@ -60,7 +60,7 @@ class StepResponse:
         reference, actual: Set-point and actual value, shape (n,).
         current: Actual current [A, peak i_q], shape (n,).
         figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "greatest dip [turns]" -> value;
-            nan where there is none. A disturbance exists on the emulator only.
+            nan for one that does not apply. A disturbance exists on the emulator only.
     """
 
     name: str
@@ -116,7 +116,7 @@ SEEN_KEPT = "kept where it was measured"  # a peak may lie where it was not
 
 @dataclass(frozen=True)
 class Requirement:
-    """What the dynamics ask of an axis, and what it has.
+    """A requirement of the dynamics, and the axis' value.
 
     Attributes:
         name: What is asked for, with its unit, e.g. "velocity loop, phase margin [deg]".
@@ -168,7 +168,7 @@ class AxisCertificate:
         frequency_responses: Open loops.
         dynamics: Name of the dynamics that were asked for, or their numbers.
         requirements: What these ask for, and whether it is kept.
-        figures: The `CROSSOVERS` of the loops; nan where there is none.
+        figures: The `CROSSOVERS` of the loops; nan without a crossover.
         corrections: Which gains gave way to which, and why, in their order.
         notes: What no integer reached, limits met, what was left out.
         hardware_seconds: Time that passed on the drive [s].

@@ -59,7 +59,7 @@ def is_unchanged(path: str | Path) -> bool:
     """Return whether a certificate.json, a stepper-certificate.json or a report.html is as it was written.
 
     Raises:
-        CertificateError: If the file is none of them.
+        CertificateError: If the file is another one.
     """
     where = Path(path)
     if where.suffix == ".html":
@@ -90,7 +90,7 @@ def _text(path: Path) -> str:
 
 
 def _built(kind: Any, data: Mapping[str, Any]) -> Any:
-    """Return a dataclass from what `_plain` made of it."""
+    """Return a dataclass from the plain data of `_plain`."""
     kinds = get_type_hints(kind)
     return kind(**{f.name: _value(kinds[f.name], data[f.name]) for f in fields(kind)})
 

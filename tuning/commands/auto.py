@@ -115,7 +115,7 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
 
 
 def _not_kept(target: Target) -> str:
-    """Return what to say of settings that a drive on a bus cannot store; "" where there is nothing to say."""
+    """Return the note on settings that a drive on a bus cannot store; "" where it can."""
     from tuning.snapshot import can_store
 
     if not target.bus or can_store(target):

@@ -1,4 +1,4 @@
-"""The command `drive-tune`: it only puts together what lies in `commands`, one file per command."""
+"""The command `drive-tune`: it assembles the commands of this folder, one file per command."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def drive_tune(version: Version = False, quiet: Quiet = False, verbose: Verbose 
     """Tune servo drives: emulated ones, and with --bus real ones, inside the safety envelope.
 
     Exit codes: 0 done, 1 the drive or the bus said no, 2 a mistake in the command, 130 Ctrl-C, 141
-    nobody takes the output any more.
+    the reader of the output has gone.
     """
     say_as_much(quiet, verbose)
 

@@ -180,7 +180,7 @@ def _on_machine(
     resume: bool,
     json: bool,
 ) -> None:
-    """Search on an emulated machine, write and print what was found."""
+    """Search on an emulated machine, write and print the result."""
     from tuning.runs import unfinished
     from tuning.runs.inputs import as_kept
 
@@ -198,9 +198,9 @@ def _on_machine(
 
 
 def _on_bus(given: DriveOptions, drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
-    """Search on the drives of a bus, write and print what was found.
+    """Search on the drives of a bus, write and print the result.
 
-    They are opened as they were given: the state before names their device for whoever undoes this another day.
+    They are opened as they were given: the state before names their device for a later undo.
     """
     from tuning.snapshot import file_before
     from tuning.way_back import way_back
@@ -218,7 +218,7 @@ def _on_bus(given: DriveOptions, drive: DriveOptions, settings: Settings, folder
 
 
 def _subject(drive: DriveOptions) -> str:
-    """Return what a journal is of: the drive, and a machine's load, with what files of the user hold."""
+    """Return the subject of a journal: the drive, and a machine's load, with hashes of the user's files."""
     from tuning.runs.inputs import as_kept, table_of
 
     named = _named(drive) | ({} if drive.bus else {"load": drive.load})
@@ -226,7 +226,7 @@ def _subject(drive: DriveOptions) -> str:
 
 
 def _named(drive: DriveOptions) -> dict[str, Any]:
-    """Return what settings.toml tells of any drive."""
+    """Return the entries of settings.toml that any drive has."""
     named = {"device": drive.device, "motor": drive.motor_name, "supply": drive.supply, "travel": drive.travel}
     return named | ({"axis": sorted(set(drive.axis))} if drive.axis else {})
 
@@ -279,7 +279,7 @@ def _check_unfinished(folder: Path, journal: Path | None) -> None:
 
 
 def _kept_in(journal: Path) -> str:
-    """Return what an interrupted search with a journal says."""
+    """Return the message of an interrupted search with a journal."""
     return f"interrupted; the trials made are in {journal}: the same command continues from there"
 
 
@@ -406,7 +406,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
 
 
 def _margins_by_model(found: Any, axes: Sequence[str]) -> list[str]:
-    """Return the margins of the outer loops with the best gains, for people; `axes` is what each axis is called."""
+    """Return the margins of the outer loops with the best gains, for people; `axes` are the axes' names."""
     lines = []
     for where, axis in zip(axes, found.margins.tolist(), strict=True):
         told = [
@@ -426,7 +426,7 @@ def _as_dicts(axis: list[list[float]]) -> dict[str, dict[str, float | None]]:
 
 
 def _what_counts(device: str, gains: tuple[str, ...] | None) -> list[str]:
-    """Return what J of a stepper has in place of a servo's terms, for people; nothing for a servo."""
+    """Return the terms of J that a stepper has in place of a servo's, for people; [] for a servo."""
     from drive_env.devices import find_device
     from drive_env.trials.open_loop import unmeasured
     from tuning.search.trials_files import is_tried_by_pid, is_tried_open
@@ -464,7 +464,7 @@ def _told(row: Any, objectives: Sequence[str], t_0: float) -> list[str]:
 
 
 def _cells(name: str, numbers: Sequence[int], gains: Any, told: list[str]) -> list[tuple[str, ...]]:
-    """Return the rows of a machine's gains, one for each of its axes; what it reached stands in the first."""
+    """Return the rows of a machine's gains, one for each of its axes; its figures stand in the first."""
     first = name if list(numbers) == list(range(len(numbers))) else f"{name}, axis {numbers[0]}"
     return [
         (first if k == 0 else f"  axis {axis}", *map(str, row), *(told if k == 0 else [""] * len(told)))

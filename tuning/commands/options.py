@@ -194,7 +194,7 @@ class DriveOptions:
         check_linear_model(find_device(self.device))
 
     def machine(self) -> dict[str, Any]:
-        """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
+        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
         self.check()
         check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
         named = {name: getattr(self, name) for name in ("device", "load", "seed", "supply")}
@@ -222,14 +222,14 @@ class TargetOptions(DriveOptions):
         check_machines("--machines", self.machines)
 
     def machine(self) -> dict[str, Any]:
-        """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
+        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
         return super().machine() | {"num_machines": self.machines, "randomise": self.randomise}
 
 
 def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command these options beside its own; it gets them together, as its argument `drive`.
 
-    Whoever types an option of a bus means the bus.
+    An option of a bus means drives on the bus.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -330,7 +330,7 @@ def ask_to_turn(
 
 
 def open_target(drive: DriveOptions) -> Target:
-    """Return what a command's options name, drives on a bus or emulated ones, without asking.
+    """Open the drives of a command's options, on a bus or emulated ones, without asking.
 
     Raises:
         ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer, or
@@ -396,7 +396,7 @@ def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | N
 
 @contextmanager
 def unchanged(drive: DriveOptions, file: Path | None) -> Iterator[tuple[Target, Transaction | None]]:
-    """Open drives, with their state before in a file if there is one, and restore at the end what is not committed."""
+    """Open drives, with their state before in a file if one is given; restore at the end all but committed changes."""
     from tuning.snapshot import Transaction
     from tuning.way_back import way_back
 
@@ -414,7 +414,7 @@ def before_as_json(file: Path | None) -> dict[str, str]:
 
 
 def tell_before(file: Path | None) -> None:
-    """Print what drives of a bus have other than before, and the line that restores it."""
+    """Print the differences of a bus' drives from their state before, and the line that restores it."""
     if file is not None:
         from tuning.way_back import what_is_changed
 

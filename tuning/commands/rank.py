@@ -138,7 +138,7 @@ def _compare(
     workers: int | None,
     cluster: str | None,
 ) -> Comparison:
-    """Compare tuners on machines; what is done of a run that is stopped is kept beside the folder."""
+    """Compare tuners on machines; finished results of a run that is stopped are kept beside the folder."""
     import hashlib
 
     from tuning.compare.comparison import compare, so_far
@@ -201,7 +201,7 @@ def _print(comparison: Comparison, dynamics: str, folder: Path, left_out: list[s
 
 
 def _print_figures(comparison: Comparison, dynamics: str) -> None:
-    """Print the table of tuners, and what they are worth machine by machine."""
+    """Print the table of tuners, and their costs machine by machine."""
     from tuning.compare.against_best import all_rivals
 
     machines = comparison.tuners[0].machines

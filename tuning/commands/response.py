@@ -85,7 +85,7 @@ def response(
             tell_before(file)
         if measured.trusted.mean(axis=0).min() < FEWEST:
             worst = int(measured.trusted.mean(axis=0).argmin())
-            # What has been seen comes before what may be.
+            # Measured margins come before possible ones.
             why = "; ".join(measured.notes[worst]) or "the excitation was too weak"
             fail(f"less than a tenth of an axis's frequencies are coherent: {why}", REFUSED)
 

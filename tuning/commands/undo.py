@@ -81,7 +81,7 @@ def undo(
 def _restore(
     file: Path, snapshot: Snapshot, address: dict[str, Any], store: bool, *, other_drive: bool
 ) -> tuple[list[tuple[int, Any]], int]:
-    """Return what was changed as (axis, difference), and how many parameters another connection has read anew."""
+    """Restore a snapshot; return the changes as (axis, difference), and the number of parameters read again."""
     from drive_env.master.open_drives import open_drives
     from drive_env.master.parameters import list_differences, restorable
     from tuning import snapshot as snapshots

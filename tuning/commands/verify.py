@@ -17,7 +17,7 @@ def verify(
 ) -> None:
     """Check whether a certificate or its report was changed since it was written; exit code 1 if it was.
 
-    The hash shows a change; it is not a signature: whoever writes another certificate can compute another hash.
+    The hash shows a change; it is not a signature: the writer of another certificate can compute another hash.
     """
     with errors_as_exit_codes():
         from tuning.certificate.certificate_files import is_unchanged

@@ -1,1 +1,1 @@
-"""What drives' own signals say of motor and machine."""
+"""Identification of motor and machine from the drives' own signals."""

@@ -22,7 +22,7 @@ def t_quantile(freedom: float) -> float:
 
 
 def gain_error(device: Device, motor: Motor, *, turns: bool = True) -> float:
-    """Return by what share a measured current may be wrong altogether: the gain errors of the sensors, 95 %.
+    """Return the share by which all measured currents may be wrong: the gain errors of the sensors, 95 %.
 
     No signal of the drive shows it: whatever is measured in amperes has it. The two channels of a three-phase motor
     are averaged, whose error has a triangular distribution, unless its field stands and one of them sees it all.

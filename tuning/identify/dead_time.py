@@ -23,7 +23,7 @@ STEP = 1e-3  # of the saturating current, of a difference quotient
 
 
 def dead_time(angle: Floats, i_q: Floats, saturation: float, brushed: bool) -> Floats:
-    """Return the voltage along q that dead time takes, over what one phase loses at most.
+    """Return the voltage along q that dead time takes, over the greatest loss of one phase.
 
     Args:
         angle: Electrical angle [rad].
@@ -42,7 +42,7 @@ def dead_time(angle: Floats, i_q: Floats, saturation: float, brushed: bool) -> F
 
 
 def dead_time_resistance(device: Device, motor: Motor, supply: float, current: Floats) -> float:
-    """Return the resistance [ohm] that dead time in the middle of its range looks like to what swings in a current.
+    """Return the resistance [ohm] that dead time in the middle of its range looks like to a swing of the current.
 
     Args:
         device: The drive.

@@ -66,7 +66,7 @@ class EncoderCheck(NamedTuple):
 
 
 def check_encoders(working: Working) -> list[EncoderCheck]:
-    """Turn the fields of three-phase motors and return what the encoders say, axis by axis; all axes are off then."""
+    """Turn the fields of three-phase motors and check the encoders, axis by axis; all axes are off then."""
     target, drives = working.target, working.target.drives
     count = target.num_axes
     if target.motor.kind == "dc":
@@ -148,7 +148,7 @@ def _push(working: Working) -> list[Estimate]:
 
 
 def _likeness(angle: Floats, torque: Floats) -> float:
-    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; what falls is left out."""
+    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; falling is left out."""
     t = np.linspace(-1.0, 1.0, len(angle))
     trend = np.stack([np.ones_like(t), t, t * t], axis=1)
     pair = np.stack([angle, np.cumsum(np.cumsum(torque))], axis=1)
@@ -259,7 +259,7 @@ def _rest(working: Working) -> Floats:
 
 
 def _judge(field: float, away: float, back: float, expected: int) -> EncoderCheck:
-    """Return what a turn of the field [electrical rad] and the rotor's ways there and back [rad] say."""
+    """Judge an encoder by a turn of the field [electrical rad] and the rotor's ways there and back [rad]."""
     rotor = 0.5 * (away - back)
     would = field / expected
     if abs(rotor) < STUCK * abs(would) or abs(away + back) > 0.5 * abs(away - back):

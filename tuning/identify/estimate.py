@@ -1,4 +1,4 @@
-"""The results of an identification: each value with its 95 % interval, or with the reason why there is none."""
+"""The results of an identification: each value with its 95 % interval, or with the reason why it is refused."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def interval(low: float, high: float) -> str:
 
 
 def refused(unit: str, reason: str) -> Estimate:
-    """Return the estimate of what could not be identified."""
+    """Return the estimate of a value that could not be identified."""
     return Estimate(math.nan, math.nan, math.nan, unit, reason)
 
 

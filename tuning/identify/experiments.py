@@ -1,4 +1,4 @@
-"""The order of the experiments of an identification: each needs what the ones before it found."""
+"""The order of the experiments of an identification: each needs the results of those before it."""
 
 from __future__ import annotations
 
@@ -68,15 +68,15 @@ OSCILLATED = "the axis oscillated"  # how the reason begins where one did
 
 
 class Experiments:
-    """One identification of some axes, side by side; `quick_identification` replaces what needs torque by less.
+    """One identification of some axes, side by side; `quick_identification` replaces those that need torque.
 
     Attributes:
         target, where, progress: As `tuning.identify.identification.identify` takes them.
         found: What is known so far of each axis, by the names of `NAMES`.
     """
 
-    thorough = True  # also what only tells better what is told
-    corrects = False  # drives that somebody set up go on with what their wiring needs, too
+    thorough = True  # also experiments that only narrow an interval
+    corrects = False  # drives that a user has set up keep the settings of their wiring, too
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         check_linear_model(target.device)  # what is moved with here comes from it
@@ -110,12 +110,12 @@ class Experiments:
                 for found, chosen, wiring, fit in every]  # fmt: skip
 
     def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
-        """Tell what is under way and the share done; what it and all after it are to say has these names."""
+        """Report the experiment under way and the share done; it and all after it give the values of these names."""
         self.progress(what, share)
         self._under_way = what, names
 
     def calm(self, working: Working) -> Working:
-        """Return the axes that did not oscillate; what the others have no value of is refused with that reason."""
+        """Return the axes that did not oscillate; missing values of the others are refused with that reason."""
         watch = watch_of(working.target.drives)
         swung = working.where & (np.zeros_like(working.where) if watch is None else watch.swung)
         what, names = self._under_way
@@ -212,7 +212,7 @@ class Experiments:
         return ""
 
     def turn(self, working: Working) -> None:
-        """Do what needs torque."""
+        """Make the experiments that need torque."""
         target, drives = working.target, working.target.drives
         self.begin("current pulses", 0.15, NAMES)
         enable(working, "csp")
@@ -243,7 +243,7 @@ class Experiments:
             go_back(replace(working, where=on), "csv", to=0.0)
 
     def hold(self, working: Working) -> Floats:
-        """Return what holds the axes [A], at rest in csp."""
+        """Return the currents that hold the axes at rest in csp [A]."""
         drives = working.target.drives
         trace = drives.record([cia402.TORQUE_ACTUAL], HOLD * CYCLE)
         alive = still_enabled(working, drives.read(cia402.STATUSWORD))
@@ -268,7 +268,7 @@ class Experiments:
             self.found[k] |= mechanics[k]._asdict()
 
     def respond(self, working: Working, inertia: Floats) -> None:
-        """Measure the velocity loop's response, with loops fit for it, and take what it says."""
+        """Measure the velocity loop's response, with loops fit for it, and take its estimates."""
         target, drives = working.target, working.target.drives
         # Still enabled: an axis under gravity would fall between the experiments.
         go_back(working, "csv")
@@ -332,7 +332,7 @@ class Experiments:
         return late_first(self._drives, reason)
 
     def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
-        """Refuse what has no value yet, by a reason or by late SYNCs."""
+        """Refuse values that are still missing, by a reason or by late SYNCs."""
         reason = self._late_first(reason)
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):

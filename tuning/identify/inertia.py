@@ -65,7 +65,7 @@ VISCOUS_MODEL = 0.02  # the same, of viscous friction besides: a transmission lo
 
 
 class Mechanics(NamedTuple):
-    """What the moves say of one axis, in data sheet units: J/K_t times the data sheet's K_t."""
+    """The mechanics of one axis by its moves, in data sheet units: J/K_t times the data sheet's K_t."""
 
     inertia: Estimate
     coulomb: Estimate
@@ -74,7 +74,7 @@ class Mechanics(NamedTuple):
 
 
 class Rough(NamedTuple):
-    """What moves say of one axis however rough they are, for the next ones.
+    """Rough mechanics of one axis, for its next moves.
 
     Inertia [kg*m^2], current that holds the axis [A], and what dry friction takes of it in motion at least [A].
     """
@@ -190,7 +190,7 @@ def _there_and_back(speed: float, ramp: int, cruise: int) -> Floats:
 
 
 def _of_machines(target: Target, values: Floats, choose: Callable[..., Floats]) -> Floats:
-    """Return what each machine's axes have in common, shape (num_axes,)."""
+    """Reduce the values of each machine's axes to one by `choose`, shape (num_axes,)."""
     axes = target.axes_per_machine
     return np.repeat(choose(values.reshape(-1, axes), axis=1), axes)
 
@@ -254,7 +254,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
 
 
 def identify_mechanics(working: Working, holding: Floats) -> tuple[list[Mechanics], Floats]:
-    """Move the axes, which are enabled in csv at rest, and return what that says, and the total inertias [kg*m^2].
+    """Move the axes, which are enabled in csv at rest; return the mechanics of each, and total inertias [kg*m^2].
 
     Machines move side by side. The axes of one move one after the other while the others hold, unless they pull at the
     same thing: then they move together, and each inertia is what its drive has to move.
@@ -298,7 +298,7 @@ def are_linked(working: Working) -> bool:
 
 
 def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked: bool) -> list[Mechanics]:
-    """Move the axes there are and return what each says; `inertia` is brought up to date."""
+    """Move the axes and return the mechanics of each; `inertia` is brought up to date."""
     target = working.target
     results: list[Mechanics] = []
     softness = np.ones(target.num_axes, np.int64)
@@ -327,7 +327,7 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
 def _moved(
     working: Working, plan: Callable[[], Plan], gains: Integers, softness: Integers
 ) -> tuple[Plan, Floats, Floats, Mask, Integers]:
-    """Move, once more with softer gains if an axis oscillates; return plan, what `move` returns, and the gains."""
+    """Move, once more with softer gains if an axis oscillates; return plan, the result of `move`, and the gains."""
     drives = working.target.drives
     watch = watch_of(drives)
     gains = working.target.device.gains.softened(gains, softness, "velocity")
@@ -397,7 +397,7 @@ def hidden_ripple(target: Target, k: int, gains: Integers, inertia: float) -> fl
 def _balance(
     working: Working, k: int, angle: Floats, current: Floats, plan: Plan, gains: Integers
 ) -> tuple[Mechanics, Rough]:
-    """Return the estimates of one axis, and what is known of it however rough."""
+    """Return the estimates of one axis, and its rough mechanics."""
     target = working.target
     motor, K = target.motor, target.motor.torque_constant
     cruises = plan.cruises[k]
@@ -445,7 +445,7 @@ def _with_losses(
     did: Motion, cruises: tuple[tuple[int, int, int], ...], motor: Motor, rows: BalanceRows, fit: Solved, least: float,
     hidden: float,
 ) -> tuple[float, Solved, Floats]:  # fmt: skip
-    """Return inertia [kg*m^2], the fit, and half of what else is open of its unknowns, for what a transmission loses.
+    """Return inertia [kg*m^2], the fit, and half of the remaining range of its unknowns, with a transmission's losses.
 
     Args:
         did: What the axis did.
@@ -477,7 +477,7 @@ def _with_losses(
 
 
 def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
-    """Return what cogging and the sensors' offsets leave of the inertia's error, 95 %, as a share of it.
+    """Return the inertia's error by cogging and the sensors' offsets, 95 %, as a share of it.
 
     Both repeat with the angle: over many turns they average out, over a short way every move has the same of them.
     """
@@ -491,7 +491,7 @@ def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
 
 
 def _ripple(target: Target) -> float:
-    """Return what repeats with the angle, cogging and the sensors' offsets, as an RMS current [A]."""
+    """Return the current that repeats with the angle, by cogging and the sensors' offsets, as RMS [A]."""
     motor = target.motor
     offsets = [target.device.stage[name] for name in ("adc_offset_a", "adc_offset_b")]
     # Uniform between their limits; a cosine of the angle.
@@ -530,7 +530,7 @@ def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[l
 
 
 def _fit(rows: BalanceRows, least: float) -> Solved:
-    """Return J/K, dry and viscous friction and offset, fitted with what the data ask for.
+    """Return J/K, dry and viscous friction and offset, fitted with the terms that the data ask for.
 
     A fan's drag or a load that changes with position only if it is clear. What is not clear may be there all the same:
     by what it would change, the intervals are wider.

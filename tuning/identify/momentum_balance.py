@@ -18,7 +18,7 @@ STANDS, SLOWEST = 0.02, 0.5  # share of the greatest speed, and rad/s: about sta
 
 
 class Motion(NamedTuple):
-    """What one axis did, shape (samples,) each."""
+    """A motion of one axis, shape (samples,) each."""
 
     angle: Floats  # rad
     current: Floats  # A
@@ -52,7 +52,7 @@ class Solved(NamedTuple):
 
 
 def motion(angle: Floats, current: Floats, demand: Floats) -> Motion:
-    """Return what an axis did by its angles [rad], currents [A] and set-points of speed [rad/s], shape (samples,)."""
+    """Return an axis' motion from its angles [rad], currents [A] and set-points of speed [rad/s], shape (samples,)."""
     speed = np.gradient(angle) / CYCLE
     smooth = smoothed(speed)
     # The demand tells the size, and the speed the sign.

@@ -1,4 +1,4 @@
-"""What inertia an axis pushes while all axes of its machine accelerate alike, as they do in an identification's moves.
+"""The inertia that an axis pushes while all axes of its machine accelerate alike, as in the moves of an identification.
 
 `mechanics.shaft` says what an axis sees that turns alone; where axes are coupled the two differ.
 """

@@ -86,7 +86,7 @@ class _Brief(Experiments):
 
     def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
         super().__init__(target, where, progress)
-        # What is told of each axis where `found` has a guess.
+        # The estimates of each axis by measurement, where `found` has a guess.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
         self._pushed: list[tuple[float, ...]] = [() for _ in range(target.num_axes)]
 
@@ -130,7 +130,7 @@ class _Brief(Experiments):
         self.respond(working, inertia)
 
     def _move_together(self, working: Working, trials: Trials, holding: NDArray[np.float64]) -> Working:
-        """Find what axes of one machine push for one another while all of them move; return what did not oscillate."""
+        """Find the inertia that axes of one machine push while all of them move; return those without oscillation."""
         target, lanes = working.target, working.target.axes_per_machine
         whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
         if lanes == 1 or target.linked or not whole.any():  # which have moved together as it is
@@ -213,7 +213,7 @@ class _Brief(Experiments):
 
 
 def pushed_inertia(ways: NDArray[np.float64], inertia: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), by what they pushed while all moved.
+    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), from the inertias pushed while all moved.
 
     Args:
         ways: Which way each axis went, 1 or -1, (moves, axes): all alike first.
@@ -232,7 +232,7 @@ def pushed_inertia(ways: NDArray[np.float64], inertia: NDArray[np.float64]) -> N
 
 
 def loose(ratio: float) -> str:
-    """Return what a response means that gives this share of the inertia that the moves give."""
+    """Return the message about a response that gives this share of the inertia of the moves."""
     return (
         f"the frequency response gives {ratio:.2f} times the inertia found in the moves: it was measured within the "
         "play of a gear, where the motor turns alone"
@@ -249,7 +249,7 @@ def _turns(working: Working) -> list[NDArray[np.bool_]]:
 
 
 def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
-    """Return what a fit says by itself, up to the highest frequency [Hz]; its refusals are what is told."""
+    """Return the estimates of a fit alone, up to the highest frequency [Hz]; its refusals are the reasons."""
     told = {name: fit.estimates[name] for name in ("inertia", *RESPONSE)}
     told["loop_delay"] = refused(UNITS["loop_delay"], NO_DELAY)
     if fit.plant.is_elastic and fit.plant.resonance > highest:
@@ -263,7 +263,7 @@ def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
 
 
 def _guessed(fit: PlantFit) -> dict[str, Estimate]:
-    """Return what a fit says, with doubt in place of refusal: a twin is better off with a guess than with nothing."""
+    """Return the estimates of a fit, with wide intervals in place of refusals: a twin needs a guess."""
     found = dict(fit.estimates)
     values = {"inertia": fit.plant.inertia, "velocity_filter": fit.plant.velocity_filter}
     if fit.plant.is_elastic:

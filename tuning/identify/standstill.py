@@ -87,7 +87,7 @@ def standstill_resistances(working: Working) -> list[Estimate]:
 
 
 def _resistance(working: Working, k: int, current: Floats, duty: Floats, field: float) -> Estimate:
-    """Return what duties at currents [A] say, shape (n,) each, the field standing at an angle [rad]."""
+    """Estimate the resistance from duties at currents [A], shape (n,) each, the field standing at an angle [rad]."""
     target, stage = working.target, working.target.device.stage
     supply = float(target.supply[k])
     link = supply - stage["supply_resistance"].default * (1.5 * np.maximum(duty * current, 0.0) + SUPPLY_IDLE)

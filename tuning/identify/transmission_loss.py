@@ -1,4 +1,4 @@
-"""What a screw or a gear loses in proportion to what it carries, where the moves of an axis show it.
+"""The losses of a screw or a gear in proportion to the transmitted torque, where the moves of an axis show them.
 
 While the motor drives the load, the loss adds to what it carries; while the load drives the motor, it takes from it.
 With i_L the current behind the rotor and behind the friction before the transmission, and T what is carried,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Cruises = tuple[tuple[int, int, int], ...]
 
-CLEAR = 3.0  # times its deviation: from here on it is taken out; where there is none, the interval becomes wider
+CLEAR = 3.0  # times its deviation: from here on it is taken out; below, the interval becomes wider
 BEFORE = (0.5, 0.0, 1.0)  # share of friction that lies before the transmission: the middle, and both ends
 TURNING = 0.15  # of a ramp, about standstill: there friction breaks away, and play is passed
 STEEP = 0.5  # of a ramp, on which a weight fades
@@ -49,7 +49,7 @@ class Loss(NamedTuple):
 
     @property
     def loss(self) -> float:
-        """What is lost over what is carried; a screw of 90 % efficiency: 0.11."""
+        """Losses over the transmitted torque; of a screw of 90 % efficiency: 0.11."""
         return self.share / (2.0 + self.share)
 
     def load_alone(self, inertia: float, rotor: float) -> float:
@@ -100,7 +100,7 @@ def friction_of_whole_ways(did: Motion, cruises: Cruises, loss: Loss, inertia: f
 
 
 def _while_braking(did: Motion, cruises: Cruises, motor: Motor, before: Floats) -> Floats:
-    """Return what of the current behind the rotor brakes, with the sign of the speed, per sample [A]."""
+    """Return the part of the current behind the rotor that brakes, with the sign of the speed, per sample [A]."""
     accelerating = motor.inertia / motor.torque_constant * smoothed(np.gradient(did.smooth) / CYCLE)
     behind = smoothed(smoothed(smoothed(did.current))) - accelerating - before[0] * did.sign - before[1] * did.smooth
     braking = np.maximum(-behind * did.sign, 0.0) * did.sign

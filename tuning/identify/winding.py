@@ -66,7 +66,7 @@ TURN = 2  # column of the balance
 
 
 class Pulses(NamedTuple):
-    """What was recorded, one row per millisecond: n rows, or n + 1 where both ends count; (rows, num_axes)."""
+    """A recording, one row per millisecond: n rows, or n + 1 where both ends count; (rows, num_axes)."""
 
     demand: Floats  # A, n
     current: Floats  # A, n + 1: the last tick's
@@ -78,7 +78,7 @@ class Pulses(NamedTuple):
 
 
 class Winding(NamedTuple):
-    """What pulses say of one axis."""
+    """Estimates of one axis' winding by pulses."""
 
     resistance: Estimate
     inductance: Estimate
@@ -177,7 +177,7 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
 
 
 class _Window(NamedTuple):
-    """Each millisecond's part of the balance, shape (n,), and what happened within it by the model, (n, ticks)."""
+    """Each millisecond's part of the balance, shape (n,), and the currents within it by the model, (n, ticks)."""
 
     flux: Floats  # V s
     charge: Floats  # A s
@@ -421,7 +421,7 @@ def _solve(
 
 
 def _judge(working: Working, axis: _AxisWinding, found: _Fit, window: _Window) -> Winding:
-    """Return the estimates with their intervals, or why there are none."""
+    """Return the estimates with their intervals, or with the reason of a refusal."""
     target = working.target
     t = t_quantile(found.freedom)
     gain = gain_error(target.device, target.motor)

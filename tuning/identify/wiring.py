@@ -32,7 +32,7 @@ FINDINGS = {
     Role.HALL_POLARITY: "hall levels inverted",
     Role.HALL_DIRECTION: "halls in reverse order",
 }
-SETTLED = 0.002  # s after which a position is told in the new direction
+SETTLED = 0.002  # s after which a position is read in the new direction
 
 LEAST_HALL_TURN = 2.6  # electrical rad of the field: two edges at least, from wherever it begins
 HALL_SLACK = 0.5  # by which their way may differ from the field's: a sector of three
@@ -40,7 +40,7 @@ CLEAR = np.radians(60.0)  # of what their angle is off: beyond half a sector and
 
 
 class Halls(NamedTuple):
-    """What the halls say of one axis: whether they count against the field, and stand opposite to it; None unknown."""
+    """The halls of one axis: whether they count against the field, and stand opposite to it; None unknown."""
 
     reversed: bool | None = None
     inverted: bool | None = None
@@ -48,7 +48,7 @@ class Halls(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What an object is, and what the wiring needs it to be."""
+    """An object's value, and the one that the wiring needs."""
 
     has: int
     needs: int
@@ -58,12 +58,12 @@ Settings = Mapping[Key, Setting]
 
 
 def findings(device: Device) -> dict[Key, str]:
-    """Return what a cable can be wrong in, by the object that makes up for it, as far as the device has such ones."""
+    """Return the possible mistakes in wiring, by the object that compensates each, as far as the device has them."""
     return {device.roles[role]: text for role, text in FINDINGS.items() if role in device.roles}
 
 
 def judge_halls(field: Floats, halls: Floats) -> Halls:
-    """Return what angles of the field and of the halls [electrical rad] say, shape (n,), read while the field turns."""
+    """Judge the halls by angles of field and halls [electrical rad], shape (n,), read while the field turns."""
 
     def turned(angle: Floats) -> float:
         return float(_wrapped(np.diff(angle)).sum())
@@ -100,17 +100,17 @@ def needed(device: Device, reads: Mapping[Key, int], encoder: float, halls: Hall
 
 
 def changes(settings: Settings) -> dict[Key, int]:
-    """Return what must be written."""
+    """Return the values to write."""
     return {key: one.needs for key, one in settings.items() if one.has != one.needs}
 
 
 def finding(device: Device, settings: Settings) -> list[str]:
-    """Return in words what is wrong, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
+    """Return the mistake in words, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
     return [f"{findings(device)[key]}: write {named(key)} = {value}" for key, value in changes(settings).items()]
 
 
 def corrected(device: Device, settings: Settings) -> list[str]:
-    """Return in words what was wrong, once it is written: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
+    """Return the corrected mistake in words: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
     wrong = changes(settings)
     what = findings(device)
     return [f"{what[key]}: {named(key)} is {wrong[key]} now, and was {settings[key].has}" for key in wrong]
@@ -124,7 +124,7 @@ def named(key: Key) -> str:
 def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key, int]]) -> tuple[Target, Integers]:
     """Write settings of axes that are off, and return the target and where its rotors had begun [inc], as then counted.
 
-    A drive that counts the other way shows another position where the rotor is, and nobody knows whether a travel was
+    A drive that counts the other way shows another position where the rotor is, and it is unknown whether a travel was
     meant in the old direction or in the new: what is left is free to both sides.
 
     Args:

@@ -40,7 +40,7 @@ STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is al
 
 
 def borrowed(device: Device) -> tuple[ObjectName, ...]:
-    """Return what experiments change, in the order in which it is given back, as far as the device has it."""
+    """Return the objects that experiments change, in the order of giving them back, as far as the device has them."""
     names: tuple[ObjectName, ...] = (
     Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
     Role.ENCODER_STEPS, *FINDINGS,
@@ -52,7 +52,7 @@ def borrowed(device: Device) -> tuple[ObjectName, ...]:
 
 
 def read_role(target: Target, role: Role) -> Integers:
-    """Return an object by its role, shape (num_axes,); 0 of a drive that has none such, which is as if it were unused.
+    """Return an object by its role, shape (num_axes,); 0 if the drive lacks it, which is as if it were unused.
 
     So a drive without a setting of the shaft's direction turns it nowhere, and one without flags aligns no encoder.
     """
@@ -135,7 +135,7 @@ def cautious_bandwidth(motor: Motor, inertia: float, wanted: float = VELOCITY_HZ
 
 @contextmanager
 def working_state(target: Target, where: Mask | None = None) -> Iterator[Working]:
-    """Give drives that are commissioned, cautious and off; afterwards they are off and have back what they had.
+    """Give drives that are commissioned, cautious and off; afterwards they are off and have their own settings.
 
     Raises:
         RuntimeError: If a drive is enabled, moves, or does not take what it must.
@@ -243,7 +243,7 @@ def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
 
 
 def switch_off(drives: Drives, where: Mask) -> None:
-    """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by who wants."""
+    """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by the caller."""
     fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     motion.disable(drives, where & ~fault)
 

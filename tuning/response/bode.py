@@ -1,4 +1,4 @@
-"""Pictures of measured open loops: Bode with coherence, and Nyquist. What is not coherent is grey, and not joined."""
+"""Pictures of measured open loops: Bode with coherence, and Nyquist. Incoherent lines are grey, and not joined."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def _text(value: float, form: str) -> str:
 
 
 def _turns(L: Complex) -> Floats:
-    """Return the phase in degrees, as it is shown."""
+    """Return the phase in degrees for display."""
     from tuning.certificate.certificate_pictures import within_a_turn
 
     return within_a_turn(np.degrees(np.angle(L)))

@@ -1,4 +1,4 @@
-"""What shakes an axis: multisines and periodic chirps of given amplitudes, and how they are dimensioned.
+"""Excitations of an axis: multisines and periodic chirps of given amplitudes, and their dimensioning.
 
 Both repeat exactly, so that every period holds the same lines and whatever differs between periods is noise.
 """
@@ -93,7 +93,7 @@ def _chirp(lines: Lines, amplitude: Floats) -> Floats:
 
 
 def peak(kind: str, lines: Lines, amplitude: Floats, response: Complex) -> Floats:
-    """Return the peak of what an excitation makes of a response at its lines, complex (n, axes); shape (axes,)."""
+    """Return the peak of a response to an excitation at its lines, complex (n, axes); shape (axes,)."""
     spectrum = np.fft.rfft(periodic(kind, lines, amplitude), axis=0)
     answer = np.zeros_like(spectrum)
     answer[lines.bins] = spectrum[lines.bins] * response

@@ -1,4 +1,4 @@
-"""Shakes axes that run at a steady speed, there and back, and says what went in and what came out.
+"""Excites axes that run at a steady speed, there and back, and returns excitation and response.
 
 Dry friction is a constant while an axis keeps its direction: so the excitation rides on a speed that is larger than
 its own, within the travel. The excitation goes on through the reversal and repeats exactly; what is looked at begins
@@ -49,7 +49,7 @@ NEAR = 0.02  # rad from where it began at which an axis stays
 
 
 class Pass(NamedTuple):
-    """What a run showed while its speed was steady; periods one after the other, SI.
+    """The samples of a run while its speed was steady; periods one after the other, SI.
 
     set_point: As played, less the steady motion, shape (periods * samples, axes).
     answer: As seen on the bus, likewise.
@@ -164,7 +164,7 @@ class Shaker:
         )
 
     def hold(self) -> Floats:
-        """Return what holds the axes at rest [A], shape (axes,)."""
+        """Return the currents that hold the axes at rest [A], shape (axes,)."""
         trace = self._drives.record([cia402.TORQUE_ACTUAL], (REST + LOOK) * CYCLE)
         return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
 

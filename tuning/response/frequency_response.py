@@ -1,4 +1,4 @@
-"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and what coherence says.
+"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and the coherence.
 
 The set-point is the instrument: it is known exactly and independent of noise, so that the open loop is the quotient of
 two cross-spectra with it, answer over error, without the bias that noise inside the loop gives to answer over input.
@@ -73,7 +73,7 @@ OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, a
 
 @dataclass(frozen=True)
 class Signal:
-    """What a loop is shaken with.
+    """The excitation of a loop.
 
     Attributes:
         kind: "multisine" or "chirp".
@@ -114,7 +114,7 @@ def measure(
         target: The axes.
         loop: "velocity", in csv, or "position", in csp.
         where: Axes that are measured; all by default. The others get nan.
-        signal: What it is shaken with.
+        signal: The excitation.
         traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
         confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
         softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;
@@ -185,7 +185,7 @@ def _closed_loops(target: Target, loop: str) -> Mask:
 
 
 class _Measurement:
-    """One measurement of axes side by side: a trial, the run proper, and what they say."""
+    """One measurement of axes side by side: a trial, the run proper, and their results."""
 
     def __init__(
         self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool,
@@ -242,12 +242,12 @@ class _Measurement:
 
     # --- how strongly ---------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
-        """Return what may flow [A]: the user's limit, or the drive's own."""
+        """Return the highest permitted current [A]: the user's limit, or the drive's own."""
         own = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)
         return np.asarray(np.minimum(self._target.current, own))
 
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
-        """Return what a weak shaking shows; an axis that oscillates gets softer gains first, if it may."""
+        """Return the response to a weak excitation; an axis that oscillates gets softer gains first, if it may."""
         drives = self._target.drives
         watch = watch_of(drives)
         for left in reversed(range(SOFTER + 1)):
@@ -271,7 +271,7 @@ class _Measurement:
         return speed
 
     def _falling(self, shaker: Shaker, speed: Floats, passes: int, periods: int) -> Floats:
-        """Return what weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
+        """Return the energy that weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
         steady, _ = shaker.steady(speed, passes, periods)
         return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding, self._friction)
 
@@ -298,7 +298,7 @@ class _Measurement:
     def _amplitude(
         self, shaker: Shaker, rough: Complex, trial: Pass, room: Floats, limit: Floats
     ) -> tuple[Floats, Floats]:
-        """Return amplitudes and steady speeds of the run proper by what the trial showed."""
+        """Return amplitudes and steady speeds of the run proper from the trial."""
         lines, omega = self._lines, 2.0 * math.pi * self._lines.f[:, None]
         gain, error = _bounded(rough, 1e-3, 10.0), _bounded(1.0 - rough, 0.02, 10.0)
         current = _bounded(self._current_gain() * error, 1e-12, np.inf)
@@ -360,7 +360,7 @@ class _Measurement:
         return velocity_noise(self._device, plant)
 
     def _note_oscillation(self, seen: Pass, where: Mask) -> Mask:
-        """Return which axes oscillate: the current has what does not repeat with the excitation."""
+        """Return which axes oscillate: their currents have parts that do not repeat with the excitation."""
         shape = (self._passes, self._periods, self._lines.samples, len(where))
         current = seen.current.reshape(shape)
         own = (current - current.mean(axis=1, keepdims=True)).reshape(self._passes, -1, len(where))

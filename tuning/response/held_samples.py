@@ -1,4 +1,4 @@
-"""What a bus sees of a loop that runs faster: set-points held for a communication cycle, samples once in one.
+"""A fast loop as a bus sees it: set-points held for a communication cycle, samples once in one.
 
 A set-point of the bus acts from a cycle's beginning and is held for its windows; a sample is what the last window
 before had. At f the loop therefore sees the set-point times H(f), and at f + k/T its images; sampling folds their
@@ -43,7 +43,7 @@ def split(device: Device, f: Floats, closed_loop: Response) -> tuple[Complex, Co
 
 
 def unhold(device: Device, f: Floats, seen: Complex, images: Complex) -> Complex:
-    """Return T(f) from what the bus has, less the images."""
+    """Return T(f) from the samples of the bus, without the images."""
     return np.asarray((seen - images) / _hold(device, f))
 
 

@@ -1,4 +1,4 @@
-"""A loop as it was measured: its lines, which of them are trusted, and what lies between them."""
+"""A measured loop: its lines, which of them are trusted, and the values between them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MODEL_POINTS, MODEL_LOW, NYQUIST = 400, 2.0, 0.49  # frequencies of a model: how
 
 
 class Loops(NamedTuple):
-    """Both outer loops of an axis as one measurement shows them: frequencies [Hz], complex open loops, what is trusted.
+    """Both outer loops of an axis by one measurement: frequencies [Hz], complex open loops, trusted lines.
 
     All of shape (n,). The position loop is that of the measured velocity loop, closed, and of the position P.
     """
@@ -44,7 +44,7 @@ class Loops(NamedTuple):
 
 
 class AtLeast(NamedTuple):
-    """Lower bounds of margins that were not measured; nan where there is none."""
+    """Lower bounds of margins that were not measured; nan without a bound."""
 
     phase_deg: float
     gain_db: float
@@ -62,7 +62,7 @@ class MeasuredLoop:
         coherence: Of set-point with answer and with error, the lower of the two, 0...1.
         traced: Which frequencies come from an emulator's trace at the velocity loop's rate; no bus shows them.
         gains: Raw gains in force, shape (axes, count).
-        fits: What the linear model makes of each axis; None of the position loop.
+        fits: The fitted linear model of each axis; None for the position loop.
         peak_speed, peak_current: Of the shaking [rad/s], [A], shape (axes,).
         drive_time: Time that passed on the drives [s].
         notes: Of each axis, for people.
@@ -92,7 +92,7 @@ class MeasuredLoop:
         return np.asarray(self.open_loop / (1.0 + self.open_loop))
 
     def margins(self, axis: int = 0) -> margins_.Margins:
-        """Return the margins of an axis, by its trusted lines; what those do not show is nan."""
+        """Return the margins of an axis, by its trusted lines; nan for those that they do not show."""
         found = margins_.margins(*self.refined(axis))
         # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
         return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
@@ -123,7 +123,7 @@ class MeasuredLoop:
     def loops(
         self, gains: Sequence[int] | Integers, axis: int = 0, *, plant: Plant | None = None, refined: bool = True
     ) -> Loops:
-        """Return what a measured velocity loop says of other gains: by as much as those change the linear model.
+        """Return the loops with other gains from a measured velocity loop: changed as those change the linear model.
 
         What is not in the model, as friction or a second resonance, was measured; gains of the outer loops change it by
         a factor that is known exactly, those of the torque loop by what the winding makes of them.
@@ -153,7 +153,7 @@ class MeasuredLoop:
         return Loops(f, velocity, outer_loop(self.device, fit.plant, now, f, velocity), trusted)
 
     def at_least(self, loop: str, gains: Sequence[int] | Integers, axis: int = 0) -> AtLeast:
-        """Return what the margins of a loop are at least, by the fitted model, everything within its intervals.
+        """Return lower bounds of a loop's margins, by the fitted model, everything within its intervals.
 
         Args:
             loop: "velocity" or "position".

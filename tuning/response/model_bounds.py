@@ -1,4 +1,4 @@
-"""Lower bounds of margins that were not measured: the worst corner of what was identified of an axis."""
+"""Lower bounds of margins that were not measured: the worst corner of an axis' identified intervals."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def why_unbounded(identified: Identification) -> str:
 
 
 def at_least_by_model(device: Device, plant: Plant, identified: Identification, gains: RawGains) -> dict[str, AtLeast]:
-    """Return what the margins of both outer loops are at least, by the linear model at all corners of the intervals.
+    """Return lower bounds of both outer loops' margins, by the linear model at all corners of the intervals.
 
     Args:
         device: The drive.
@@ -77,7 +77,7 @@ def at_least_by_model(device: Device, plant: Plant, identified: Identification, 
 
 
 def _corners(plant: Plant, identified: Identification) -> Iterator[Plant]:
-    """Yield an axis at all corners of its intervals; what was not identified stays as it is."""
+    """Yield an axis at all corners of its intervals; values that were not identified stay as they are."""
 
     def ends(names: Mapping[str, str]) -> dict[str, tuple[float, float]]:
         told = {field: identified.estimates.get(name) for name, field in names.items()}

@@ -49,7 +49,7 @@ WIDEST = {
 # cannot tell it from the velocity filter, and both get lost.
 EXPECTED_DELAY = 50e-6
 # Share of what dead time may add to the winding's resistance that is expected, and its deviation: currents that swing
-# through zero seldom see all of it, and it is told from the lag of the velocity filter by this alone.
+# through zero seldom see all of it, and this alone distinguishes it from the lag of the velocity filter.
 EXPECTED_LOSS, LOSS_SPREAD = 0.5, 0.4
 LEVEL = 0.03  # by which a resonance may move with the strength of the shaking, unless noise explains more
 DISTORTED = 0.13  # share by which passes may differ beyond noise
@@ -78,13 +78,13 @@ class Pair(NamedTuple):
     damping: float
 
     def response(self, f: Floats) -> Complex:
-        """Return by what the pair multiplies the velocity that a torque makes; 1 far below."""
+        """Return the factor by which the pair changes the velocity that a torque makes; 1 far below."""
         swing = 2.0 * self.damping * 1j * f / self.resonance
         return np.asarray((1.0 - (f / self.anti_resonance) ** 2 + swing) / (1.0 - (f / self.resonance) ** 2 + swing))
 
 
 class PlantFit(NamedTuple):
-    """The fitted plant, and each parameter with its interval; `reason` says why there is none.
+    """The fitted plant, and each parameter with its interval; `reason` says why the fit is refused.
 
     The plant has the first pair of anti-resonance and resonance; a second one, above it, is in `second`.
     """
@@ -106,7 +106,7 @@ class PlantFit(NamedTuple):
         return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
 
     def drawn(self, rng: np.random.Generator, count: int) -> Iterator[PlantFit]:
-        """Yield fits whose parameters lie as the intervals say, each on its own; what was refused stays as it is."""
+        """Yield fits with each parameter drawn from its interval; refused ones stay as they are."""
         for _ in range(count):
             values = {}
             for name, estimate in self.estimates.items():
@@ -185,7 +185,7 @@ def fit_plant(
 
 def _weight(seen: Complex, spread: Floats) -> Floats:
     size = np.abs(seen)
-    # In the valley of an anti-resonance what is not linear, small elsewhere, is all that is left.
+    # In the valley of an anti-resonance the non-linear part, small elsewhere, is all that is left.
     around = maximum_filter1d(size, NEIGHBOURS)
     return np.asarray(1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2))
 
@@ -236,7 +236,7 @@ def _covariance(solution: _Solution) -> Floats:
 
 
 def _better(simple: _Solution, found: list[_Solution]) -> _Solution:
-    """Return the best of what was found, or the simpler one if the data do not clearly ask for more."""
+    """Return the best of the fits, or the simpler one if the data do not clearly ask for more."""
     sure = [solution for solution in found if _is_sure(solution)]
     best = min(sure, key=_criterion, default=simple)
     return best if _criterion(best) < _criterion(simple) - LEAST_GAIN else simple
@@ -257,7 +257,7 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
     passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
     plant, quiet = found.model.plant, spread <= np.median(spread)
     if plant.is_elastic:
-        # A pair that lies close together is told by the few lines about it; without these the fit takes any other one.
+        # Only the few lines about a pair that lies close together show it; without these the fit takes any other one.
         quiet |= (loop.f > plant.anti_resonance / ABOUT) & (loop.f < plant.resonance * ABOUT)
     fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
     return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - p))
@@ -271,7 +271,7 @@ def _doubted(fit: PlantFit, reason: str) -> PlantFit:
 
 
 class Seen(NamedTuple):
-    """What was seen of a closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
+    """A closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
 
     f: Floats  # Hz
     seen: Complex

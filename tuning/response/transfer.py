@@ -1,4 +1,4 @@
-"""What whole periods of an excitation say at its lines: response, coherence, noise, and how two directions differ."""
+"""Whole periods of an excitation at its lines: response, coherence, noise, and the difference of two directions."""
 
 from __future__ import annotations
 

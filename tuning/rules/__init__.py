@@ -1,1 +1,1 @@
-"""From what is known of an axis to gains, by rules."""
+"""Rules: from an identified axis to gains."""

@@ -25,7 +25,7 @@ NOISE = 0.1  # RMS current that the counts may cause, over the rated current
 
 
 def cascade_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose gains loop by loop; notes say what limits the velocity loop."""
+    """Propose gains loop by loop; notes name the limit of the velocity loop."""
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)

@@ -40,7 +40,7 @@ def simc_integrating(slope: float, dead: float, closed: float) -> PI:
 
 
 def imc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose IMC: lags cancelled, closed loops three and four times as slow as what the model leaves out.
+    """Propose IMC: lags cancelled, closed loops three and four times as slow as the lags that the model leaves out.
 
     An axis that friction hardly holds is a lag of seconds; its integral part is as slow.
     """

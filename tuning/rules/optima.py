@@ -24,7 +24,7 @@ POSITION_SYMMETRICAL = 0.25  # of a velocity loop that overshoots
 
 
 class PI(NamedTuple):
-    """A controller p (1 + 1/(s time)); an infinite time is none."""
+    """A controller p (1 + 1/(s time)); with an infinite time a proportional one."""
 
     p: float
     time: float
@@ -55,7 +55,7 @@ def symmetrical_optimum(slope: float, small: float, spread: float = SPREAD) -> P
 def modulus_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """Propose the modulus optimum for all three loops.
 
-    Of an axis without viscous friction the velocity loop has no lag to cancel: its integral part is none then, and a
+    Of an axis without viscous friction the velocity loop has no lag to cancel: it has no integral part then, and a
     constant load leaves an error.
     """
     bench = Workbench(device, plant)

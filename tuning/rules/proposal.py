@@ -1,4 +1,4 @@
-"""What a rule proposes: raw integers of the device's gains, what was wanted, and what no integer reaches."""
+"""The proposal of a rule: raw integers of the device's gains, the wanted values, and those that no integer reaches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Rule = Callable[["Device", "Motor", "Plant"], Proposal]
 
 
 class Workbench:
-    """Turns a rule's controllers into integers, the inner loops first, and tells what each integer really is.
+    """Turns a rule's controllers into integers, the inner loops first, and returns each integer's real value.
 
     A rule designs a loop, takes its gains here, and designs the next loop around what it got: the integration time and
     the outer loop follow the bandwidth that is reached, not the one that was wanted.
@@ -58,11 +58,11 @@ class Workbench:
         self._notes: list[str] = []
 
     def p(self, loop: str, value: float) -> float:
-        """Take a proportional gain [V/A, A*s/rad, 1/s] of a loop; return what it became."""
+        """Take a proportional gain [V/A, A*s/rad, 1/s] of a loop; return the value after rounding to an integer."""
         return self._take((loop, "P"), value)
 
     def time(self, loop: str, value: float) -> float:
-        """Take an integration time [s], infinite for none, of the current or velocity loop; return what it became."""
+        """Take an integration time [s], infinite for none, of the current or velocity loop; return it as rounded."""
         inverse = self._take((loop, "I"), 1.0 / value)
         return 1.0 / inverse if inverse else math.inf
 
@@ -73,7 +73,7 @@ class Workbench:
         return value / self.per_si[part]
 
     def si(self, part: Part, value: float) -> float:
-        """Return what a raw gain means in SI, of an I 1/s."""
+        """Return a raw gain in SI units, of an I 1/s."""
         return value / self.per_si[part]
 
     def row(self, part: Part) -> Gain:
@@ -81,20 +81,20 @@ class Workbench:
         return self._rows[part]
 
     def integer(self, part: Part, wanted: float) -> int:
-        """Return the integer that is nearest to what is wanted of a gain, 1 at least."""
+        """Return the integer that is nearest to the wanted value of a gain, 1 at least."""
         return min(max(round(wanted), 1), self._rows[part].highest)
 
     def note(self, text: str) -> None:
-        """Say something to whoever reads the proposal."""
+        """Add a note to the proposal."""
         self._notes.append(text)
 
     def so_far(self, more: Mapping[Part, int] | None = None) -> tuple[int, ...]:
-        """Return what was taken so far, and more, in the device's order; 1 for what is not taken yet."""
+        """Return the gains taken so far, and more, in the device's order; 1 for a gain that is not taken yet."""
         found = self._raw | dict(more or {})
         return tuple(found.get(part, 1) for part in self._rows)
 
     def proposal(self) -> Proposal:
-        """Return what was taken."""
+        """Return the proposal of the gains taken."""
         return Proposal(tuple(self._raw[part] for part in self._rows), dict(self._wanted), tuple(self._notes))
 
     def _take(self, part: Part, value: float) -> float:

@@ -56,7 +56,7 @@ class Ultimate(NamedTuple):
 
 
 class Swing(NamedTuple):
-    """What a relay experiment says of every axis, each of shape (num_axes,); nan and a reason where nothing.
+    """The swing of every axis under a relay, each of shape (num_axes,); nan and a reason for an axis without one.
 
     frequency: Of the swing [Hz]. amplitude: Of the velocity [rad/s]. slope: Acceleration per current [rad/(A*s^2)],
     K_t/J. lag: Sum of the small lags from current to measured velocity [s]. reason: Why there is nothing, else "".
@@ -125,7 +125,7 @@ def finish(bench: Workbench, ultimate: Ultimate, slope: float) -> Proposal:
 
 
 def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats | None = None) -> Swing:
-    """Swing axes by a relay and return what that says; the drives are enabled in cst meanwhile and off afterwards.
+    """Swing axes by a relay and evaluate the swing; the drives are enabled in cst meanwhile and off afterwards.
 
     The current loop must work: write its gains first. An axis that nears the end of its travel is left alone.
 
@@ -173,7 +173,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
 
 
 def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside: Mask, count_angle: float) -> Swing:
-    """Return what recorded swings say.
+    """Evaluate recorded swings.
 
     Args:
         speed: Velocity once a cycle [rad/s], shape (n, num_axes).
@@ -227,7 +227,7 @@ def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside
 
 
 def fundamental(x: Floats) -> float:
-    """Return the frequency of the strongest line [Hz], nan of a signal that rests."""
+    """Return the frequency of the strongest line [Hz], nan for a signal that rests."""
     y = (x - x.mean()) * np.hanning(len(x))
     if not np.any(y):
         return math.nan

@@ -1,4 +1,4 @@
-"""The rules by name: from what is known of an axis to raw integers of its drive's gains.
+"""The rules by name: from an identified axis to raw integers of its drive's gains.
 
 A rule proposes; nothing is written.
 """
@@ -50,7 +50,7 @@ MEANINGS: Mapping[str, str] = {
 
 
 def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Return what a rule proposes.
+    """Return the proposal of a rule.
 
     Raises:
         ValueError: For an unknown rule, naming those there are, or a drive without a linear model of its loops.

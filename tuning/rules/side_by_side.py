@@ -1,4 +1,4 @@
-"""Rules side by side: what each proposes for an axis as it was identified, with the margins that it would have."""
+"""Rules side by side: the proposal of each for an identified axis, with the margins that it would have."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POINTS = 1500  # frequencies at which margins are looked for
 
 @dataclass
 class AxisRules:
-    """The results of an axis: its model, or why there is none, and the rules' proposals.
+    """The results of an axis: its model, or the reason why it has none, and the rules' proposals.
 
     unswung: Why the relay says nothing.
     """
@@ -37,7 +37,7 @@ class AxisRules:
 
 
 def identified_plants(target: Target, progress: Callable[[float], None]) -> list[Plant | str]:
-    """Return the axes' models, or why there is none: the inertia was not identified."""
+    """Return the axes' models, or the reason for an axis without one: the inertia was not identified."""
     from tuning.identify.identification import identify
 
     with swinging_allowed(target.drives):
@@ -53,12 +53,12 @@ def identified_plants(target: Target, progress: Callable[[float], None]) -> list
 
 
 def proposals(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
-    """Return what rules propose."""
+    """Return the proposals of rules by name."""
     return {name: propose(name, target.device, target.motor, plant) for name in names}
 
 
 def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
-    """Return the relay experiments' proposals, with the current loops that the rule computes, or why there is none."""
+    """Return the relay experiments' proposals, with the rule's current loops, or the reason for a missing one."""
     from tuning.rules.relay import gains_from_swing, relay_experiment, relay_rule
     from tuning.search.trial_bench import read_gains
 

@@ -57,7 +57,7 @@ class SweptObject:
     spacing: str
 
     def values(self) -> NDArray[np.int64]:
-        """Return the raw values in rising order; what is equal after rounding counts once."""
+        """Return the raw values in rising order; values that are equal after rounding count once."""
         spaced = np.geomspace if self.spacing == "log" else np.linspace
         raw = np.rint(spaced(self.low, self.high, self.count)).astype(np.int64)
         return np.unique(np.clip(raw, self.low, self.high))
@@ -65,7 +65,7 @@ class SweptObject:
 
 @dataclass(frozen=True)
 class Excitation:
-    """What every point gets; exactly one of each pair of units is set. Times [s] from the start of the recording."""
+    """The excitation of every point; exactly one of each pair of units is set. Times [s] from the recording's start."""
 
     velocity_time: float
     load_torque: float  # N*m on the load
@@ -88,7 +88,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class MetricChoice:
-    """What ranks: a metric, and its weights if it is a combination."""
+    """The metric of the ranking, and its weights if it is a combination."""
 
     name: str
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -136,7 +136,7 @@ class Experiment:
         return inputs_in([getattr(self, name) for name in _NAMES])
 
     def to_toml(self, versions: Mapping[str, str]) -> str:
-        """Return the experiment as TOML: where a run's folder has its inputs, and the versions of what ran it."""
+        """Return the experiment as TOML: where a run's folder has its inputs, and the versions that ran it."""
         lines = [f"{name} = {toml(as_kept(getattr(self, name)))}" for name in (*_NAMES, "seed")]
         for swept in self.sweep:
             lines += ["", "[[sweep]]", *toml_lines(swept)]
@@ -173,7 +173,7 @@ def load_experiment(
         closed_loop: Without a file take the one that ships for steppers with a loop of this kind closed.
         overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
             sweeps the same gains of any device, over the same range in its units, with the device's usual motor where
-            its own is none of that device's.
+            its own does not suit that device.
 
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
@@ -211,7 +211,7 @@ def shipped_experiment(device: str | None, *, closed_loop: str | None = None) ->
     """Return the experiment that ships for a device, None for the default one.
 
     Raises:
-        ExperimentError: For a device that is none, or that closes no loop where one is wanted.
+        ExperimentError: For an unknown device, or one that closes no loop where one is wanted.
     """
     if device is None:
         return CLOSED_LOOPS[closed_loop] if closed_loop else DEFAULT
@@ -230,7 +230,7 @@ def shipped_experiment(device: str | None, *, closed_loop: str | None = None) ->
 
 
 def resolve(experiment: Experiment) -> Resolved:
-    """Check an experiment against what there is and look its names up.
+    """Look an experiment's names up, and check its values against the device.
 
     Raises:
         ExperimentError: For a name that does not exist, or a value beyond its limits.
@@ -296,7 +296,7 @@ def _velocity_ratio(device: Device, dictionary: ObjectDictionary, preset: Mappin
 
 
 def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
-    """Return what a scale's objects make, of a preset, else by default."""
+    """Return the scale that a preset gives, with defaults for objects that it lacks."""
     given = {dictionary.find(name).label: value for name, value in preset.items()}
     entries = [dictionary.find(key) for key in scale.keys]
     values = [np.array([given.get(entry.label, entry.default)], float) for entry in entries]
@@ -304,7 +304,7 @@ def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[st
 
 
 def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
-    """Return what an experiment sweeps as another device has it: its gains of the same parts, in its units."""
+    """Return the gains of an experiment for another device: its gains of the same parts, in its units."""
     try:
         device = find_device(name)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""What a run takes from its user's files: kept in its folder by content, known by a hash, and sent along with its work.
+"""A run's files from its user: kept in its folder by content, known by a hash, and sent along with its work.
 
 A motor, load, device, set of distributions or suite of one's own is a path. What lies there may be edited while a run
 is stopped, and a worker may have another file of that name. So a run reads it once: from then on its `Input` is what is
@@ -27,11 +27,11 @@ _KEPT = re.compile(rf"{FOLDER}/[a-z]+(?:/[^/\\\0]+)+")
 
 
 class InputError(ValueError):
-    """A file that a run cannot keep, or that is not what it was when the run was begun; one line with its remedy."""
+    """A file that a run cannot keep, or that has changed since the run was begun; one line with its remedy."""
 
 
 class Input(str):
-    """The path of this process's own copy of what a run takes from its user's files.
+    """The path of this process's own copy of a user's file.
 
     Pickled, it is its content: where it is unpickled a copy is made, and no file is looked for.
 
@@ -60,7 +60,7 @@ class Input(str):
 
     @property
     def what(self) -> str:
-        """What it is: motor, load ..."""
+        """Its kind: motor, load ..."""
         return self.kept.split("/")[1]
 
     @property
@@ -81,12 +81,12 @@ class Input(str):
         return self
 
     def __repr__(self) -> str:
-        """Return what tells it from others, wherever its copy lies."""
+        """Return its name and hash, wherever its copy lies."""
         return f"Input({self.kept!r}, {self.hash!r})"
 
 
 def taken(what: str, name: Any, also: Iterable[Path] = ()) -> Any:
-    """Return a name as it is, or what it stands for as an `Input` if it is the path of a file or folder.
+    """Return a name as it is, or an `Input` if it is the path of a file or folder.
 
     Args:
         what: A key of `_FILES`.
@@ -104,7 +104,7 @@ def taken(what: str, name: Any, also: Iterable[Path] = ()) -> Any:
 
 
 def files_of(what: str, path: Path) -> list[Path]:
-    """Return the files that are read of what lies at a path; raises as `taken`."""
+    """Return the files that are read for the one at a path; raises as `taken`."""
     return _FILES[what](path)
 
 
@@ -119,7 +119,7 @@ def inputs_in(value: Any) -> list[Input]:
 
 
 def hashes(inputs: Iterable[Input]) -> dict[str, str]:
-    """Return what settings say of inputs: where the folder has each -> its hash."""
+    """Return the table of inputs in settings: place in the folder -> hash."""
     return {one.kept: one.hash for one in inputs}
 
 
@@ -243,7 +243,7 @@ def is_path(what: str, name: str) -> bool:
 
 
 def is_shipped(what: str, name: str) -> bool:
-    """Return whether a name is one of what ships, whatever lies in the present folder."""
+    """Return whether a name ships, whatever lies in the present folder."""
     if what == "device":
         from drive_env.devices import device_names
 
@@ -252,7 +252,7 @@ def is_shipped(what: str, name: str) -> bool:
 
 
 def _check(what: str, name: str | Path) -> None:
-    """Raise ValueError, with the path as it is given, for what is none."""
+    """Raise ValueError, with the path as it is given, for a file that is not of this kind."""
     if what == "motor":
         from drive_env.motors import find_motor
 
@@ -312,7 +312,7 @@ def _alone(path: Path) -> list[Path]:
 
 
 def _of_load(path: Path) -> list[Path]:
-    """Return the files of an MJCF: what it includes, meshes, textures and height fields."""
+    """Return the files of an MJCF: includes, meshes, textures and height fields."""
     import mujoco
 
     try:
@@ -322,7 +322,7 @@ def _of_load(path: Path) -> list[Path]:
 
 
 def _of_device(path: Path) -> list[Path]:
-    """Return the files of a variant, or of a device's folder; whatever else lies in that is none of the device's."""
+    """Return the files of a variant, or of a device's folder; other files in the folder are left out."""
     if not path.is_dir():
         return [path]
     from drive_env.devices.own_folder import own_data

@@ -1,4 +1,4 @@
-"""What a sweep measures of every point: the table of metrics, and the combined one that ranks by default.
+"""The metrics of a sweep's points: their table, and the combined one that ranks by default.
 
 Speeds are in rpm, as drive engineers read them. For every metric less is better; one that does not exist (never
 settles) is nan.
@@ -68,7 +68,7 @@ class MoveRecording(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What response.py says of a recording; errors [rpm] are set-point less actual."""
+    """The figures of a recording by response.py; errors [rpm] are set-point less actual."""
 
     recording: MoveRecording
     step: response.StepMetrics

@@ -72,7 +72,7 @@ class Pool(Protocol):
 
         Args:
             function: Of a module.
-            items: What it is called with.
+            items: Its arguments.
             say: Called with what is waited for, "" when the work goes on; from any thread.
             fits: Whether a result has the form of what is computed of an item; one from elsewhere that has not is
                 refused.
@@ -256,7 +256,7 @@ class _Dask:
 
     @contextmanager
     def _told_of_no_workers(self, say: Say) -> Iterator[None]:
-        """Say it if the last worker goes: the work waits for another one, for ever if need be."""
+        """Report if the last worker goes: the work waits for another one, for ever if need be."""
         ended = threading.Event()
 
         def watch() -> None:
@@ -379,16 +379,16 @@ class _Call:
 
 
 def _call(function: Callable[..., Any], *arguments: Any) -> bytes:
-    """Return what `pickle.loads` makes a call of.
+    """Return bytes of which `pickle.loads` makes a call.
 
     Dask itself unpickles functions of tasks before they run, and a worker without our packages then ends, once and
-    again, with no word to whoever gives the work. This one is unpickled within the task, whose failure comes back.
+    again, with no word to the caller. This one is unpickled within the task, whose failure comes back.
     """
     return pickle.dumps(_Call(function, *arguments))
 
 
 class _Answer(NamedTuple):
-    """What a worker gives back of a task: on which work, with which versions, and the result with its hash."""
+    """A worker's answer to a task: on which work, with which versions, and the result with its hash."""
 
     work: str
     versions: Mapping[str, str]
@@ -414,13 +414,13 @@ def _checked(sources: str, work: bytes) -> _Answer:
 
 
 def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, again: str) -> Any:
-    """Return the result in an answer; PoolError, with who gave it, for one that is none of this work."""
+    """Return the result in an answer; PoolError, naming the worker, for an answer that does not belong to this work."""
     wrong, result = _wrong_with(answer, work), None
     if not wrong:
         result = pickle.loads(answer.content)
         try:
             good = fits(result)
-        except Exception:  # whatever there is in its place
+        except Exception:  # a foreign object may raise anything
             good = False
         wrong = "" if good else f"a result of another form ({type(result).__name__})"
     if wrong:
@@ -432,7 +432,7 @@ def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, 
 
 
 def _wrong_with(answer: Any, work: bytes) -> str:
-    """Return what an answer is in place of one on this work, "" if it is that."""
+    """Return a description of an answer that does not belong to this work, "" if it does."""
     if not isinstance(answer, _Answer):
         return "nothing" if answer is None else f"a value of type {type(answer).__name__}"
     if answer.versions.get("sources") != provenance.SOURCES:
@@ -464,5 +464,5 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         forget_copies()
-        # At once: whoever waits in a queue that nobody fills any more would wait for ever.
+        # At once: a thread that waits in a queue that is not filled any more would wait for ever.
         os._exit(1)

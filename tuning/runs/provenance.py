@@ -42,7 +42,7 @@ SOURCES = hash_of_sources()
 
 
 def check_begun(what: object, recorded: object, remedy: str) -> None:
-    """Raise ValueError, with both hashes, if what is to be continued was begun with other sources.
+    """Raise ValueError, with both hashes, if a run to be continued was begun with other sources.
 
     Args:
         what: The file or folder that keeps it.
@@ -96,7 +96,7 @@ def check_sources(expected: str) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Return what decides the digits: packages, our sources, Python, the processor for which kernels are compiled."""
+    """Return the versions that decide the digits: packages, our sources, Python, the processor of compiled kernels."""
     import llvmlite.binding
 
     found = {"drive-env": __version__} | {name: importlib.metadata.version(name) for name in _PACKAGES}

@@ -1,4 +1,4 @@
-"""Results of shards in a file that is only ever appended to: what a run leaves if it is killed, and what goes on.
+"""Results of shards in a file that is only ever appended to: a killed run leaves it, and goes on from it.
 
 A frame is a line of JSON, which shard it is, how long its data are and their hash, and the data: NumPy arrays. Frames
 are complete or recognised as incomplete; what was being written when the process was killed is cut off.

@@ -50,7 +50,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep found.
+    """The result of a sweep.
 
     Attributes:
         experiment: The experiment.
@@ -79,7 +79,7 @@ class SweepResult:
 
     @property
     def score(self) -> NDArray[np.float64]:
-        """What ranks, shape (points,)."""
+        """The metric of the ranking, shape (points,)."""
         return np.asarray(self.columns[self.score_column])
 
     @property
@@ -134,7 +134,7 @@ class SweepResult:
 
 
 class Shard(NamedTuple):
-    """A part of a grid: what a sweep is split into, whatever it runs on."""
+    """A part of a grid: a sweep is split into these, whatever it runs on."""
 
     experiment: Experiment
     first: int  # its points, of those of the grid
@@ -206,7 +206,7 @@ def run(
     left = shards(experiment, threads, width=width, done=done)
     report("compiling", 0.0)
     if left:
-        # Of workers as well: they find the kernels compiled, and what there is to warn of is said once and here.
+        # Of workers as well: they find the kernels compiled, and warnings come once and here.
         _compile(experiment)
     started = time.perf_counter()
     with warnings.catch_warnings():
@@ -306,7 +306,7 @@ def _compile(experiment: Experiment) -> None:
 
 
 def _signals(resolved: Resolved) -> list[ObjectName]:
-    """Return what is recorded: velocity and current, or what an open loop has in place of a measured current."""
+    """Return the objects to record: velocity and current, or those of an open loop without a measured current."""
     if resolved.loop is not None:
         return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL]
     if resolved.device.gains.is_open_loop:
@@ -461,7 +461,7 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
 
 
 def _score(columns: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Return what ranks: inf for a point with a flag, or without the figure."""
+    """Return the key of the ranking: inf for a point with a flag, or without the figure."""
     flagged = np.any([columns[flag] for flag in FLAGS], axis=0) | np.isnan(columns["score"])
     return np.where(flagged, np.inf, columns["score"])
 

@@ -22,20 +22,20 @@ SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part
 
 
 def unfinished_folder(folder: str | Path) -> Path:
-    """Return where a run keeps what it has while its folder is absent."""
+    """Return where a run keeps finished shards while its folder is absent."""
     path = Path(folder)
     return path.with_name(path.name + SUFFIX)
 
 
 def settings_of(folder: str | Path) -> Path | None:
-    """Return the settings of an unfinished run, None if there is none."""
+    """Return the settings of an unfinished run, None without an unfinished run."""
     path = unfinished_folder(folder) / SETTINGS
     return path if path.is_file() else None
 
 
 @contextmanager
 def shard_log(folder: str | Path, settings: str, *, resume: bool, inputs: Iterable[Input] = ()) -> Iterator[ShardLog]:
-    """Give the shards of a run that are done, and keep those to come; leave nothing behind if there are none.
+    """Give the shards of a run that are done, and keep those to come; leave no folder behind without any shard.
 
     Args:
         folder: Where the results will be.
@@ -85,7 +85,7 @@ def telling_what_is_kept(folder: str | Path) -> Iterator[None]:
 
 
 def _recorded(settings: Path) -> object:
-    """Return what the settings of an unfinished run say of its inputs; of settings that are none, nothing."""
+    """Return the inputs in the settings of an unfinished run, None if the file cannot be read."""
     try:
         return read_toml(settings).get("inputs")
     except (OSError, ValueError, tomllib.TOMLDecodeError):
@@ -93,18 +93,18 @@ def _recorded(settings: Path) -> object:
 
 
 def has_parts(log: ShardLog) -> bool:
-    """Return whether shards of a run have begun, and kept what they have."""
+    """Return whether shards of a run have begun, and kept partial results."""
     return any(log.path.parent.glob(f"{PART}*"))
 
 
 def part_path(log: ShardLog, shard: int) -> Path:
-    """Return the file in which a shard of a run keeps what it has so far."""
+    """Return the file in which a shard of a run keeps partial results."""
     return log.path.with_name(f"{PART}{shard}")
 
 
 @contextmanager
 def part_log(path: Path, key: str) -> Iterator[ShardLog]:
-    """Give what a shard has done so far, and keep what is to come; leave no file behind if there is nothing."""
+    """Give the partial results of a shard, and keep those to come; leave no file behind without results."""
     with ShardLog(path, key) as log:
         try:
             yield log
@@ -114,5 +114,5 @@ def part_log(path: Path, key: str) -> Iterator[ShardLog]:
 
 
 def discard(folder: str | Path) -> None:
-    """Remove what an unfinished run has left."""
+    """Remove the files of an unfinished run."""
     shutil.rmtree(unfinished_folder(folder), ignore_errors=True)

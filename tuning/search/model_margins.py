@@ -1,4 +1,4 @@
-"""What a search knows of margins: models of identified axes, by which gains are judged before a drive has them."""
+"""Margins by model in a search: models of identified axes, by which gains are judged before a drive has them."""
 
 from __future__ import annotations
 

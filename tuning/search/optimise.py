@@ -1,4 +1,4 @@
-"""Optimisation of gains on drives: a generation of trials at a time, costed from what a drive shows.
+"""Optimisation of gains on drives: a generation of trials at a time, costed from the drives' signals.
 
 Optimisers search the logarithms of gains around the baseline rule's, each machine separately or, where the emulated
 machines are copies of one machine, in one search whose generation they try at the same time. The safe search starts at
@@ -129,7 +129,7 @@ class TrialRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Optimised:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
         gains: The best of every machine, raw integers, (num_axes, count); that of the safe search was never stopped.
@@ -300,7 +300,7 @@ class _Search:
         return min(made) / self._settings.trials if made else 1.0
 
     def best(self) -> tuple[Integers, Floats]:
-        """Return the best gains of every machine, (num_axes, count), and what they cost, (num_machines,)."""
+        """Return the best gains of every machine, (num_axes, count), and their costs, (num_machines,)."""
         bench = self._bench
         start = bench.safe if self._settings.safe else bench.rule
         gains = (start if self._known is None else self._known.before).copy()
@@ -372,7 +372,7 @@ class _Search:
         slack: list[float],
         run: tuple[Tried, Integers] | None = None,
     ) -> None:
-        """Tell a sampler what its proposals are worth; only what keeps the dynamics was run."""
+        """Give a sampler the costs of its proposals; only those that keep the dynamics were run."""
         values, facts, made, untried = [], [], self._made(k), 0
         for place, (point, own, kept) in enumerate(zip(asked, held, slack, strict=True)):
             machine = int(self._members[k][place])
@@ -429,7 +429,7 @@ class _Search:
         ]
 
     def _take(self, k: int, point: Floats, row: TrialRow) -> None:
-        """Remember a trial; what is better than all before and was not stopped is what the next ones go back to."""
+        """Remember a trial; if it is better than all before and was not stopped, the next ones go back to it."""
         self.rows.append(row)
         (self._refuted if row.aborted else self._proved)[k].append(point)
         for machine in map(int, self._members[k]):
@@ -468,7 +468,7 @@ class _Search:
             )
 
     def _held_back(self, k: int, point: Floats) -> Floats:
-        """Return the point, in the safe search drawn near to what was proved and away from what was refuted."""
+        """Return the point, in the safe search drawn near to proved points and away from refuted ones."""
         if not self._settings.safe:
             return point
         proved, caution = np.array(self._proved[k]), self._bench.method.caution
@@ -547,7 +547,7 @@ def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow
 
 
 def objective_values(row: TrialRow, objectives: Sequence[str]) -> tuple[float, ...]:
-    """Return what a trial is worth in each objective, less is better."""
+    """Return a trial's value in each objective, less is better."""
     broken = math.log(2.0 - math.exp(min(row.slack, 0.0)))  # as the robust cost counts it
     return tuple(
         row.robust_cost if name == COST else row.objectives[OBJECTIVES.index(name)] + broken for name in objectives

@@ -1,4 +1,4 @@
-"""What proposes gains: points of a box, a generation at a time, and takes their cost.
+"""Samplers propose gains: points of a box, a generation at a time, and take their costs.
 
 TPE, CMA-ES and Gaussian processes are Optuna's, by ask and tell. Their samplers are made anew for every generation from
 seed and number of the generation, so that a study that was broken off and is taken up again proposes what it would have
@@ -30,13 +30,13 @@ STARTUP = 6  # trials of TPE and GP that are drawn at random before the model sa
 
 
 class Proposer(Protocol):
-    """Points of a box, and what they cost."""
+    """Points of a box, and their costs."""
 
     def ask(self, count: int) -> list[Floats]:
         """Return so many points, or fewer if there are no more."""
 
     def tell(self, values: Sequence[Sequence[float]], facts: Sequence[Mapping[str, Any]]) -> None:
-        """Take what the points asked for last are worth, one row of objectives each, less is better.
+        """Take the values of the points asked for last, one row of objectives each, less is better.
 
         `facts` is what else is to be remembered of each, as JSON has it.
         """
@@ -50,7 +50,7 @@ class Proposer(Protocol):
 
 
 class Study(NamedTuple):
-    """A study of a journal: its name in there, and as lines of text what its points are of."""
+    """A study of a journal: its name in there, and as lines of text the subject of its points."""
 
     name: str = "study"
     subject: str = ""
@@ -84,10 +84,10 @@ def new_proposer(
         first: Points that are proposed before all others.
         generation: How many points are asked for at a time: the population of CMA-ES, if it is 4 or more.
         journal: File in which Optuna's studies are kept, and from which one that was broken off goes on.
-        study: What the journal calls the study, and what it is of: one of something else is refused.
+        study: The study's name in the journal, and its subject: a study of another subject is refused.
 
     Raises:
-        ValueError: For a sampler that is none, that has one objective only, or that lacks a package.
+        ValueError: For an unknown sampler, one that has one objective only, or one that lacks a package.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"no sampler is named {sampler!r}; there are {', '.join(SAMPLERS)}")
@@ -112,7 +112,7 @@ def check_installed(sampler: str) -> None:
 
 
 def load(sampler: str) -> None:
-    """Import what a sampler needs, which takes a second or more: too long with an axis enabled."""
+    """Import a sampler's package, which takes a second or more: too long with an axis enabled."""
     if sampler != "grid":
         importlib.import_module("optuna.samplers")
 
@@ -219,7 +219,7 @@ class _Optuna:
 
     @contextmanager
     def _quiet(self) -> Iterator[None]:
-        """Say nothing of what Optuna calls experimental."""
+        """Silence Optuna's warnings of experimental features."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
             yield

@@ -26,14 +26,14 @@ from tuning.toml_tables import toml
 
 
 class Search(NamedTuple):
-    """A search on an emulated machine: what `emulated` takes, and how it is searched."""
+    """A search on an emulated machine: the arguments of `emulated`, and the settings."""
 
     machine: Mapping[str, Any]
     settings: Settings
 
 
 class _SearchTask(NamedTuple):
-    """A search to be run, and the file from which it goes on with its key; None if there is none."""
+    """A search to be run, and the file from which it goes on with its key; None without a file."""
 
     search: Search
     path: Path | None
@@ -55,7 +55,7 @@ def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list
 
 
 def description(shards: list[Search]) -> str:
-    """Return what makes these searches what they are, as TOML lines."""
+    """Return the machine and the settings of searches as TOML lines; equal searches have equal lines."""
     lines = [f"searches = {len(shards)}"]
     machine = as_kept(dict(shards[0].machine))
     lines += [f"machine.{name} = {_text(value)}" for name, value in machine.items() if value is not None]
@@ -70,7 +70,7 @@ def run(
     log: ShardLog,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Optimised]:
-    """Run what is not in the log yet, and return what every search found, in their order.
+    """Run the searches that are not in the log yet, and return the results of all, in their order.
 
     Args:
         shards: The searches.
@@ -129,7 +129,7 @@ def joined(found: list[Optimised]) -> Optimised:
 
 
 def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: None) -> Arrays:
-    """Return what a search found, of the machine that its machines are, as arrays."""
+    """Run a search on the machine that its machines are; return the result as arrays."""
     search = task.search
     kept = nullcontext() if task.path is None else part_log(task.path, task.key)
     with emulated(**search.machine) as target, kept as log:

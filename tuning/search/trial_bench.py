@@ -67,8 +67,8 @@ class Tried(NamedTuple):
         among them; RMS increment of the current over the rated one [%], in open loop the RMS of the currents that are
         set.
     aborted: Stopped in any phase, (num_machines,).
-    fragile: Shook on with the incumbent's gains after it had been stopped, (num_machines,): those are none to keep.
-    causes: Emergencies of the machine's drives meanwhile, texts, (num_machines,); "" where there were none.
+    fragile: Shook on with the incumbent's gains after it had been stopped, (num_machines,): not gains to keep.
+    causes: Emergencies of the machine's drives meanwhile, texts, (num_machines,); "" without one.
     """
 
     cost: Floats
@@ -245,7 +245,7 @@ class TrialBench:
         return np.array([", ".join(dict.fromkeys(filter(None, axes))) for axes in machines], np.str_)
 
     def _stopped(self, axes: Mask, error: SafetyError) -> Tried:
-        """Return what there is to say of a trial that the envelope ended: everything that took part is stopped."""
+        """Return the result of a trial that the envelope ended: everything that took part is stopped."""
         self._stops += 1
         if self._stops > MOST_STOPS:
             raise error

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEPT, STOPPED, FRAGILE, FRONT = "#0072b2", "#d55e00", "#cc79a7", "black"
-# What each objective is told as, less is better; the search itself knows the first three as logarithms.
+# The title of each objective, less is better; the search itself knows the first three as logarithms.
 TITLES = {COST: "J", "speed": "settles [ms]", "robustness": "worst J over J", "current": "ripple [%]"}
 MEANINGS = {
     COST: "J by measured terms",
@@ -122,7 +122,7 @@ def is_tried_by_pid(device: str, gains: tuple[str, ...] | None) -> bool:
 
 
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
-    """Return what a trial reached in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
+    """Return a trial's figure in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
     scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
     told = dict(zip((COST, *OBJECTIVES), (row.cost, *row.objectives), strict=True))
     return [scales[name] * math.exp(told[name]) if name in scales else told[name] for name in objectives]
@@ -156,7 +156,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
 
 
 def axis_numbers(machine: Mapping[str, Any], count: int) -> list[int]:
-    """Return what results call the axes of a search: chosen ones by their number among all axes of the nodes."""
+    """Return the numbers of a search's axes in results: chosen ones by their number among all axes of the nodes."""
     from drive_env.devices import find_device
 
     parts = machine.get("axis")
@@ -226,7 +226,7 @@ def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
 
 
 def _scale(axis: Any, set_scale: Any, name: str) -> None:
-    """Scale an axis of a picture: what is a factor by its logarithm, with plain numbers at the lines."""
+    """Scale an axis of a picture: factors by their logarithm, with plain numbers at the lines."""
     if name == "current":
         return
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -238,7 +238,7 @@ def _scale(axis: Any, set_scale: Any, name: str) -> None:
 
 
 def _draw_best(axes: Any, rows: list[TrialRow], values: list[float], label: str | None) -> None:
-    """Draw what a search had found by each of its trials, of those that were accepted."""
+    """Draw the best accepted trial of a search so far, by trials."""
     least, best, shown = math.inf, [], math.nan
     for row, value in zip(rows, values, strict=True):
         if row.accepted and row.robust_cost < least:

@@ -29,7 +29,7 @@ LOOP_FIGURES = (BEFORE, AFTER)
 
 
 def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[int, int]]) -> dict[str, Floats]:
-    """Put the gains of the closed loop into what load detection has found; return `LOOP_FIGURES`, (num_axes,) each.
+    """Write the gains of the closed loop into the result of load detection; return `LOOP_FIGURES`, (num_axes,) each.
 
     Axes on which no gains are better in trials that are made again keep what they have, with a reservation.
 

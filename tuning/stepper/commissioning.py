@@ -53,7 +53,7 @@ MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
 
 
 def check_stepper(target: Target) -> None:
-    """Load what the search needs; ValueError unless drives have a load detection to be set, before anything is done."""
+    """Import the search's packages; ValueError, before anything moves, for drives without a load detection to set."""
     if lacks := lacks_load_detection(target.device):
         raise ValueError(
             f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "
@@ -123,7 +123,7 @@ def commission(
 def _commissioned(
     bench: TrialBench, target: Target, gains: Integers, weakness: Sequence[str], say: Progress
 ) -> tuple[LoadDetection, dict[str, Floats]]:
-    """Return what was found at the working speed; of axes that fail there at a lower one, which it says."""
+    """Return the result at the working speed; of axes that fail there at a lower one, with a note."""
     weak = np.array([bool(reason) for reason in weakness])
     detection, figures = _found_at(bench, target, gains, ~weak, WORK[0], say)
     for k in map(int, np.flatnonzero(weak)):
@@ -209,7 +209,7 @@ def _moves(bench: TrialBench, gains: Integers, share: float) -> WorkingMoves:
 
 
 def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed: float) -> dict[str, Floats]:
-    """Put load and obstacle on the axes, or say that nobody did."""
+    """Put load and obstacle on the axes, or add the reservation that this was not done."""
     found = detection.found
     lost = np.full(target.num_axes, np.nan)
     if not can_load(target):
@@ -327,7 +327,7 @@ def _axis(
 def _settings(
     k: int, transaction: Transaction, target: Target, roles: dict[Role, tuple[int, int]]
 ) -> dict[str, dict[str, int]]:
-    """Return what an axis had, and has now, of the objects beside the gains; one that is given up has what it had."""
+    """Return values before and now of an axis' objects beside the gains; equal ones for an axis that is given up."""
     return {
         f"{index:04X}:{sub:02X}": {
             "before": transaction.before.axes[k][index, sub], "after": int(target.drives.read(role)[k]),

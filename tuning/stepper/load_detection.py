@@ -60,7 +60,7 @@ COOL_RAISES = 3  # of the lower threshold, where steps were lost
 
 @dataclass
 class Found:
-    """What was found of the axes, (num_axes,) each; nan and 0 where nothing was.
+    """The settings found for the axes, (num_axes,) each; nan and 0 without a result.
 
     per_volt: Counts of the reading of a volt given back. margin: Reading of the axis' own load with the threshold.
     wanted: What that was to be. speed: The working speed [rad/s]. angle: Load angle at the working speed [rad].
@@ -96,7 +96,7 @@ class Found:
 
 
 class LoadDetection:
-    """Finds the settings on drives that moves turn; `gains` are what the drives have, raw, (num_axes, count)."""
+    """Finds the settings on drives that moves turn; `gains` are the drives' own, raw, (num_axes, count)."""
 
     def __init__(self, drives: Drives, motor: Motor, moves: WorkingMoves, gains: Integers, speed: float) -> None:
         self.gains = gains.copy()
@@ -108,7 +108,7 @@ class LoadDetection:
         self._run, _ = run_and_standby(device_of(drives), gains)
 
     def take(self, other: LoadDetection, where: Mask) -> None:
-        """Take what was found of some axes in other moves."""
+        """Take the settings of some axes from other moves."""
         self.gains = np.where(where[:, None], other.gains, self.gains)
         self._run = np.where(where, other._run, self._run)
         for row in fields(Found):
@@ -246,7 +246,7 @@ class LoadDetection:
         return self._moves.run(speed, self.found.going())
 
     def _reject_stopped(self, where: Mask, reason: str) -> None:
-        """Give axes up that went into fault in the last move, with what their drives have told."""
+        """Give axes up that went into fault in the last move, with their drives' emergencies."""
         causes = stop_causes(self._drives) if where.any() else []
         for k in np.flatnonzero(where):
             self.found.reject(np.arange(len(where)) == k, f"{reason}: {causes[k]}")

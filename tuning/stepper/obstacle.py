@@ -31,7 +31,7 @@ STALL = "stall"  # in what a drive says by itself
 
 @dataclass(frozen=True)
 class ObstacleProof:
-    """What load and obstacle did to the axes, (num_axes,) each.
+    """The reaction of the axes to load and obstacle, (num_axes,) each.
 
     withstood: Neither stopped nor lost steps with the acceptable load. causes: What the drives told meanwhile, "" for
     nothing. stopped: Stopped by a stall at the obstacle. lost: Whole teeth (four full steps) that were lost until then.
@@ -102,7 +102,7 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
 
 @contextmanager
 def _loading(target: Target) -> Iterator[Callable[[Floats], None]]:
-    """Give what puts torques on the axes as their rotors see them: of a machine of one axis where its load is."""
+    """Give a function that puts torques on the axes as their rotors see them: of a machine of one axis at its load."""
     machine = machine_of(target.drives)
     if target.axes_per_machine > 1:
         with machine.pushed() as push:

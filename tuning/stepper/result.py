@@ -1,4 +1,4 @@
-"""The result of commissioning a stepper: what became of each axis, as the certificate has it."""
+"""The result of commissioning a stepper, axis by axis, as the certificate has it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CERTIFICATE = "stepper-certificate.json"
 
 @dataclass(frozen=True)
 class StepperAxis:
-    """What became of one axis; figures are None where they were not measured.
+    """The result of one axis; figures are None where they were not measured.
 
     Attributes:
         before, after: Gains by name.
@@ -115,7 +115,7 @@ class StepperResult:
 
 
 def figure(value: float, digits: int = 5) -> float | None:
-    """Return a number as the certificate has it: None for what was not measured."""
+    """Return a number as the certificate has it: None for one that was not measured."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 

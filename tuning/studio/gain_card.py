@@ -1,4 +1,4 @@
-"""The card of gains: a slider and a number for each, what it is in SI, undo, and the way back to the state before."""
+"""The card of gains: a slider and a number for each, its value in SI, undo, and the way back to the state before."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class GainCard:
         self._controls.append((gain, slider, number, unit))
 
     def _slides(self, column: int, place: int) -> None:
-        """Show what a slider means while it is moved; written when it is let go."""
+        """Show a slider's value while it is moved; written when it is let go."""
         if self._is_setting or not self.wanted:
             return
         gain, _, number, _ = self._controls[column]

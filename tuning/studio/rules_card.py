@@ -1,4 +1,4 @@
-"""The card of identification and rules: values with their intervals, and what each rule proposes, side by side."""
+"""The card of identification and rules: values with their intervals, and each rule's proposal, side by side."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LONG = 14  # letters from which a cell is a text rather than a figure
 
 
 def identified_rows(found: Identification) -> list[tuple[str, str, str]]:
-    """Return title, value with unit, and interval or the reason why there is none."""
+    """Return rows of title, value with unit, and interval or the reason of a refusal."""
     rows = []
     for name, estimate in found.estimates.items():
         if estimate.is_known:
@@ -66,7 +66,7 @@ class RulesCard:
         await panel.visitor.do(tune_jobs.identify_axes(panel.desk), "Identification", paced=False)
 
     def show(self) -> None:
-        """Show what was found."""
+        """Show the results."""
         desk, axis = self._panel.desk, self._panel.axis
         seen = id(desk.identified), id(desk.rules)
         if not hasattr(self, "_found") or seen == self._seen or axis >= len(desk.identified):

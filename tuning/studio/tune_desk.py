@@ -1,4 +1,4 @@
-"""What the page Tune knows of a session: gains and their history, recordings, the present run of a tuner."""
+"""The state of the page Tune in a session: gains and their history, recordings, the present run of a tuner."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MOST_STEPS = 1000  # changes of gains that can be taken back one by one
 
 @dataclass(frozen=True)
 class GainChange:
-    """A change of an axis' gains that can be taken back: raw integers before and after, and what it was."""
+    """A change of an axis' gains that can be taken back: raw integers before and after, and its cause."""
 
     axis: int
     before: tuple[int, ...]
@@ -78,7 +78,7 @@ class StepRecording:
 
 @dataclass(frozen=True)
 class AxisVerdict:
-    """What a run made of an axis, for people."""
+    """The verdict of a run on an axis, for people."""
 
     axis: int
     verdict: str
@@ -118,7 +118,7 @@ class TunerSession:
 
 @dataclass
 class MachineEntries:
-    """What people say of the machine: the motor, how far it may turn, supply, how axes belong together."""
+    """A user's entries about the machine: the motor, how far it may turn, supply, how axes belong together."""
 
     motor: str = ""
     travel: str = ""
@@ -127,7 +127,7 @@ class MachineEntries:
 
 
 class TuneDesk:
-    """What the pages of one session share.
+    """The state that the pages of one session share.
 
     Args:
         session: The drives.
@@ -162,7 +162,7 @@ class TuneDesk:
         return self.session.is_emulated
 
     def touch(self) -> None:
-        """Take note that something has changed."""
+        """Note that something has changed."""
         with self._lock:
             self.version += 1
 
@@ -172,7 +172,7 @@ class TuneDesk:
         return mine[::-1][: LAST + 1]
 
     def note(self, axis: int, before: Sequence[int], after: Sequence[int], what: str) -> None:
-        """Add a change to the history; one that changes nothing is none."""
+        """Add a change to the history, unless the gains are equal."""
         old, new = tuple(map(int, before)), tuple(map(int, after))
         if old != new:
             self.changes.append(GainChange(axis, old, new, what))

@@ -1,4 +1,4 @@
-"""What the page Tune asks of the drives, each a job: a function of the drives."""
+"""The jobs of the page Tune, each a function of the drives."""
 
 from __future__ import annotations
 
@@ -311,7 +311,7 @@ def rest(drives: Drives) -> None:
 
 
 def _told(desk: TuneDesk, what: str) -> Callable[[float], None]:
-    """Return what is called with the share done: the page shows it, and a job that was stopped ends."""
+    """Return a callback for the share done: the page shows it, and a job that was stopped ends."""
 
     def tell(share: float) -> None:
         desk.session.tell(what, share)
@@ -376,7 +376,7 @@ def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]
 
 
 def verdicts(result: Any) -> tuple[AxisVerdict, ...]:
-    """Return what a result says of its axes, that of auto or of a stepper's commissioning."""
+    """Return the verdicts of a result on its axes, that of auto or of a stepper's commissioning."""
     return tuple(
         AxisVerdict(
             k, axis.verdict, axis.reason, tuple(axis.reservations), tuple(getattr(axis, "notes", ())),

@@ -59,7 +59,7 @@ class TunePanel:
         visitor: The page.
 
     Attributes:
-        device: What they are.
+        device: The drives' device.
     """
 
     def __init__(self, session: Session, visitor: Visitor) -> None:
@@ -79,7 +79,7 @@ class TunePanel:
 
     @property
     def motor(self) -> Any:
-        """The motor that is turned, as far as it is known."""
+        """The emulated machine's motor, else the one entered, else the usual one of the device."""
         made = self.session.glimpse(lambda machine: machine.drives.motor)
         return made or find_motor(self.desk.entries.motor or self.device.default_motor)
 
@@ -117,7 +117,7 @@ class TunePanel:
         return card(title, name)
 
     def gains_slide(self) -> None:
-        """Show what the sliders would make of the response."""
+        """Show the response with the sliders' gains."""
         self.response.show(tuple(self.gains.wanted))
 
     def _show(self) -> None:
@@ -138,7 +138,7 @@ class TunePanel:
                 await asyncio.wrap_future(future)
 
     def _machine_card(self) -> None:
-        """Ask what no bus tells: motor, travel, supply, coupling."""
+        """Ask for motor, travel, supply and coupling, which no bus knows."""
         desk = self.desk
         emulated = desk.is_emulated
         with self.card("Machine", "machine"):

@@ -33,7 +33,7 @@ LINES = 12  # of what a run says that are shown
 
 
 class TunerCard:
-    """What starts tuners, and what the present or last run says.
+    """The buttons that start tuners, and the state of the present or last run.
 
     Args:
         panel: The page.
@@ -67,7 +67,7 @@ class TunerCard:
                 part.build(panel)
 
     def build_run(self) -> None:
-        """Make the card that says what the run does and did."""
+        """Make the card with the run's progress and result."""
         with self._panel.card("Run", "run"):
             self._head = ui.label("No run yet.").classes("studio-strong").props("role=status data-test=run-head")
             self._bar = ui.linear_progress(value=0.0, show_value=False).props('aria-label="Progress of the run"')

@@ -113,7 +113,7 @@ def merge(found: dict[str, Any], others: Mapping[str, Any]) -> None:
 
 
 def read_value(value: Any) -> Any:
-    """Return what an entry means: RL-Zoo writes tables as "dict(...)" and classes as "nn.Tanh", numbers as 1e-4 too.
+    """Return the value of an entry: RL-Zoo writes tables as "dict(...)" and classes as "nn.Tanh", numbers as 1e-4 too.
 
     Raises:
         HyperparameterError: For anything else that would have to be evaluated.

@@ -27,7 +27,7 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
     """Return object name -> raw value, in the order of writing.
 
     Raises:
-        ValueError: If a gain leaves the drive's range: the motor is none for this drive.
+        ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
     """
     from drive_env.gains import gains_from_bandwidths
 

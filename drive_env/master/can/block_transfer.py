@@ -1,6 +1,6 @@
 """Block transfers as a client: many bytes with an answer for every 127 segments, and not for each (CiA 301).
 
-What is lost is sent again: whoever receives names the last segment that came in order, and the next sub-block begins
+What is lost is sent again: the receiver names the last segment that came in order, and the next sub-block begins
 behind it.
 """
 
@@ -38,7 +38,7 @@ class NoBlockTransferError(Exception):
 
 
 class SdoChannel(Protocol):
-    """What a transfer needs of its client; errors are python-canopen's."""
+    """The client's side that a transfer needs; errors are python-canopen's."""
 
     def send_request(self, request: bytes) -> None:
         """Send a frame."""

@@ -1,7 +1,7 @@
 """Identifiers for PDOs of further axes, which a module of several axes has none for at first.
 
 CiA 301 gives four PDOs of each direction to a node. Axis k of node n borrows those of node n + k, as if every axis were
-a node of its own: 281h is TPDO 2 of node 1, 282h the second TPDO of its axis 1. Nobody else may be there.
+a node of its own: 281h is TPDO 2 of node 1, 282h the second TPDO of its axis 1. No other node may have that node-ID.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class BorrowedIdentifiers:
         """Return the node-ID whose identifiers an axis of a node has.
 
         Raises:
-            BusError: If there is none so high, or a node answers there, ours or another.
+            BusError: If that node-ID is too high, or a node answers under it, ours or another.
         """
         if node not in self._free:
             self._look(node)

@@ -10,7 +10,7 @@ from drive_env.dictionary.entries import Entry
 
 BIT_RATE = 1_000_000  # bit/s, the highest of classical CAN
 FRAME_BITS = 47  # of a frame without data, the gap after it included (ISO 11898-1)
-SHARE = 0.8  # of a cycle, that PDOs may take which nobody asked for: requests and emergencies want the rest
+SHARE = 0.8  # of a cycle that PDOs beyond those asked for may take: requests and emergencies want the rest
 
 
 class BusTime(NamedTuple):
@@ -25,7 +25,7 @@ class BusTime(NamedTuple):
         return bits <= SHARE * self.bit_rate * self.cycle
 
     def excess(self, groups: Sequence[Sequence[Entry]], axes: int) -> str | None:
-        """Return what to say of PDOs that cannot all go with a SYNC, even without stuff bits; None of those that can.
+        """Return a message about PDOs that cannot all go with a SYNC, even without stuff bits; None if they can.
 
         Args:
             groups: The entries of each PDO of an axis.

@@ -78,7 +78,7 @@ class CanLink:
         return ErrorControls(self.port, self.nodes, self._clients, self._description)
 
     def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
-        """Take whom to tell of waiting for an answer, and of a node that has booted though nobody here has reset it."""
+        """Set callbacks: `alive` while an answer is waited for, `restarted` for a node that booted unasked."""
         self._alive, self._restarted = alive, restarted
 
     # --- objects and states -----------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ class CanLink:
                 self.port.drain()
                 beats.clear()
                 time.sleep(TIME_LOOK)
-                self._read(0, producer)  # whoever is late answers after what was due before
+                self._read(0, producer)  # a node that is late answers after what was due before
                 self._write(0, producer, before)
             if noted:
                 signal.raise_signal(noted[0])
@@ -170,7 +170,7 @@ class CanLink:
         return self.port.wait(done, timeout)
 
     def drain(self) -> None:
-        """Hand out what has arrived, without waiting."""
+        """Process the received frames, without waiting."""
         self.port.drain()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A dry run: what would go over the bus is written down, and a drive that obeys at once is imagined behind it.
+"""A dry run: frames are written down in place of being sent, and a drive that obeys at once is simulated behind it.
 
 Without an answer nothing would go on, so reads return the dictionary's defaults or what was written, and the
 statusword follows the controlword.
@@ -82,12 +82,12 @@ class DrySdoClient:
             self._values[cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0] = struct.pack("<H", 0x0240)
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
-        """Return what was written, or else the dictionary's default."""
+        """Return the bytes written before, or else the dictionary's default."""
         self._request(struct.pack("<BHB4x", 0x40, index, sub))
         return self._values.get((index, sub), b"\0\0\0\0")
 
     def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
-        """Return what `read` does."""
+        """Return the bytes that `read` returns."""
         return self.read(index, sub, "", timeout)
 
     def command(self, index: int, sub: int, data: bytes) -> None:

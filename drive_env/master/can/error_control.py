@@ -1,4 +1,4 @@
-"""What the drive does when its master dies: it misses heartbeats (1016h) or its life is not guarded (100Ch, 100Dh).
+"""The drive's watch over its master: it misses heartbeats (1016h) or its life is not guarded (100Ch, 100Dh).
 
 Each process sends heartbeats under a node-ID of its own: two that shared one would hide each other's death.
 """
@@ -48,7 +48,7 @@ class Heartbeats:
             port.subscribe(ERROR_CONTROL + node, partial(self._hear, node))
 
     def choose(self) -> None:
-        """Take a node-ID that nobody is heard under; the process' number makes two choose two."""
+        """Choose a node-ID without heartbeats on the bus; by the process' number two programs choose different ones."""
         self._port.drain()
         if self.node_id and self.node_id not in self._heard:
             return
@@ -58,16 +58,16 @@ class Heartbeats:
 
     @property
     def is_shared(self) -> bool:
-        """Whether somebody else sends heartbeats under our node-ID."""
+        """Whether another program sends heartbeats under our node-ID."""
         return self.node_id in self._heard
 
     def is_alive(self, node: int, within: float) -> bool:
-        """Wait up to `within` [s] for a heartbeat of somebody; return whether one came."""
+        """Wait up to `within` [s] for a heartbeat of a node; return whether one came."""
         since = time.monotonic()
         return self._port.wait(lambda: self._heard.get(node, -1.0) >= since, within)
 
     def send(self) -> None:
-        """Send one, unless somebody else was found to send under our node-ID."""
+        """Send a heartbeat, unless another program was found to send under our node-ID."""
         if self.node_id:
             self._port.send(ERROR_CONTROL + self.node_id, bytes((OPERATIONAL,)))
 
@@ -170,7 +170,7 @@ class ErrorControl:
             self._guard()
 
     def restore(self) -> None:
-        """Put the objects back as they were. Whoever calls has proved that the node's axes are off.
+        """Put the objects back as they were. The caller has proved that the node's axes are off.
 
         The master's heartbeats must go on until then: a drive that still waits for them, and misses them, stops, and
         answers no more.
@@ -182,7 +182,7 @@ class ErrorControl:
         self.kind = "none"
 
     def forget(self) -> None:
-        """Forget what was: the node was reset."""
+        """Forget the settings: the node was reset."""
         self._objects.forget()
         self.kind = "none"
 
@@ -196,7 +196,7 @@ class ErrorControl:
             raw = int.from_bytes(self._objects.read(key), "little")
             watched, period = raw >> 16 & 0x7F, raw & 0xFFFF
             if key in self._objects or not (watched and period) or watched == self._heartbeats.node_id:
-                pass  # ours, or nobody's
+                pass  # ours, or of no node
             elif self._heartbeats.is_alive(watched, 1e-3 * period):
                 living.append(watched)
                 continue
@@ -245,12 +245,12 @@ class Beats:
             self._beat()
 
     def keep(self) -> None:
-        """Send what is due."""
+        """Send the heartbeats or requests that are due."""
         if not self.has_ceased and self._clock() >= self._next:
             self._beat()
 
     def cease(self) -> None:
-        """Send the last ones: a node that was started meanwhile watches anew from them, and stops by itself, too."""
+        """Send the last ones: a node started meanwhile watches again from them on, and stops by itself, too."""
         self.has_ceased = True
         self.begin()
 
@@ -339,7 +339,7 @@ class ErrorControls:
         self._controls[node].restore()
 
     def forget(self, node: int) -> None:
-        """Forget what was: the node was reset, and its error control is its own again."""
+        """Forget the settings: the node was reset, and its error control is its own again."""
         self._controls[node].forget()
 
     def take_rival(self) -> str:

@@ -41,8 +41,8 @@ class LssMaster:
 
     Args:
         port: The bus.
-        timeout: Longest wait for an answer [s]; a step of a scan that nobody answers takes all of it.
-        is_dry: Nobody answers, and everything succeeds: frames are shown.
+        timeout: Longest wait for an answer [s]; a step of a scan without an answer takes all of it.
+        is_dry: A dry run without slaves: frames are shown, and everything succeeds.
     """
 
     def __init__(self, port: Port, timeout: float = 0.1, *, is_dry: bool = False) -> None:
@@ -80,7 +80,7 @@ class LssMaster:
             yield found
 
     def fastscan(self) -> LssIdentity | None:
-        """Find one slave without a node-ID, bit by bit, and switch it into configuration; None if there is none.
+        """Find one slave without a node-ID, bit by bit, and switch it into configuration; None if no slave answers.
 
         Raises:
             LssError: If a slave answers at first and not at last.
@@ -278,7 +278,7 @@ def show(identity: LssIdentity) -> str:
 
 
 def parse_identity(text: str) -> LssIdentity:
-    """Return the identity of "286:664:10009:5"; ValueError for what is none."""
+    """Parse an identity such as "286:664:10009:5"; ValueError for other text."""
     parts = text.replace("0x", "").split(":")
     try:
         numbers = [int(part, 16) for part in parts]

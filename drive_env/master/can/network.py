@@ -19,7 +19,7 @@ _EMCY_LAYOUT = struct.Struct("<HB5s")
 
 
 class Network:
-    """Commands the nodes' communication states and collects what they report by themselves.
+    """Commands the nodes' communication states and collects their boot-ups, heartbeats and emergencies.
 
     Args:
         port: The bus.
@@ -33,7 +33,7 @@ class Network:
         self._booted: set[int] = set()
         self._resets = False
         self.on_boot: Callable[[int], None] = lambda node: None
-        self.on_restart: Callable[[int], None] = lambda node: None  # of a node that nobody here has reset
+        self.on_restart: Callable[[int], None] = lambda node: None  # of a node that booted without our reset
         self.on_error_control: Callable[[int, bytes], None] | None = None
         for node in self._nodes:
             port.subscribe(EMCY + node, partial(self._on_emergency, node))

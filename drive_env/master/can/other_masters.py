@@ -1,6 +1,6 @@
 """Whether another master commands the nodes: frames that only a master sends, and that are not ours.
 
-A bus hands a program everybody's frames but its own, so what comes with such an identifier is somebody else's.
+A program receives every frame of the bus but its own, so a frame with such an identifier is from another master.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from drive_env.master.errors import BusError
 
 
 class OtherMastersError(BusError):
-    """Another master commands the nodes, and what we would do disturbs both."""
+    """Another master commands the nodes, so that our commands and its own would disturb each other."""
 
 
 class OtherMasters:
-    """Listens for other masters whenever somebody receives from the port.
+    """Listens for other masters whenever frames are received from the port.
 
     Args:
         port: The bus.

@@ -140,8 +140,8 @@ class PdoConfiguration:
         """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
 
         PDOs of this direction that carried a mapping of ours and are not needed any more are put back. Other TPDOs that
-        go with SYNC, as the factory's may, are silent meanwhile: the SYNCs are ours, and a frame that nobody asked for
-        holds up the next one for 0.1 ms.
+        go with SYNC, as the factory's may, are silent meanwhile: the SYNCs are ours, and each frame that was not asked
+        for holds up the next one for 0.1 ms.
 
         Raises:
             ObjectAccessError: If the drive refuses; BusError if it gives the PDO no identifier.
@@ -176,7 +176,7 @@ class PdoConfiguration:
         tidying.end()
 
     def forget(self) -> None:
-        """Forget what was found: the node was reset and has its own configuration again."""
+        """Forget the configuration found: the node was reset and has its own again."""
         self._before.clear()
         self._silenced.clear()
         self._quiet.clear()
@@ -225,7 +225,7 @@ class PdoConfiguration:
         return RemotePdo(label, can_id, start, tuple(members))
 
     def _usual_identifier(self, direction: Direction, number: int, axis: int) -> int:
-        """Return the identifier of a PDO that has none: the node's, or a borrowed one; 0 of a fifth PDO of an axis."""
+        """Return the identifier of a PDO that has none: the node's, or a borrowed one; 0 for a fifth PDO of an axis."""
         usual = direction.identifiers
         if number < len(usual):
             return usual[number] + self._node
@@ -291,7 +291,7 @@ class PdoConfiguration:
         put(communication, 1, cob_id, 4)
 
     def _is_fixed(self, direction: Direction, number: int) -> bool:
-        """Return whether nobody can write when an RPDO takes effect: then it does as it comes, just before SYNC."""
+        """Return whether the type of an RPDO cannot be written: then it acts as it comes, just before SYNC."""
         kind = (direction.communication + number, 2)
         known = self._description
         return direction is INTO_DRIVE and known.has(kind) and known.dictionary.find(kind).access in ("ro", "const")

@@ -1,6 +1,6 @@
-"""The master's port to a bus: frames go out, frames come in, and whoever waits for an identifier gets its data.
+"""The master's port to a bus: frames go out, frames come in, and a thread that waits for an identifier gets its data.
 
-There is no receiving thread: whoever waits receives, so a frame's way has no queue between threads in it. The bus
+There is no receiving thread: the thread that waits receives, so no frame passes a queue between threads. The bus
 (the kernel, the socket) keeps what arrives in the meantime. Two threads may wait at a time, the program's and the
 supervisor's (drive_env/safety/supervisor.py): one receives for both.
 """
@@ -29,7 +29,7 @@ TOKEN_VARIABLE = "DRIVE_ENV_TOKEN"
 MOST_FRAMES = 10_000
 SEND_TIMEOUT = 0.5  # [s]
 _LINE_TIME = 0.002  # for the rest of a frame that has begun to arrive (slcan: a line of text) [s]
-_ORPHANED = 0.05  # s for which whoever has the turn does nothing with it
+_ORPHANED = 0.05  # s for which the thread that has the turn does nothing with it
 _TURN = 0.0003  # how often a thread looks for what another one has received for it [s]
 _ADDRESS = re.compile(r"[\w.-]+:\d+")  # HOST:PORT
 
@@ -161,7 +161,7 @@ class Port:
         return True
 
     def drain(self) -> None:
-        """Hand out what has arrived, without waiting (and without end, where more comes than can be received)."""
+        """Process the received frames, without waiting (and not for ever, where more come than can be received)."""
         for _ in range(MOST_FRAMES):
             if not self.receive():
                 return
@@ -192,7 +192,7 @@ class Port:
             if self._is_receiving:
                 idle_since = time.monotonic()
             elif time.monotonic() - idle_since > _ORPHANED and self._receiving.locked():
-                # Ctrl-C came to the other thread between its turn and its first instruction: nobody would receive.
+                # Ctrl-C came to the other thread between its turn and its first instruction: no thread would receive.
                 self._receiving.release()
             if (done is not None and done()) or time.monotonic() >= deadline:
                 return False

@@ -48,13 +48,13 @@ class RpdoRows:
 
 
 class PdoProcessData:
-    """What is mapped at present, and the way between its integers and its frames.
+    """The present mapping, and the conversion between its integers and its frames.
 
     Args:
         port: The bus.
         description: What device the nodes are.
         configurations: The PDOs of each node.
-        dry: Nobody is there: nothing is sampled.
+        dry: A dry run: no drive is connected, and nothing is sampled.
         bus_time: What the bus carries in a cycle.
 
     Attributes:
@@ -90,15 +90,15 @@ class PdoProcessData:
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
     ) -> tuple[Entry, ...]:
-        """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+        """Return the objects to sample: the wanted ones, then as many of the welcome ones, in their order, as fit.
 
         Args:
-            wanted: To be sampled.
+            wanted: Objects to sample.
             welcome: If PDOs and bus have room for it.
-            played: What goes into the drives meanwhile.
+            played: Objects that are sent to the drives meanwhile.
 
         Raises:
-            ObjectAccessError: 06040042h if not even what is wanted fits.
+            ObjectAccessError: 06040042h if not even the wanted ones fit.
         """
         besides = [entry for entry in welcome if entry not in wanted]
         into = self._plan(INTO_DRIVE, tuple(played)) or []
@@ -130,7 +130,7 @@ class PdoProcessData:
             self._map(OUT_OF_DRIVE, sampled)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what the mapped TPDOs carry."""
+        """Return the objects that the mapped TPDOs carry."""
         return self._entries(OUT_OF_DRIVE)
 
     def outputs(self, played: Mapping[Entry, Integers]) -> RpdoRows | None:
@@ -147,14 +147,14 @@ class PdoProcessData:
         )
 
     def samples(self) -> PdoSamples | None:
-        """Begin to collect the mapped TPDOs; None if there are none, or nobody is there."""
+        """Begin to collect the mapped TPDOs. None if nothing is mapped, or in a dry run."""
         of_nodes = self._mapped.get(OUT_OF_DRIVE.name, ((), []))[1]
         if self._dry or not any(of_nodes):
             return None
         return PdoSamples(self._port, of_nodes, self._description.num_axes)
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes were configured to: they have restarted, and nothing counts as mapped."""
+        """Forget the configuration of nodes that have restarted: nothing counts as mapped."""
         for k in nodes:
             self._configurations[k].forget()
         self.mapping += 1

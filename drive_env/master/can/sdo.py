@@ -90,7 +90,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._transfer(index, sub, data, f"the write of {label}", timeout)
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write what an object had before; where no answer comes it is written once more, and waited for longer.
+        """Write an object's value of before; without an answer it is written once more, with a longer wait.
 
         A node that has missed its master's heartbeats may be stopped, where it answers no SDO: it is woken first, into
         pre-operational.
@@ -139,7 +139,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             raise BusError(several_answer(2, self._node))
 
     def _count_seconds(self, answers: list[bytes]) -> None:
-        """Take note of answers to transfers that had theirs, and forget them all."""
+        """Note answers to transfers that had theirs, and forget them all."""
         while answers:
             answer = answers.pop(0)
             if len(answer) == 8 and (answer[0] == _ABORT or answer[0] & 0xE0 in _INITIATE):
@@ -187,13 +187,13 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             ) from None
 
     def _take_for_answered(self) -> None:
-        """Take note that a transfer had its answer, unless that of the one before may be late."""
+        """Note that a transfer had its answer, unless that of the one before may be late."""
         if not self._has_retried:
             self._recent.append(self._object)
         self._has_retried = False
 
     def _read(self, index: int, sub: int) -> bytes:
-        """Read in segments what is short, and in blocks what the server says to be long."""
+        """Read short values in segments, and in blocks those that the server says to be long."""
         with ReadableStream(self, index, sub) as stream:
             if stream.exp_data is not None or (stream.size or 0) < BLOCK_FROM or not self._has_blocks:
                 return bytes(stream.read())

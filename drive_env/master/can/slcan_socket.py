@@ -30,7 +30,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         token: What a hub that is open to the network asks for. One that asks for none is joined all the same.
 
     Raises:
-        OpenError: For an address, a bit rate or a token that is none, the wrong token, or nobody there; in receiving,
+        OpenError: For an invalid address, bit rate or token, the wrong token, or no hub at the address; in receiving,
             if the hub asks for a token and none was given.
     """
 
@@ -75,7 +75,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         return (self._frames.popleft() if self._frames else None), False
 
     def _read(self, timeout: float | None) -> None:
-        """Take in what is there, after waiting for something."""
+        """Read the received bytes, after waiting for some."""
         try:
             if timeout == 0.0 or select.select([self._socket], [], [], timeout)[0]:
                 data = self._socket.recv(_CHUNK)
@@ -128,7 +128,7 @@ def _connect(channel: str) -> socket.socket:
         return socket.create_connection((host, int(port)), CONNECT_TIMEOUT)
     except (OSError, OverflowError) as error:
         raise OpenError(
-            f"nobody answers at {channel}: {error}; start `drive-env serve`, or correct --channel"
+            f"no hub answers at {channel}: {error}; start `drive-env serve`, or correct --channel"
         ) from error
 
 
@@ -161,7 +161,7 @@ def _present(token: str, connection: socket.socket, channel: str) -> None:
 
 
 def _parse(line: bytes, now: float) -> can.Message | None:
-    """Return the frame of a line; answers to commands are none."""
+    """Return the frame of a line; None for other lines, as answers to commands are."""
     if line[:1] not in (b"t", b"T", b"r", b"R"):
         return None
     extended, remote = line[:1] in (b"T", b"R"), line[:1] in (b"r", b"R")

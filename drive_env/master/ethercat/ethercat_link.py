@@ -105,7 +105,7 @@ class EtherCatLink:
         return ProcessWatchdog(self._master, self.nodes, self._clients, self.process, self._description)
 
     def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
-        """Take whom to tell of waiting for an answer, and of a node that has booted though nobody here has reset it."""
+        """Set callbacks: `alive` while an answer is waited for, `restarted` for a node that booted unasked."""
         self._alive, self._restarted = alive, restarted
 
     # --- objects and states -----------------------------------------------------------------------------------------
@@ -165,7 +165,7 @@ class EtherCatLink:
         return [one for one in self._master.take_emergencies() if one.node in self.nodes]
 
     def time_passes(self) -> bool | None:
-        """Look whether the clock of the first slave goes while no process data are exchanged; None of one without."""
+        """Return whether the first slave's clock goes while no process data are exchanged; None without a clock."""
         before = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
         time.sleep(TIME_LOOK)
         after = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
@@ -211,7 +211,7 @@ class EtherCatLink:
         return True
 
     def drain(self) -> None:
-        """Do nothing: what comes back is taken with the exchange."""
+        """Do nothing: answers are taken with the exchange."""
 
     def close(self) -> None:
         """Take all slaves to Init and let go of the segment."""
@@ -223,7 +223,7 @@ class EtherCatLink:
         self._alive()
         if self._lockstep or time.monotonic() - self.process.exchanged_at <= FACTORY / 3.0:
             return
-        # Who has the images may be waiting for this mailbox; the other of the two threads must not wait for them.
+        # The thread that has the images may be waiting for this mailbox; the other one must not wait for them.
         if self.process.turn.acquire(blocking=False):
             try:
                 self.process.exchange(is_cycle=False)

@@ -1,4 +1,4 @@
-"""What the link over EtherCAT asks of a master: slaves found, states, objects over CoE, one exchange of images.
+"""The interface of a master under the link over EtherCAT: slaves, states, objects over CoE, exchange of images.
 
 There are two: `soem_master.py` has SOEM do it, for network interfaces; `frame_master.py` does it by itself, for
 whatever carries frames as bytes: UDP, or a segment of the same process.
@@ -37,7 +37,7 @@ class SlaveStatus(NamedTuple):
 
 
 class SlaveIdentity(NamedTuple):
-    """What the EEPROM of a slave says: vendor, product code, revision, serial number."""
+    """A slave's identity in its EEPROM: vendor, product code, revision, serial number."""
 
     vendor: int
     product: int
@@ -76,7 +76,7 @@ class EtherCatMaster(Protocol):
         """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends. Returns how many.
 
         Raises:
-            BusError: If there is none, or one does not come to Pre-Op.
+            BusError: If there is no slave, or one does not come to Pre-Op.
         """
 
     def recover(self, position: int) -> bool:
@@ -87,7 +87,7 @@ class EtherCatMaster(Protocol):
         """
 
     def identity(self, position: int) -> SlaveIdentity:
-        """Return what a slave's EEPROM says."""
+        """Return the identity in a slave's EEPROM."""
 
     def status(self, position: int) -> SlaveStatus:
         """Return a slave's state, asked now."""

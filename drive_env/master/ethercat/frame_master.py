@@ -45,7 +45,7 @@ LONGEST_IMAGE = 1400  # bytes of all slaves in one frame
 
 
 class SlavePlaces(NamedTuple):
-    """What a slave's EEPROM says: who it is, (address, length) of its mailboxes, (address, control) of its images."""
+    """A slave's EEPROM: identity, (address, length) of its mailboxes, (address, control) of its images."""
 
     identity: SlaveIdentity
     receive: tuple[int, int]
@@ -103,7 +103,7 @@ class FrameMaster:
         return None if found is None else found[0]
 
     def _surely(self, command: int, station: int, address: int, data: bytes, what: str) -> bytes:
-        """Do what may be done twice until a slave has had it.
+        """Repeat a datagram that may be done twice until a slave has had it.
 
         Raises:
             NoAnswerError: If none has.
@@ -144,7 +144,7 @@ class FrameMaster:
         for position in range(self._count()):
             what = f"position {position}"
             status = self._surely(C.APRD, -position, registers.AL_STATUS, bytes(6), what)
-            # A master that was there before may have left the EEPROM to the device, where nobody else can read it.
+            # A master that was there before may have left the EEPROM to the device, where we cannot read it.
             owner = self._surely(C.APRD, -position, registers.SII_ACCESS, bytes(1), what)
             self._surely(C.APWR, -position, registers.SII_ACCESS, bytes(1), what)
             try:
@@ -181,7 +181,7 @@ class FrameMaster:
         return has_restarted
 
     def identity(self, position: int) -> SlaveIdentity:
-        """Return what a slave's EEPROM says."""
+        """Return the identity in a slave's EEPROM."""
         return self._places[position].identity
 
     def status(self, position: int) -> SlaveStatus:

@@ -56,7 +56,7 @@ class CallWay:
         return self._came.pop(0) if self._came else None
 
     def close(self) -> None:
-        """Forget what came."""
+        """Drop received frames."""
         self._came.clear()
 
 
@@ -75,7 +75,7 @@ class UdpWay:
 
     def send(self, payload: bytes) -> None:
         """Send a datagram."""
-        with contextlib.suppress(OSError):  # nobody serves there now: no answer says so
+        with contextlib.suppress(OSError):  # no server at the address now: no answer says so
             self._socket.send(payload)
 
     def receive(self, timeout: float) -> bytes | None:
@@ -94,7 +94,7 @@ class RawWay:
         interface: Its name, as veth0.
 
     Raises:
-        OpenError: Where there is none, or raw sockets are not there or not allowed.
+        OpenError: If there is no such interface, or raw sockets are missing or not allowed.
     """
 
     def __init__(self, interface: str) -> None:
@@ -137,6 +137,6 @@ def _receive(sock: socket.socket, timeout: float) -> bytes | None:
         return None
     try:
         return sock.recv(LARGEST)
-    except OSError:  # nobody serves there, or the interface is down
+    except OSError:  # no server at the address, or the interface is down
         time.sleep(min(timeout, 1e-3))
         return None

@@ -73,7 +73,7 @@ class ImageSamples:
 
 
 class ImageRows:
-    """Rows of what is played, ready to be put into the output images."""
+    """Rows to play, ready to be put into the output images."""
 
     def __init__(self, data: EtherCatProcessData, layout: ImageLayout, played: Mapping[Entry, Integers]) -> None:
         self._data = data
@@ -95,7 +95,7 @@ class ImageRows:
 
 
 class EtherCatProcessData:
-    """What is mapped at present, and the exchange of images.
+    """The present mapping, and the exchange of images.
 
     Args:
         master: Of the segment.
@@ -154,7 +154,7 @@ class EtherCatProcessData:
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
     ) -> tuple[Entry, ...]:
-        """Return what is wanted, and what of the welcome is in the same image.
+        """Return the wanted entries, and those of `welcome` that are in the same image.
 
         Raises:
             ObjectAccessError: 06040042h if not even what is wanted fits.
@@ -167,11 +167,11 @@ class EtherCatProcessData:
         """Return whether the images that are exchanged carry these already."""
         if self.missing or not self._carries(OUTPUTS, played):
             return False
-        # What nobody needs any more is not read before each frame.
+        # An object that is not recorded any more is not read before each frame.
         return set(sampled) - set(self._layouts[INPUTS].entries) == set(self._beside)
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
-        """Have images carry entries of every axis besides what is in them, as far as there is room.
+        """Have images carry entries of every axis besides their present ones, as far as there is room.
 
         Raises:
             ObjectAccessError: 06040042h if they do not fit; 08000022h while an axis is enabled: images are changed in
@@ -196,20 +196,20 @@ class EtherCatProcessData:
         self.operate()
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every cycle."""
+        """Return the objects that come with every cycle; none before the images are ready."""
         return (*self._layouts[INPUTS].entries, *self._beside) if self._ready else ()
 
     def outputs(self, played: Mapping[Entry, Integers]) -> ImageRows | None:
-        """Return rows to send; None of nothing."""
+        """Return rows to send; None without mapped objects."""
         return ImageRows(self, self._layouts[OUTPUTS], played) if played else None
 
     def samples(self) -> ImageSamples | None:
-        """Begin to collect input images; None while there are none."""
+        """Begin to collect input images; None before they are ready."""
         self.owed = 0
         return ImageSamples(self, self._sampled_layout(), self._description) if self._ready else None
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes have: they have restarted."""
+        """Forget the images of nodes that have restarted."""
         self.mapping += 1
         with self.turn:
             self._ready -= set(nodes)
@@ -230,7 +230,7 @@ class EtherCatProcessData:
         return [k for k in range(len(self._nodes)) if k not in self._ready]
 
     def prepare(self) -> None:
-        """Give the slaves that are in Pre-Op their images, filled with what their objects have, and go to Safe-Op."""
+        """Give the slaves that are in Pre-Op their images, filled with their objects' values, and go to Safe-Op."""
         layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
         for k in self.missing:
             for direction, layout in layouts.items():
@@ -256,7 +256,7 @@ class EtherCatProcessData:
                 self._master.leave_op(position)
 
     def put(self, node: int, key: Key, data: bytes) -> bytes | None:
-        """Put what an object gets into the output image; return what was there, None of an object not in it."""
+        """Put an object's value into the output image; return the bytes before, None if the image lacks the object."""
         if node not in self._ready or key not in self._places:
             return None
         start, size = self._places[key]
@@ -270,7 +270,7 @@ class EtherCatProcessData:
         return bool(self._ready) and key in self._places
 
     def exchange(self, is_cycle: bool, timeout: float = FRAME) -> bool:
-        """Exchange images with all slaves; what comes back outside a cycle is nobody's sample.
+        """Exchange images with all slaves; only those of a cycle are samples.
 
         Returns:
             Whether the images of all of them came back.
@@ -305,7 +305,7 @@ class EtherCatProcessData:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _fitting(self, wanted: Sequence[Entry]) -> tuple[Entry, ...]:
-        """Return what of the wanted an image can have together, the first ones first."""
+        """Return those of the wanted entries that fit into one image, the first ones first."""
         fitting: tuple[Entry, ...] = ()
         for entry in wanted:
             with suppress(ObjectAccessError):
@@ -315,7 +315,7 @@ class EtherCatProcessData:
         return fitting
 
     def _sampled_layout(self) -> ImageLayout:
-        """Return where each object is in a row: the input image, and behind it what is read by SDO."""
+        """Return where each object is in a row: the input image, and behind it the objects read by SDO."""
         layout, members = self._layouts[INPUTS], []
         size = layout.size
         for entry in self._beside:
@@ -326,7 +326,7 @@ class EtherCatProcessData:
         return layout._replace(members=(*layout.members, *members), size=size)
 
     def _read_beside(self) -> list[bytes]:
-        """Return of each slave what is read by SDO, in the order of `_sampled_layout`."""
+        """Read the objects beside the image of each slave by SDO, in the order of `_sampled_layout`."""
         known, rows = self._description, []
         for client in self._clients:
             parts = []
@@ -338,7 +338,7 @@ class EtherCatProcessData:
         return rows
 
     def _layout(self, direction: int) -> ImageLayout:
-        """Return the image that is mapped, or will be where nobody asks for more: the slave's, and what is needed."""
+        """Return the image that is mapped, or will be unless more is asked for: the slave's own, completed."""
         if direction not in self._layouts:
             found = self._slaves[0].found(direction, self._planner)
             self._layouts[direction] = self._planner.completed(direction, found)
@@ -383,7 +383,7 @@ class EtherCatProcessData:
         return any(entry in layout.entries for layout in self._layouts.values())
 
     def _as_it_is(self, node: int, layout: ImageLayout) -> bytearray:
-        """Return an output image of what the slave's objects have now; 0 of those that cannot be read."""
+        """Return an output image of the slave's present values; 0 for those that cannot be read."""
         image = bytearray(layout.size)
         for member in layout.members:
             if member.entry.access != "wo":
@@ -400,4 +400,4 @@ def _is_below_0(data: bytes) -> bool:
 
 
 def _nothing(_: object) -> None:
-    """Take what nobody asks for."""
+    """Discard the value (no-op callback)."""

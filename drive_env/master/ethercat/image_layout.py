@@ -29,7 +29,7 @@ class ImageLayout(NamedTuple):
         pdo: Object that the sync manager is assigned.
         members: Objects of the axes and their places; one of the whole node stands for each axis.
         size: Length [bytes].
-        mapped: Mapping entries to be written; None of a ready-made image.
+        mapped: Mapping entries to be written; None for a ready-made image.
     """
 
     pdo: int
@@ -52,7 +52,7 @@ class ImageLayout(NamedTuple):
 
 
 class ImagePlanner:
-    """Finds images of a device that carry what is wanted.
+    """Finds images of a device that carry wanted entries.
 
     Args:
         description: The device. Images that it has ready-made are those of its data.
@@ -93,7 +93,7 @@ class ImagePlanner:
         return layout if layout.mapped == tuple(mapped) else None
 
     def plan(self, direction: int, wanted: Sequence[Entry], current: ImageLayout) -> ImageLayout:
-        """Return an image with what is wanted of every axis; the current one if that has it.
+        """Return an image with the wanted entries of every axis; the current one if it has them.
 
         Raises:
             ObjectAccessError: 06040042h if it is too much for one image.
@@ -113,7 +113,7 @@ class ImagePlanner:
         return self._filled(direction, layout, current.entries)
 
     def completed(self, direction: int, current: ImageLayout) -> ImageLayout:
-        """Return an image with what commands and shows a drive besides, as far as there is room."""
+        """Return an image with the entries that command and show a drive besides, as far as there is room."""
         return current if current.mapped is None else self._filled(direction, current, ())
 
     def free(self, pdo: int, entries: Iterable[Entry]) -> ImageLayout:
@@ -137,7 +137,7 @@ class ImagePlanner:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _find_ready_made(self, direction: int, wanted: Sequence[Entry], current: ImageLayout) -> ImageLayout:
-        """Return the first ready-made image that has what is wanted; ObjectAccessError 06040041h if none has."""
+        """Return the first ready-made image that has the wanted entries; ObjectAccessError 06040041h if none has."""
         others = self._ready_made[direction]
         for layout in others:
             if set(wanted) <= set(layout.entries):
@@ -150,7 +150,7 @@ class ImagePlanner:
         raise ObjectAccessError(CANNOT_BE_MAPPED, f"{missing.label} is in no image of this drive, for every axis")
 
     def _of_fields(self, pdo: int, fields: Iterable[tuple[Key | None, int]]) -> ImageLayout:
-        """Return the ready-made image of fields: each an object, None for what is reserved, and its bits."""
+        """Return the ready-made image of fields: each an object, None for a reserved one, and its bits."""
         known = self._description
         members, bit = [], 0
         for key, bits in fields:

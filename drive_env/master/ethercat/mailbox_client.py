@@ -120,12 +120,12 @@ class MailboxClient:
             self._turn.release()
 
     def look(self, timeout: float) -> None:
-        """Take what waits and is no answer; who has no turn within `timeout` [s] leaves it to who has."""
+        """Take waiting messages that are no answers, unless another thread has the turn for `timeout` [s]."""
         if not self._turn.acquire(timeout=max(timeout, 0.0)):
             return
         try:
             while True:
-                with contextlib.suppress(SlaveMailboxError):  # of a request that nobody waits for any more
+                with contextlib.suppress(SlaveMailboxError):  # of a request that is not waited for any more
                     if self._take() is None:
                         return
         finally:
@@ -133,12 +133,12 @@ class MailboxClient:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _ask(self, request: bytes, key: bytes | None, deadline: float) -> bytes:
-        """Return what answers a request, without its CoE header; `key` is index and sub-index that it must be of."""
+        """Return the answer to a request, without its CoE header; `key`: the index and sub-index that it must have."""
         whole = self._request(request)
         is_sent = False
         while True:
             # Sent again, since its frame did not come back, it has the same counter and is done once. The slave may
-            # have had it all the same, and one whose answers nobody reads takes no more requests.
+            # have had it all the same, and one whose answers are not read takes no more requests.
             is_sent = is_sent or bool(self._send_message(whole))
             answer = self._take()
             if answer is None:
@@ -163,7 +163,7 @@ class MailboxClient:
         time.sleep(LOOK)
 
     def _take(self) -> bytes | None:
-        """Take a message: return the SDO that it is, b"" for another one, None where there is none."""
+        """Take a message: return the SDO that it is, b"" for another kind, None if there is no message."""
         data = self._fetch()
         if data is None:
             self._repeat()

@@ -99,7 +99,7 @@ class ProcessWatchdog:
         self._data.is_silent = True
 
     def end(self) -> None:
-        """Take note that the watchdogs are given up; images may go on."""
+        """Note that the watchdogs are given up; images may go on."""
         self._time = math.inf
 
     def is_set(self, node: int) -> bool:
@@ -127,7 +127,7 @@ class ProcessWatchdog:
                 self._master.write_register(self._nodes[node], registers.SM_WATCHDOG, before)
 
     def forget(self, node: int) -> None:
-        """Forget what was found: the node was reset."""
+        """Forget the watchdog found: the node was reset."""
         self._objects[node].forget()
         self._before.pop(node, None)
         self._set.pop(node, None)

@@ -1,4 +1,4 @@
-"""What a slave has mapped: read as it was found, changed in Pre-Op from the outside in, put back."""
+"""The mapping of a slave: read as found, changed in Pre-Op from the outside in, put back."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SlaveImages:
         self._before: dict[int, tuple[list[int], dict[int, list[int]]]] = {}
 
     def found(self, direction: int, planner: ImagePlanner) -> ImageLayout:
-        """Return the image that the slave has now; an empty one where a program could not name what is in it."""
+        """Return the image that the slave has now; an empty one if it has entries without a name."""
         assigned = self._read_list(direction, 2)
         pdo = assigned[0] if assigned else FIRST_PDO[direction]
         mapped = self._read_list(pdo, 4)
@@ -59,7 +59,7 @@ class SlaveImages:
         tidying.end()
 
     def forget(self) -> None:
-        """Forget what was found: the slave has restarted."""
+        """Forget the images found: the slave has restarted."""
         self._before.clear()
 
     # --- inside -----------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The objects of a slave, by its mailbox; what the output image carries besides is put there, too."""
+"""The objects of a slave, by its mailbox; values that the output image carries are put there, too."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class SlaveObjects:
             raise
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write what an object had before; a slave that is silent is woken."""
+        """Write an object's value of before; a slave that is silent is woken."""
         try:
             self.write(index, sub, data, label, timeout)
         except NoAnswerError:
@@ -93,7 +93,7 @@ class SlaveObjects:
             self._data.exchange(is_cycle=False)
 
     def _named(self, call: Callable[[], T], what: str, timeout: float) -> T:
-        """Make a transfer, and tell by name what went wrong with it."""
+        """Make a transfer; its errors name the object."""
         where = f"position {self._position}"
         try:
             return call()

@@ -116,7 +116,7 @@ class SoemMaster:
         return not status.state
 
     def identity(self, position: int) -> SlaveIdentity:
-        """Return what a slave's EEPROM says."""
+        """Return the identity in a slave's EEPROM."""
         slave = self._slave(position)
         serial = self._quietly(lambda: slave.eeprom_read(0x0E))
         return SlaveIdentity(slave.man, slave.id, slave.rev, int.from_bytes(serial or b"", "little"))

@@ -1,4 +1,4 @@
-"""What a refused or missing state is called in messages (ETG.1000.6, table 11; ETG.1020)."""
+"""Messages about refused or missing states (ETG.1000.6, table 11; ETG.1020)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def state_name(state: int) -> str:
 
 
 def refusal(position: int, wanted: AlState, status: SlaveStatus) -> str:
-    """Return what to tell of a slave that does not come to a state."""
+    """Return a message about a slave that does not come to a state."""
     if not status.state:
         return f"position {position} does not answer; check cable and power"
     code = status.code

@@ -67,7 +67,7 @@ def write_controlword(drive: Drive, word: int) -> Drive:
 
 
 def _remembering_less(drive: Drive) -> Drive:
-    """Return the drive without what of its controlword no longer matters, so that equal futures are equal states."""
+    """Return the drive without controlword bits that no longer matter, so that equal futures are equal states."""
     return drive if drive.ramps else drive._replace(word=drive.word & cia402.FAULT_RESET)
 
 
@@ -124,7 +124,7 @@ def _enter(drive: Drive, nmt: NmtState) -> Drive:
 
 
 def write_consumer(drive: Drive, node: int) -> Drive:
-    """Return the drive after a write of 1016h: whoever is watched must be heard anew."""
+    """Return the drive after a write of 1016h: the node that it watches must be heard anew."""
     return drive._replace(consumer=node, heard=False)
 
 

@@ -1,4 +1,4 @@
-"""What must not happen in a session, and the search for it: breadth first, so that a trace found is a shortest one."""
+"""The forbidden situations of a session, and the search for them: breadth first, so that traces are shortest ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drive_env.safety.model.situation import (
 )
 from drive_env.safety.model.steps import attended, left_alone, steps
 
-RUNS_ON = "runs on: nobody watches, and no watchdog ends it"
+RUNS_ON = "runs on: nothing monitors it, and no watchdog ends it"
 GIVEN_UP = "the watchdog is given up while the axis is live"
 UNWATCHED = "the axis is live under our hand, and neither a watchdog nor the envelope was made ready"
 TAKEN_FOR_OFF = "the envelope takes a live axis for off"
@@ -112,7 +112,7 @@ def described(s: Situation) -> str:
 
 @dataclass
 class Exploration:
-    """What was found.
+    """The result of an exploration.
 
     Attributes:
         states: How many situations are reachable.

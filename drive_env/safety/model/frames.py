@@ -28,7 +28,7 @@ def deliver(s: Situation, frame: Held) -> Situation:
 
 
 class ModelTransfer(NamedTuple):
-    """How an SDO transfer may end: what happened to it, and the answer that its client takes for its own."""
+    """How an SDO transfer may end: its fate, and the answer that its client takes for its own."""
 
     kind: str
     text: str

@@ -25,7 +25,7 @@ from drive_env.safety.model.situation import (
 
 
 def signal_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
-    """Return what may come over the process: signals, a pause, its death."""
+    """Yield the steps of the process as a whole: signals, a pause, a kill."""
     if s.at in GONE:
         return
     if assumptions.coincidences or not s.interfered:
@@ -59,7 +59,7 @@ _FOREIGN = {
 
 
 def other_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
-    """Return what other masters, other programs and the drive itself may do."""
+    """Yield the steps of other masters, other programs and the drive itself."""
     if s.drive.latched is not None:
         yield Step("foreign SYNC", "another master sends SYNC", moved(s, sync(s.drive), Hand.OURS))
     if s.twin:

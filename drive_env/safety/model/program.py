@@ -1,4 +1,4 @@
-"""What the program may do between two calls, and what the library does in the program's thread."""
+"""The possible steps of the program between two calls, and of the library in the program's thread."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ PLAYS = ((ENABLE,), (SHUTDOWN, ENABLE))  # whose last word enables
 
 
 def program_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
-    """Return what the program's thread may do next."""
+    """Yield the next steps of the program's thread."""
     if s.at is At.PROGRAM:
         yield from _calls(s, rules, assumptions)
     elif s.at is At.ARM:
@@ -127,7 +127,7 @@ def _configure(s: Situation, rules: Rules, assumptions: Assumptions, kind: str, 
             if answer:
                 yield from _beat(after, rules, both, done)
             else:
-                # Written anew, 1016h watches nobody until the next heartbeat: no state for an axis that may be live.
+                # A new 1016h watches no node until the next heartbeat: no state for an axis that may be live.
                 failed = begun(refused(after), rules) if rules.watches and s.armed else refused(after)
                 yield Step(both, joined(done, more), failed)
 

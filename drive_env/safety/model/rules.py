@@ -122,12 +122,12 @@ OURS = Rules(
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What the world is taken to do.
+    """Assumptions about the world.
 
     Attributes:
         troubles: How many troubles a run has: a frame lost, held back or doubled, a node that falls silent, an act of
             another master, a second program with our node-ID, a fault of the drive, a pause of the process. Signals, a
-            hung program and a kill are none: they are always possible, but see `coincidences`.
+            hung program and a kill do not count: they are always possible, but see `coincidences`.
         keeps_order: Frames of one identifier arrive in their order, as CAN controllers and the hub send them.
         coincidences: The process may be killed between an act of another master and the stop that it sets off: until
             the drive is in quick stop active or off, some 20 ms.

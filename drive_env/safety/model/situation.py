@@ -1,4 +1,4 @@
-"""Everything that matters at one moment of a session, and what a step leads to."""
+"""Everything that matters at one moment of a session, and the steps from it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Hand(_Place):
 
 
 class Held(NamedTuple):
-    """A frame that was held back: its identifier's part ("request", "answer", "rpdo") and what it holds."""
+    """A frame that was held back: its identifier's part ("request", "answer", "rpdo") and its content."""
 
     kind: Literal["request", "answer", "rpdo"]
     content: object
@@ -86,7 +86,7 @@ class Situation(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Something that may happen: its kind, what an engineer reads of it, and what is then."""
+    """A possible step: its kind, its text for an engineer, and the situation after it."""
 
     kind: str
     text: str
@@ -156,5 +156,5 @@ def begun(s: Situation, rules: Rules) -> Situation:
 
 
 def joined(what: str, more: str) -> str:
-    """Return what is done, and what becomes of it if there is more to say."""
+    """Join an action and its consequence; without a consequence the action alone."""
     return f"{what}; {more}" if more else what

@@ -38,7 +38,7 @@ def attended(s: Situation, rules: Rules) -> bool:
 
 
 def left_alone(s: Situation, rules: Rules) -> Situation:
-    """Return what comes next when the program does nothing and no trouble comes."""
+    """Return the situation that follows when the program does nothing and no trouble comes."""
     acts = next(supervisor_steps(s, rules, Assumptions(troubles=0)), None)
     return _time_passes(s, rules) if acts is None else acts.after
 

@@ -1,4 +1,4 @@
-"""What the thread does that watches and stops; in the code before, the program stops in its own."""
+"""The steps of the thread that watches and stops; in the code before, the program stops in its own."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drive_env.safety.model.situation import (
 
 
 def supervisor_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
-    """Return what the thread that stops does; that of TODAY is the program's, but for a stall."""
+    """Yield the steps of the thread that stops drives; with the rules TODAY it is the program's, but for a stall."""
     if s.at in GONE:
         return
     if s.stop in IN_A_STOP:
@@ -71,14 +71,14 @@ def _look(s: Situation, rules: Rules) -> Steps:
 def _stop(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
     if s.stop is StopStage.QUICK:
         for kind, text, after, answer in transfers(s, cia402.CONTROLWORD, QUICK_STOP, assumptions):
-            # Once in quick stop active it needs nobody any more: a controlword that comes late changes nothing.
+            # Once in quick stop active it needs no help any more: a controlword that comes late changes nothing.
             stops = answer is not None and after.drive.fsa is not Fsa.OPERATION_ENABLED
             sent = after._replace(stop=StopStage.RAMP, ramped=True, acknowledged=answer is not None)
             sent = sent._replace(interfered=s.interfered and not stops)
             yield Step(kind, joined("the stop sends 6040h = 02h", text), sent)
     elif s.stop is StopStage.RAMP:
-        # A quick stop that comes while operation is being disabled waits for that ramp, if it came; we wait as long as
-        # somebody else watches, too.
+        # A quick stop that comes while operation is being disabled waits for that ramp, if it came; we wait as
+        # long as a second watchdog is in force, too.
         guarded = _watchdog_is_there(s, rules) and s.twin != master_id(rules)
         waits = s.drive.fsa is not Fsa.OPERATION_ENABLED or (s.drive.ramps and s.acknowledged and guarded)
         if not (s.drive.live and s.drive.turns and waits and has_sdo(s)) or s.silent:
