@@ -15,8 +15,9 @@ from thinning import part
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, rule_gains
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import Gains, rule_gains, write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins

@@ -11,7 +11,8 @@ from auto_stages import basis, designs, recorded, short_designs
 from test_auto import gains, standing_in
 
 from drive_env import cia402, motion
-from drive_env.gains import Gains, Rule, rule_gains, write_gains
+from drive_env.devices.gains import Gains, Rule, rule_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.true_plant import true_plant

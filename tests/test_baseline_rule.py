@@ -9,8 +9,8 @@ import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
+from drive_env.devices.gains import BASELINE_RULE, rule_gains
 from drive_env.envs.randomisation import Distributions, RandomMachines
-from drive_env.gains import BASELINE_RULE, rule_gains
 from drive_env.loops.dynamics import find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines

@@ -18,7 +18,7 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from drive_env.devices import find_device
-from drive_env.gains import Gains, bandwidths_from_gains, gains_in_si
+from drive_env.devices.gains import Gains, bandwidths_from_gains, gains_in_si
 from drive_env.loops.margins import Margins, margins
 from drive_env.motors import find_motor
 from tuning.certificate.certificate import (

@@ -19,9 +19,9 @@ from test_suite import open_machines
 
 from drive_env import cia402, motion
 from drive_env.devices import find_device
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.gains import write_gains
 from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group

@@ -9,8 +9,9 @@ from scipy.linalg import expm
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, gains_from_bandwidths, gains_in_si
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.loop_trace import trace_loops
-from drive_env.gains import Gains, gains_from_bandwidths, gains_in_si, write_gains
 from drive_env.loops.linear_model import (
     Controllers,
     Plant,

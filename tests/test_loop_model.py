@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drive_env.devices import find_device
-from drive_env.gains import rule_gains
+from drive_env.devices.gains import rule_gains
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops

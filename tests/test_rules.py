@@ -12,8 +12,9 @@ from scipy import signal
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import RAW_MAX, Gains, gains_in_si
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant, current_open_loop, position_open_loop, velocity_open_loop
 from drive_env.loops.margins import Margins, margins

@@ -19,11 +19,11 @@ from soak_cycle import BRIDGE, CHOPPER, COPPER, IDLE, LEAP, OFF_CURRENT, SHAFT, 
 from thinning import part
 
 from drive_env import EmulatedDrives, motion
+from drive_env.bus.bus_faults import MOST_BABBLE, BusFaults
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import TRANSMIT_BUFFER, World
 from drive_env.canopen.frames import Frame
 from drive_env.cia402 import STATE_CODING, State
-from drive_env.faults.bus_faults import MOST_BABBLE, BusFaults
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.record import get_lanes

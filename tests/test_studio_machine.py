@@ -12,7 +12,7 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.faults.table import FAULTS
-from drive_env.master.description import describe
+from drive_env.fieldbus.description import describe
 from drive_env.pictures.opengl import OpenGLError
 from drive_env.studio import machine_jobs, motion_jobs
 from drive_env.studio.machine_camera import HEIGHT, PERIOD, SHARE, WIDTH, MachineCamera

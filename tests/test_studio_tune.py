@@ -12,9 +12,9 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.devices import find_device
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
+from drive_env.fieldbus.description import describe
 from drive_env.loops.margins import Margins
-from drive_env.master.description import describe
 from drive_env.studio import motion_jobs
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.session import Session

@@ -11,8 +11,8 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, rule_gains
 from drive_env.dictionary.units import RPM
-from drive_env.gains import Gains, rule_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor

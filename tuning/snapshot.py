@@ -22,9 +22,9 @@ from drive_env import cia402, motion
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_writable
 from drive_env.drives.interface import Drives, device_of
+from drive_env.fieldbus.description import Description, Key, describe
+from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
-from drive_env.master.description import Description, Key, describe
-from drive_env.master.errors import BusError
 from drive_env.master.identity import Identity, check_same_drive, load_identity, read_identity
 from drive_env.master.parameters import (
     Difference,

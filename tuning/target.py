@@ -458,7 +458,7 @@ _ADDRESS = ("bitrate", "pace")
 
 def hold_to_travel(target: Target) -> None:
     """Have the envelope hold each axis to its own travel, by more than a move overshoots, and to its motor's speed."""
-    from drive_env.safety.limits import Limits
+    from drive_env.drives.limits import Limits
 
     drives = target.drives
     here, scale = drives.read(cia402.POSITION_ACTUAL), target.increments()

@@ -25,7 +25,7 @@ from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.envs import environment_of
-from drive_env.master.realtime_section import undisturbed
+from drive_env.realtime_section import undisturbed
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_json
 from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in

@@ -19,7 +19,7 @@ from agents.training.tasks import environment_name, make_environments
 from drive_env.bus.config import Machine
 from drive_env.drives.interface import Drives, machine_of
 from drive_env.envs import environment_of
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety.envelope import SafetyError
 
 if TYPE_CHECKING:

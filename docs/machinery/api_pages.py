@@ -74,7 +74,7 @@ PAGES = {
             ("drive_env.loops.dynamics", "Dynamics find_dynamics"),
             ("tuning.certificate.certificate", "Certificate AxisCertificate StepResponse FrequencyResponse"),
             ("tuning.certificate.certificate_files", "load_certificate save_certificate"),
-            ("drive_env.gains", "read_gains write_gains"),
+            ("drive_env.drives.raw_gains", "read_gains write_gains"),
         ),
     ),
     "agents": (

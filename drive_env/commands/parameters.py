@@ -40,9 +40,9 @@ from drive_env.commands.tables import Column, print_table, print_text
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
     from drive_env.master.identity import Identity
-    from drive_env.master.quantities import Scale
 
 Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
@@ -108,7 +108,7 @@ def diff(
     json: Json = False,
 ) -> None:
     """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
-    from drive_env.master.description import describe
+    from drive_env.fieldbus.description import describe
     from drive_env.master.parameters import Difference, compare
 
     with errors_as_exit_codes():
@@ -158,7 +158,7 @@ def restore(
     The file must be unchanged since `backup` wrote it, and belong to this drive. Bit rate and node-ID are not changed;
     commands and services are refused. The axis must be disabled.
     """
-    from drive_env.master.description import describe
+    from drive_env.fieldbus.description import describe
     from drive_env.master.identity import check_same_drive, read_identity
     from drive_env.master.parameters import check_no_commands
 
@@ -251,7 +251,7 @@ def _exchange(
         json: Print JSON.
         dry_run: Say what would be written, and write nothing.
     """
-    from drive_env.master.description import describe
+    from drive_env.fieldbus.description import describe
     from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
 
     wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
@@ -417,7 +417,7 @@ def _print(differences: Iterable[Any], found: str, wanted: str, scale: Scale, js
 
 
 def _row(difference: Any, scale: Scale) -> dict[str, Any]:
-    from drive_env.master.quantities import show
+    from drive_env.dictionary.quantities import show
 
     entry, wanted, found = difference
     return {

@@ -15,18 +15,19 @@ from typing import TYPE_CHECKING, Any, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.drives.arguments import checked_mask
-from drive_env.drives.interface import Drives, Integers, Mask
+from drive_env.drives.interface import Drives
 from drive_env.drives.trace import Trace
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.dictionary.entries import ObjectName
     from drive_env.drives.emergency import EmergencyMessage
+    from drive_env.drives.limits import Limits
     from drive_env.drives.observed import Observer
     from drive_env.master.bus_drives import BusDrives
     from drive_env.safety.envelope import Envelope
-    from drive_env.safety.limits import Limits
 
 _PER_AXIS_LIMITS = ("velocity", "current", "following_error")
 

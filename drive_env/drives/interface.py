@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from drive_env.dictionary.axis_objects import AxisObjects, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -19,25 +20,9 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
     from drive_env.safety.envelope import Envelope
 
-Mask = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
-
-class BasicDrives(Protocol):
-    """What it takes to move axes: objects that are read and written, and time that passes.
-
-    Integers are those of the wire, one for each axis, shape (num_axes,).
-    """
-
-    @property
-    def num_axes(self) -> int:
-        """Number of axes."""
-
-    def read(self, name: ObjectName) -> Integers:
-        """Return an object of every axis."""
-
-    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of every axis, or of some."""
+class BasicDrives(AxisObjects, Protocol):
+    """What it takes to move axes: objects that are read and written, and time that passes."""
 
     def advance(self, duration: float) -> None:
         """Let time pass [s], whole communication cycles."""

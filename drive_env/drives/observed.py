@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import Drives, Integers, Mask
+from drive_env.drives.interface import Drives
 from drive_env.drives.trace import Trace
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ from drive_env.cores import usable_cores
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
@@ -27,6 +28,7 @@ from drive_env.emulator.inertia_check import warn_of_misfits
 from drive_env.emulator.inside import Inside
 from drive_env.emulator.live_dictionary import NOTHING, LiveDictionary
 from drive_env.emulator.machine import Machines, checked_supply
+from drive_env.emulator.machine_faults import MachineFaults
 from drive_env.emulator.machine_kinds import MACHINE_KINDS
 from drive_env.emulator.parameters import (
     check_known,
@@ -35,11 +37,9 @@ from drive_env.emulator.parameters import (
     parameter_table,
 )
 from drive_env.emulator.prepared_record import PreparedRecord
-from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
-from drive_env.master.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.motors import Motor, find_motor
 from drive_env.saved_state import Saved, State, check_alike
 from mechanics.load import Load

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drive_env.emulator.group import Group
 from drive_env.emulator.live_dictionary import LiveDictionary
-from drive_env.faults.machine_faults import MachineFaults
+from drive_env.emulator.machine_faults import MachineFaults
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask
+from drive_env.emulator.machine_faults import InjectedFault
 from drive_env.emulator.parameters import check_known, check_one_supply, check_parameter
 from drive_env.emulator.record_snapshot import RecordSnapshot
-from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import find_device
+from drive_env.devices.gains import BASELINE_RULE, rule_gains, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import NO_PAYLOAD, PayloadChanges, find_payload
@@ -28,13 +30,6 @@ from drive_env.envs.online_margins import OnlineMargins
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
-from drive_env.gains import (
-    BASELINE_RULE,
-    read_gains,
-    rule_gains,
-    small_time_constants,
-    write_gains,
-)
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
 from mechanics.loads import find_load

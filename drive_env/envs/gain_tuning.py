@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.raw_gains import read_gains
 from drive_env.envs.configuration import configured
 from drive_env.envs.gain_observation import (
     RATIO_MAX,
@@ -29,7 +30,6 @@ from drive_env.envs.gain_observation import (
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
-from drive_env.gains import read_gains
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.motors import Motor, find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost

@@ -15,9 +15,9 @@ from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.link import Link, Outputs, Samples
 from drive_env.master.asked_rows import CAN_BE_ASKED, AskedRows
-from drive_env.master.description import Description, Key
-from drive_env.master.link import Link, Outputs, Samples
 from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 

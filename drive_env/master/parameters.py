@@ -13,8 +13,8 @@ from drive_env import cia402
 from drive_env.canopen.frames import INVALID
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
-from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
     from drive_env.devices import MasterHints

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.master.description import Key
+from drive_env.fieldbus.description import Key
 from drive_env.safety.bounds import COUNTED
 from drive_env.safety.objects import CURRENT, DEMAND, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.devices.gains import PI, gain_factors
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context, find_unit, split_unit
-from drive_env.gains import PI, gain_factors
-from drive_env.master.description import Key
-from drive_env.master.errors import RefusedError
-from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
+from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.objects import CURRENT, VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 

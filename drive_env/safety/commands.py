@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
+from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, given
+from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
 from drive_env.safety.errors import SafetyError
-from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
 from drive_env.safety.objects import (
     CONTROLWORD,

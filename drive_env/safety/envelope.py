@@ -28,7 +28,8 @@ from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
-from drive_env.master.description import Key
+from drive_env.drives.limits import Limits
+from drive_env.fieldbus.description import Key
 from drive_env.safety import signals
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
@@ -45,7 +46,6 @@ from drive_env.safety.commands import Commands
 from drive_env.safety.errors import SafetyError as SafetyError
 from drive_env.safety.errors import logged
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import Limits
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.objects import (
     CONTROLWORD,

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Key
-from drive_env.master.errors import BusError
-from drive_env.master.tidying import Tidying
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.tidying import Tidying
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives

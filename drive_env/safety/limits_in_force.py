@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
-from drive_env.master.errors import RefusedError
+from drive_env.drives.limits import NO_LIMIT, Limits
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
     FOLLOWING_WINDOW,
@@ -25,7 +26,6 @@ from drive_env.safety.bounds import (
     rotor_limits,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT, Limits
 from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
 

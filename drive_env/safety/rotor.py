@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
-from drive_env.master.description import Description, Key
-from drive_env.master.errors import RefusedError
+from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.errors import RefusedError
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives

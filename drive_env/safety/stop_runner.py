@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
+from drive_env.drives.limits import NO_LIMIT
+from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import increments_per_count, read_own
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.looks import answer_time
 from drive_env.safety.objects import (

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety.axes import Axes
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.judging import Judging

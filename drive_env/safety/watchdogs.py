@@ -10,13 +10,13 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.master.errors import BusError
-from drive_env.master.link import NoWatchdogError
+from drive_env.drives.limits import NO_LIMIT
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.link import NoWatchdogError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CONTROLWORD, STATUSWORD
 

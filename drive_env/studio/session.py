@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.quantities import Scale
 from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.master.parameters import parameters
-from drive_env.master.quantities import Scale
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
@@ -39,7 +39,7 @@ from drive_env.studio.single_axes import SingleAxes
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
 
 logger = logging.getLogger(__name__)
 

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import object_names, whole_cycles
-from drive_env.drives.interface import Drives, Integers, Mask
+from drive_env.drives.interface import Drives
 from drive_env.drives.trace import Trace
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.errors import JobStoppedError

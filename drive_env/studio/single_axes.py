@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from drive_env.dictionary.axis_objects import Integers
 from drive_env.dictionary.entries import Entry, ObjectName
-from drive_env.drives.interface import Drives, Integers
+from drive_env.drives.interface import Drives
 
 if TYPE_CHECKING:
+    from drive_env.fieldbus.description import Description
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.description import Description
 
 
 class SingleAxes:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import bandwidth_gains, rule_gains
+from drive_env.devices.gains import bandwidth_gains, rule_gains
+from drive_env.fieldbus.errors import BusError
 from drive_env.loops.linear_model import Plant
-from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.arrays import Integers, Mask
 from tuning.auto.checks import identified_plant, unsafe_gains

@@ -11,9 +11,9 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
+from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
-from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis

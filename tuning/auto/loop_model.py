@@ -195,7 +195,7 @@ def corner(device: Device, plant: Plant) -> float:
 
     An emulated drive has no delay besides its own; low frequencies hardly distinguish the two lags.
     """
-    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING
+    from drive_env.devices.gains import VELOCITY_FILTER_DAMPING
 
     lag = VELOCITY_FILTER_DAMPING / math.pi
     more = plant.delay - 1.0 / device.velocity_rate

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.gains import integers_per_si
+from drive_env.devices.gains import integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move

@@ -287,7 +287,7 @@ def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, f
 
     For an I gain the integration time T_i is given.
     """
-    from drive_env.gains import PI, gains_in_si
+    from drive_env.devices.gains import PI, gains_in_si
 
     if device.gains.cascade != PI:
         return {}

@@ -124,7 +124,7 @@ def _not_kept(target: Target) -> str:
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
-    from drive_env.gains import cascade_columns
+    from drive_env.devices.gains import cascade_columns
 
     if json:
         names = target.device.gains.names

@@ -204,7 +204,7 @@ def _apply(
     """Write a rule's gains if the user agrees, inside the transaction that is under way, or one of its own."""
     import numpy as np
 
-    from drive_env.gains import write_gains
+    from drive_env.drives.raw_gains import write_gains
     from tuning.rules.rules_by_name import propose
     from tuning.snapshot import Transaction
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import DEFAULT
 from tuning.outcome import Outcome, Tuner
 from tuning.search.optimise import Settings, optimise

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.devices.gains import bandwidth_gains, check_linear_model
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders

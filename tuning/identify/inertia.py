@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.devices.gains import as_chip
 from drive_env.dictionary.units import RPM
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import as_chip, write_gains
 from drive_env.motors import Motor
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused

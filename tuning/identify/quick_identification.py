@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
 from drive_env.trials.method import method_of
 from drive_env.trials.positioning import longer_way

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.devices.gains import check_linear_model
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
-from drive_env.gains import check_linear_model, read_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency

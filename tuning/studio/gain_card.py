@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.gains import as_chip, gains_in_si, per_chip
+from drive_env.devices.gains import as_chip, gains_in_si, per_chip
 from tuning.certificate.certificate import SI_UNITS
 from tuning.studio import tune_jobs
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from nicegui import ui
 
-from drive_env.gains import check_linear_model
+from drive_env.devices.gains import check_linear_model
 from drive_env.loops.margins import Margins, margins
 from drive_env.studio import charts
 from tuning.studio import tune_jobs

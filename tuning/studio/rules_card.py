@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.gains import check_linear_model
+from drive_env.devices.gains import check_linear_model
 from tuning.identify.estimate import TITLES, interval
 from tuning.rules.rules_by_name import MEANINGS
 from tuning.studio import tune_jobs

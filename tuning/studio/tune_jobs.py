@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives, device_of
-from drive_env.gains import read_gains, write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.dynamics import DEFAULT
 from drive_env.studio.motion_jobs import disable, only, select_mode
 from drive_env.studio.scope_view import channel_of

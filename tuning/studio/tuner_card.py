@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from drive_env.gains import has_linear_model
+from drive_env.devices.gains import has_linear_model
 from drive_env.loops.dynamics import DEFAULT, known_dynamics
 from drive_env.studio.parts import studio_parts
 from drive_env.studio.runs_folder import RUNS, url_of

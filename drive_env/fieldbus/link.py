@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Key
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 
 Integers = NDArray[np.int64]
 

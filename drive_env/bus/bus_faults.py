@@ -18,7 +18,7 @@ from drive_env.canopen.frames import NMT, Frame
 from drive_env.canopen.node import Node
 from drive_env.drives.arguments import whole_cycles
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.faults.machine_faults import axes_that_fulfil
+from drive_env.emulator.machine_faults import axes_that_fulfil
 from drive_env.faults.schedule import NEVER, Condition, Order, cycles_of
 from drive_env.faults.table import FaultRow, checked_parameters, find_fault
 
