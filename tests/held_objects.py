@@ -45,7 +45,9 @@ class HeldObjects:
         self.description = SimpleNamespace(
             num_axes=1, cycle=0.001, has=self.entries.__contains__, hints=SimpleNamespace(turns_positions_round=()),
             role=lambda role: CURRENT_LIMIT if role is Role.CURRENT_LIMIT and CURRENT_LIMIT in self.entries else None,
-            dictionary=SimpleNamespace(find=lambda key: self.entries[key], roles={}),
+            dictionary=SimpleNamespace(
+                find=lambda key: self.entries[key], has=self.entries.__contains__, roles={}
+            ),
         )  # fmt: skip
 
     def _check(self, entry, what):

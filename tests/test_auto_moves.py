@@ -13,10 +13,10 @@ from test_auto import gains, standing_in
 from drive_env import cia402, motion
 from drive_env.devices.gains import Gains, Rule, rule_gains
 from drive_env.drives.raw_gains import write_gains
+from drive_env.fieldbus.link import Timing
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.true_plant import true_plant
-from drive_env.master.pace import Timing
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import WATCH
 from tuning.auto import correction

@@ -86,7 +86,7 @@ class Played:
         log = self.log
 
         class Machine:
-            drives = SimpleNamespace(load="belt")
+            load = "belt"
 
             def __setattr__(self, name, value):
                 log.append((name, np.round(value, 9).tolist()))

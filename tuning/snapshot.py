@@ -45,7 +45,7 @@ from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.drives.interface import BusSide
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]
@@ -136,7 +136,8 @@ def take(target: Target) -> Snapshot:
 
 def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
     """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
-    identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
+    bus = drives.bus
+    identities = [] if bus is None else [read_identity(bus, node) for node in range(len(bus.nodes))]
     return Snapshot(
         device_of(drives).name, _read_axes(drives), address, identities=tuple(identities), left_out=_borrowed(drives)
     )
@@ -241,7 +242,7 @@ def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
 _BUS = {"interface": str, "channel": str, "nodes": int, "axes": int, "bitrate": int, "pace": str}
 
 
-def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, other_drive: bool = False) -> None:
+def check_same_drives(file: object, snapshot: Snapshot, drives: BusSide, *, other_drive: bool = False) -> None:
     """Raise OtherDriveError unless the nodes of a bus are those that a snapshot was taken of.
 
     Args:
@@ -252,7 +253,7 @@ def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, ot
     """
     # A file that does not say of which drives it is (`load_snapshot` wants its reader's word for that) fits any.
     for node, written in zip(range(len(drives.nodes)), snapshot.identities, strict=False):
-        check_same_drive(file, written, read_identity(drives.bus, node), other_drive=other_drive)
+        check_same_drive(file, written, read_identity(drives, node), other_drive=other_drive)
 
 
 def restore(
@@ -298,7 +299,7 @@ def _set_points(known: Description) -> list[Key]:
     return [(index, 0) for index in SET_POINTS if known.has(index) and known.dictionary.find(index).access != "wo"]
 
 
-def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Difference]]:
+def differences(drives: BusSide, snapshot: Snapshot) -> list[tuple[int, Difference]]:
     """Return what is not as a snapshot says, as (number of the axis, difference), read anew from drives of a bus.
 
     Set-points of speed and torque that would turn an axis once it is enabled are among them.

@@ -20,8 +20,8 @@ from drive_env import cia402
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import ObservedDrives, Observer
+from drive_env.drives.interface import Drives, Observer
+from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.speeds import per_increment
 from tuning.lateness import Punctuality, late_first
 from tuning.stop_causes import ToldCauses
@@ -29,7 +29,7 @@ from tuning.stop_causes import ToldCauses
 if TYPE_CHECKING:
     from drive_env import EmulatedDrives
     from drive_env.devices import Device
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.drives.interface import BusSide
     from drive_env.motors import Motor
     from mechanics.load import Load
     from tuning.runs.inputs import Input
@@ -327,7 +327,7 @@ def on_bus(
     return target
 
 
-def of_nodes(drives: BusDrives, parts: Iterable[int]) -> Drives:
+def of_nodes(drives: BusSide, parts: Iterable[int]) -> Drives:
     """Return axes of every node of a bus by their numbers in it; raises as `chosen_parts` does."""
     count = drives.description.num_axes
     chosen = chosen_parts(parts, count, drives.description.name)

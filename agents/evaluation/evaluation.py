@@ -22,8 +22,8 @@ from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, c
 from agents.training.seeds import EVALUATION
 from agents.training.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
 from agents.tuner.tune_target import TRIAL_SECONDS
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import ObservedDrives, Observer
+from drive_env.drives.interface import Drives, Observer
+from drive_env.drives.observed import ObservedDrives
 from drive_env.envs import environment_of
 from drive_env.realtime_section import undisturbed
 from drive_env.whole_file import write_whole

@@ -17,7 +17,8 @@ from agents.evaluation.served import Served, draw_machines, emulated, in_lockste
 from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
 from agents.training.tasks import environment_name, make_environments
 from drive_env.bus.config import Machine
-from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.interface import Drives
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import environment_of
 from drive_env.fieldbus.errors import BusError
 from drive_env.safety.envelope import SafetyError
@@ -136,7 +137,7 @@ def _over_the_bus(
 def _sensor(drives: Drives | None, joint: int | None) -> Callable[[], Any] | None:
     if joint is None or drives is None:
         return None
-    machine = machine_of(drives)
+    machine = emulated_of(drives).machine
     return lambda: machine.joint_positions[:, joint]
 
 

@@ -41,6 +41,7 @@ from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.quantities import Scale
+    from drive_env.drives.interface import DescribedAxes
     from drive_env.master.bus_drives import BusDrives
     from drive_env.master.identity import Identity
 
@@ -347,7 +348,7 @@ def _check_axis(drives: BusDrives, axis: int) -> None:
         raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
 
 
-def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
+def parameters_text(drives: DescribedAxes, axis: int, values: Mapping[tuple[int, int], int]) -> str:
     """Return parameters as TOML; the objects' names are comments, their index is what counts."""
     from drive_env.master.identity import read_identity
     from drive_env.whole_file import FORMAT

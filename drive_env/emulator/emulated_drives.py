@@ -22,6 +22,7 @@ from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quant
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.interface import Drives, machine_of
 from drive_env.drives.trace import Trace
 from drive_env.emulator.group import Group, call_of, channels, rates_of
 from drive_env.emulator.inertia_check import warn_of_misfits
@@ -538,3 +539,10 @@ class EmulatedDrives(Saved):
                 RuntimeWarning,
                 stacklevel=4,
             )
+
+
+def emulated_of(drives: Drives) -> EmulatedDrives:
+    """Return the emulated drives behind drives, without who looks at them; ValueError for drives of a bus."""
+    found = machine_of(drives).drives
+    assert isinstance(found, EmulatedDrives), "nothing else has a machine"
+    return found

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.interface import Drives
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.emulator.group import call_of, channels
 from drive_env.emulator.live_dictionary import NOTHING
 from drive_env.firmware.record import get_lanes, set_lanes
@@ -67,7 +68,7 @@ def trace_loops(
     """
     if drives.machine is None:
         raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
-    emulated = drives.machine.drives  # whatever looks at them does not see this time pass
+    emulated = emulated_of(drives)  # whatever looks at them does not see this time pass
     fields = emulated.device.firmware.layout.dtype.names or ()
     known = [name for name in SIGNALS if name in fields]
     for name in signals:

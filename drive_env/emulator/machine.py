@@ -25,6 +25,7 @@ from drive_env.firmware.record import get_lanes, set_lanes
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
     from drive_env.emulator.parameters import MachineParameter
+    from mechanics.load import Load
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -58,6 +59,11 @@ class Machines:
     def drives(self) -> EmulatedDrives:
         """The drives that turn these machines."""
         return self._drives
+
+    @property
+    def load(self) -> Load:
+        """What each machine is a copy of."""
+        return self._drives.load
 
     @property
     def parameters(self) -> dict[str, Floats]:

@@ -22,6 +22,7 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import NO_PAYLOAD, PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
@@ -431,7 +432,7 @@ class GainScheduling(VectorEnvironment):
         if laws is None:
             load, known = self.config.load, self.drives.device
             laws = laws_of(load, known, machine.parameters) if known and load in shipped() else {"parameters": {}}
-        self._machines = RandomMachines(machine.drives, Distributions.load(laws))
+        self._machines = RandomMachines(emulated_of(self.drives), Distributions.load(laws))
         changes = max(1, round(self.config.duration / self.config.payload_every))
         self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)
 

@@ -48,8 +48,16 @@ class Wording(NamedTuple):
     sign_of_life: str
 
 
-class ObjectClient(Protocol):
-    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
+class Timing(NamedTuple):
+    """How punctual the SYNCs of a run were: their number, those more than a cycle late, the worst lateness [s]."""
+
+    cycles: int
+    late: int
+    worst: float
+
+
+class ObjectReader(Protocol):
+    """Reads objects of a node, as bytes."""
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
         """Return the bytes of an object.
@@ -58,6 +66,10 @@ class ObjectClient(Protocol):
             ObjectAccessError: With the abort code, if the drive refuses.
             NoAnswerError: If it does not answer; one try may take `timeout` [s].
         """
+
+
+class ObjectClient(ObjectReader, Protocol):
+    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
 
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Write the bytes of an object, once: a repeated write may mean something else.

@@ -32,12 +32,13 @@ from drive_env.drives.limits import Limits
 from drive_env.drives.trace import Trace
 from drive_env.fieldbus.description import Description, Key
 from drive_env.fieldbus.errors import BusError, NoAnswerError
-from drive_env.fieldbus.link import Link, ObjectClient
+from drive_env.fieldbus.link import Link, ObjectClient, Timing
 from drive_env.held_signals import held_signals
 from drive_env.master.cycle_runner import CycleRunner
-from drive_env.master.pace import Pace, Timing
+from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 from drive_env.safety.envelope import Envelope
+from drive_env.safety.watched_drives import CycleWatch
 
 logger = logging.getLogger(__name__)
 
@@ -340,17 +341,17 @@ class BusDrives:
         """Take note that a node is not operational any more: the next command starts it."""
         self._started = False
 
-    def prepare_watch(self, envelope: Envelope) -> None:
+    def prepare_watch(self, watch: CycleWatch) -> None:
         """Have mapped what an envelope watches."""
-        self._cycle_runner.prepare(envelope)
+        self._cycle_runner.prepare(watch)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
         """Return what comes with every SYNC."""
         return self._cycle_runner.mapped()
 
-    def poll(self, envelope: Envelope) -> bool | None:
+    def poll(self, watch: CycleWatch) -> bool | None:
         """Look at the drives by a SYNC of one's own, as `CycleRunner.poll`."""
-        return self._cycle_runner.poll(envelope)
+        return self._cycle_runner.poll(watch)
 
     @property
     def is_dry(self) -> bool:

@@ -47,7 +47,7 @@ from drive_env.safety.rotor import scale_objects
 from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -81,7 +81,7 @@ class Commands:
         modes: Returns the mode of operation of every axis.
     """
 
-    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
+    def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._current_limit = drives.description.role(Role.CURRENT_LIMIT)

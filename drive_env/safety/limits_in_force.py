@@ -30,7 +30,7 @@ from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ class LimitsInForce:
         latest: The limits as they were read last; None since something changed that they depend on.
     """
 
-    def __init__(self, user: Limits, drives: BusDrives, axes: Axes, lending: Lending) -> None:
+    def __init__(self, user: Limits, drives: WatchedDrives, axes: Axes, lending: Lending) -> None:
         self.user = user
         self.latest: Bounds | None = None
         self._generation = 0

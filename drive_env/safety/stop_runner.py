@@ -36,7 +36,7 @@ from drive_env.safety.stop_ends import LATENCY, ends_by_itself, outside, stop_wa
 from drive_env.safety.stopping import GRACE, REPEAT, SHARE, AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class StopRunner:
     """
 
     def __init__(
-        self, drives: BusDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
+        self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
     ) -> None:
         self.current: Stop | None = None
         self._drives = drives

@@ -29,7 +29,7 @@ from drive_env.safety.supervisor import Supervisor
 from drive_env.safety.watchdogs import Watchdogs
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class Watch:
 
     def __init__(
         self,
-        drives: BusDrives,
+        drives: WatchedDrives,
         axes: Axes,
         limits: LimitsInForce,
         stops: StopRunner,

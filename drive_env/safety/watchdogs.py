@@ -21,7 +21,7 @@ from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CONTROLWORD, STATUSWORD
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class Watchdogs:
         lending: What the drives have for a while, and get back before their watchdogs are given up.
     """
 
-    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
+    def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._axes = axes

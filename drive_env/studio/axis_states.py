@@ -252,7 +252,9 @@ def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
     """Return what an emulated machine tells besides the drive, nothing of a real one."""
     if drives.machine is None:
         return ()
-    winding, stage = drives.machine.temperatures
+    from drive_env.emulator.emulated_drives import emulated_of
+
+    winding, stage = emulated_of(drives).machine.temperatures
     return (
         ShownQuantity("Winding temperature (emulated)", round(float(winding[axis]), 1), "°C"),
         ShownQuantity("Stage temperature (emulated)", round(float(stage[axis]), 1), "°C"),

@@ -143,7 +143,7 @@ def store(axis: int) -> Callable[[Drives], None]:
 
 def snapshot(known: Description, axis: int) -> Callable[[Drives], dict[Key, int]]:
     """Return the job that reads all parameters of an axis."""
-    return lambda drives: read_parameters(SingleAxes(drives, known).as_bus(), axis)
+    return lambda drives: read_parameters(SingleAxes(drives, known), axis)
 
 
 def factory(known: Description) -> dict[Key, int]:
@@ -163,14 +163,14 @@ class _DescriptionAlone:
 
 def differences(known: Description, wanted: Mapping[Key, int], axis: int) -> Callable[[Drives], list[Difference]]:
     """Return the job that compares an axis with values."""
-    return lambda drives: compare(SingleAxes(drives, known).as_bus(), wanted, axis)
+    return lambda drives: compare(SingleAxes(drives, known), wanted, axis)
 
 
 def backup(known: Description, axis: int) -> Callable[[Drives], str]:
     """Return the job that makes a backup file of an axis, as `drive-env backup` does."""
 
     def job(drives: Drives) -> str:
-        axes = SingleAxes(drives, known).as_bus()
+        axes = SingleAxes(drives, known)
         return sealed(parameters_text(axes, axis, read_parameters(axes, axis)))
 
     return job
@@ -202,10 +202,10 @@ def restore(
             wanted = load_parameters(path, known.dictionary)
             written, axis_then = checked_origin(path, unchecked=unchecked)
         check_no_commands(wanted, name, known.hints)
-        check_same_drive(name, written, read_identity(axes.as_bus()), other_drive=other_drive)
+        check_same_drive(name, written, read_identity(axes), other_drive=other_drive)
         if axis_then not in (None, axis) and not other_drive:
             raise ValueError(f"{name} was read from axis {axis_then}, and this is axis {axis}; nothing was written")
-        return write_all_or_none(axes.as_bus(), wanted, axis)
+        return write_all_or_none(axes, wanted, axis)
 
     return job
 

@@ -261,8 +261,10 @@ class Session:
         shared = self._drives
         if shared is None or shared.machine is None or not shared.lock.acquire(timeout=patience):
             return None
+        from drive_env.emulator.emulated_drives import emulated_of
+
         try:
-            return function(shared.machine)
+            return function(emulated_of(shared).machine)
         finally:
             shared.lock.release()
 
@@ -354,7 +356,7 @@ class Session:
         assert self._drives is not None
         drives = self._drives
         self.stored = {axis: {} for axis in range(self.num_axes)}
-        for entry in parameters(SingleAxes(drives, self.description).as_bus()):
+        for entry in parameters(SingleAxes(drives, self.description)):
             key = (entry.index, entry.sub)
             with contextlib.suppress(ObjectAccessError):
                 for axis, value in enumerate(drives.read(key).tolist()):

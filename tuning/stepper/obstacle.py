@@ -48,7 +48,7 @@ def can_load(target: Target) -> bool:
     from mechanics.shaft import one
 
     machine = target.drives.machine
-    return machine is not None and are_independent(one(machine.drives.load))
+    return machine is not None and are_independent(one(machine.load))
 
 
 def why_not_loaded(target: Target) -> str:
@@ -123,6 +123,5 @@ def _lever(target: Target) -> Floats:
     """Return how a torque on the load turns the rotor of its axis."""
     from mechanics.shaft import one, way
 
-    drives = machine_of(target.drives).drives
-    packed = one(drives.load)
+    packed = one(machine_of(target.drives).load)
     return np.full(target.num_axes, float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.drives.interface import Drives, device_of
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.studio.runs_folder import RUNS
 from tuning.runs.provenance import run_folder
 from tuning.snapshot import Snapshot, check_place, load_snapshot, take_of
@@ -218,7 +219,7 @@ class TuneDesk:
         entries, machine = self.entries, drives.machine
         ways = parse_travels(entries.travel) if entries.travel.strip() else None
         if machine is not None:
-            yield of_machines(drives, machine.drives, supply=entries.supply, travel=ways)
+            yield of_machines(drives, emulated_of(drives), supply=entries.supply, travel=ways)
             return
         from drive_env.motors import find_motor
 
