@@ -201,20 +201,3 @@ def size(node: ast.FunctionDef, is_command: bool) -> dict[str, int]:
         "lines": node.end_lineno - node.lineno + 1 - docstring,
         "arguments": len(names) - (names[:1] in (["self"], ["cls"])),
     }
-
-
-def test_nobody_outside_looks_at_the_emulators_privates():
-    """They go by `EmulatedDrives.inside`, tests and tools too."""
-    private = {"_records", "_groups", "_objects", "_faults", "_noise_seeds", "_now", "_cycles", "_refresh_inertia"}
-    room = ROOT / "drive_env" / "emulator"
-    found = []
-    for path in [*(p for package in PACKAGES for p in (ROOT / package).rglob("*.py")), *(ROOT / "tests").glob("*.py")]:
-        if path.is_relative_to(room):
-            continue
-        text = path.read_text(encoding="utf-8")
-        if not any(f".{name}" in text for name in private):
-            continue
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.Attribute) and node.attr in private and "drives" in ast.unparse(node.value):
-                found.append(f"{path.relative_to(ROOT)}:{node.lineno} {ast.unparse(node)}")
-    assert not found

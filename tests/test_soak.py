@@ -106,7 +106,7 @@ class Soak:
         if drives.inside.cycle % 20 == 0:
             self.command()
         self.order_faults()
-        drives.inside.faults.act(drives.inside.cycle)
+        drives.faults.act(drives.inside.cycle)
         magnetic, capacitor, driven = self.stored()
         theta, measured, gain = self.lanes("theta_m"), self.lanes("theta_meas"), self.lanes("encoder_gain")
         wired, told = self.lanes("encoder_true_direction"), self.lanes("encoder_direction")

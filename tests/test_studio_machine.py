@@ -55,7 +55,7 @@ def test_what_is_known_of_a_machine(session):
     assert known.meanings["load.stiffness"]
     assert "encoder_stuck" in known.faults
     assert not {name for name in known.faults if FAULTS[name].group == "bus"}
-    assert known.torque == pytest.approx(session.glimpse(lambda machine: machine.drives.motor.rated_torque))
+    assert known.torque == pytest.approx(session.glimpse(lambda machine: machine.inside.motor.rated_torque))
 
 
 def test_parameters_torque_and_supply_act(session):

@@ -66,6 +66,7 @@ PAGES = {
             ("tuning.outcome", "Outcome"),
             ("tuning.snapshot", "Transaction"),
             ("tuning.runs.sweep", "run SweepResult"),
+            ("tuning.runs.sweep_files", "save_sweep"),
             ("tuning.identify.identification", "identify"),
             ("tuning.identify.estimate", "Identification"),
             ("drive_env.loops.linear_model", "Plant"),

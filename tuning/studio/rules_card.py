@@ -12,11 +12,11 @@ from drive_env.devices.gains import check_linear_model
 from tuning.identify.estimate import TITLES, interval
 from tuning.rules.rules_by_name import MEANINGS
 from tuning.studio import tune_jobs
+from tuning.studio.tune_panel import TunePanel, card
 
 if TYPE_CHECKING:
     from tuning.identify.estimate import Identification
     from tuning.rules.side_by_side import AxisRules
-    from tuning.studio.tune_page import TunePanel
 
 LONG = 14  # letters from which a cell is a text rather than a figure
 
@@ -47,7 +47,7 @@ class RulesCard:
     def build(self) -> None:
         """Make it."""
         panel = self._panel
-        with panel.card("Identification and rules", "rules"):
+        with card("Identification and rules", "rules"):
             try:
                 check_linear_model(panel.device)
             except ValueError as error:
