@@ -244,7 +244,8 @@ def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before,
 # --- rolling back -----------------------------------------------------------------------------------------------------
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
-    from tuning.identify.estimate import Estimate, Identification, refused
+    from tuning.estimate import Estimate, refused
+    from tuning.identify.identified_axis import Identification
 
     found = []
     for axis in range(target.num_axes):

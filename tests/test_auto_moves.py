@@ -32,7 +32,8 @@ from tuning.auto.moves import keep_what_is_better
 from tuning.auto.one_button import auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown, without_noise
 from tuning.auto.trying import faster
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.rules.rules_by_name import propose
 from tuning.target import emulated

@@ -117,7 +117,7 @@ MAY_READ = {
     "drive_env.dictionary.entries": "the text of a file that was read within limits; EdsText.read_text",
     "agents.training.checkpoint": "pickles of a writer who is trusted (--trust)",
     "agents.training.hyperparameters": "YAML of a text that was read within limits",
-    "agents.training.search": "files that were written a moment ago, in a folder of its own",
+    "agents.hyperparameter_search": "files that were written a moment ago, in a folder of its own",
     "agents.training.training_table": "CSV of a text that was read within limits",
     "agents.training.learning_curve": "CSV of a text that was read within limits",
     "agents.policies.onnx_policy": "a file that has been read, and acted within limits in mechanics/limited_child.py",

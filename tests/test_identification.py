@@ -25,9 +25,10 @@ from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group
-from tuning.identify.estimate import NAMES, refused
+from tuning.estimate import refused
 from tuning.identify.experiments import current_bandwidth
 from tuning.identify.identification import identify
+from tuning.identify.identified_axis import NAMES
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly, pushed_inertia
 from tuning.identify.working_state import borrowed

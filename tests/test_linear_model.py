@@ -27,7 +27,8 @@ from drive_env.loops.linear_model import (
 from drive_env.loops.sampled import exponential
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1.5e-5)

@@ -18,7 +18,7 @@ from drive_env.motors import find_motor
 from drive_env.trials.score import RobustScore
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_axis, one_plant, two_ends
 from tuning.auto.stages import IdentifiedAxes
-from tuning.identify.estimate import Identification
+from tuning.identify.identified_axis import Identification
 from tuning.target import emulated
 
 DEVICE, MOTOR, STANDARD = find_device("tmcm1636"), find_motor("qbl4208"), find_dynamics("standard")

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
+from agents.evaluation.open_policy import open_policy
 from agents.policies.agent_file import AgentFile
-from agents.policies.open_policy import open_policy
 from agents.policies.policy import policy_of
 from agents.training.train import run_to_resume, train
 from drive_env import motors

@@ -257,7 +257,7 @@ def test_auto_is_stopped_and_everything_is_as_before(desk, tmp_path, when):
 
 def test_auto_is_asked_for_the_dynamics_of_the_page(monkeypatch, tmp_path):
     asked = {}
-    monkeypatch.setattr("tuning.auto.run_to_files.auto_to_files", lambda *_, **options: asked.update(options))
+    monkeypatch.setattr("tuning.auto_to_files.auto_to_files", lambda *_, **options: asked.update(options))
     target = SimpleNamespace(device=find_device("tmcm1636"))
     tune_jobs.auto(True, "soft")(target, TunerSession("auto", tmp_path), lambda what, share: None)
     assert asked == {"keep": True, "dynamics": "soft"}

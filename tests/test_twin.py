@@ -27,7 +27,8 @@ from tuning.auto.twin import (
     known_of,
     twin_parameters,
 )
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 22.0, 2e-5, R=0.41, L=5.5e-4, velocity_filter=260.0)

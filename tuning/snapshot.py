@@ -27,6 +27,7 @@ from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
 from drive_env.master.identity import Identity, check_same_drive, load_identity, read_identity
 from drive_env.master.parameters import (
+    SAVE,
     Difference,
     check_at_rest,
     check_no_commands,
@@ -37,6 +38,7 @@ from drive_env.master.parameters import (
     restorable,
     write_all_or_none,
 )
+from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.envelope import SafetyError
 from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
 from mechanics.untrusted import read_toml
@@ -44,14 +46,12 @@ from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import Entry
-    from drive_env.drives.interface import BusSide
+    from drive_env.drives.interface import BusSide, DescribedAxes
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]
 
 SWITCH_OFF = 1000  # cycles that switching the voltage off may take
-SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 STORE = (0x1010, 1)
 DEVICE_OBJECTS = 0x2000  # from here on: what lies below is how drives talk, which their master has in use
 # Set-points with which an axis turns as soon as it is enabled. A program that dies leaves them, and no parameter file
@@ -478,27 +478,11 @@ def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
     return {key: value for key, value in values.items() if key[0] >= DEVICE_OBJECTS}
 
 
-def _per_axis(drives: Drives) -> Any:
+def _per_axis(drives: Drives) -> DescribedAxes:
     """Return drives whose objects are reached axis by axis, as those of a bus are."""
-    return drives.bus or _EmulatedPerAxis(drives)
+    return drives.bus or SingleAxes(drives, describe(device_of(drives).name, None))
 
 
 def _places(drives: Drives) -> Sequence[int]:
     """Return where `_per_axis` finds the axes of drives: on a bus among all axes of its nodes."""
     return drives.axis_numbers if drives.bus is not None else range(drives.num_axes)
-
-
-class _EmulatedPerAxis:
-    """Emulated drives as far as `drive_env.master.parameters` needs those of a bus."""
-
-    def __init__(self, drives: Drives) -> None:
-        self._drives = drives
-        self.description: Description = describe(device_of(drives).name, None)
-
-    def read_axis(self, entry: Entry, axis: int) -> int:
-        return int(self._drives.read((entry.index, entry.sub))[axis])
-
-    def write_axis(self, entry: Entry, axis: int, value: int) -> None:
-        where = np.zeros(self._drives.num_axes, bool)
-        where[axis] = True
-        self._drives.write((entry.index, entry.sub), value, where=where)

@@ -229,7 +229,7 @@ def of_machines(
         ValueError: For a travel that does not hold 0, or an axis that the machines do not have.
     """
     from mechanics.shaft import one, way
-    from tuning.identify.linked_axes import are_linked
+    from tuning.linked_axes import are_linked
 
     alone = one(made.load)
     own = way(alone)

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation.scores import Episode, Interval, figures, interval
-from agents.policies.agent_file import plain
+from agents.plain import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
-from agents.training.seeds import EVALUATION
-from agents.training.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
+from agents.seeds import EVALUATION
+from agents.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
 from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives, Observer
 from drive_env.drives.observed import ObservedDrives

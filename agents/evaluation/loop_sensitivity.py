@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from agents.policies.agent_file import AgentFile
 from agents.policies.policy import policy_of
-from agents.training.seeds import VALIDATION
-from agents.training.tasks import environment_name, make_environments
+from agents.seeds import VALIDATION
+from agents.tasks import environment_name, make_environments
 from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import environment_of
 from drive_env.envs.tracking import Tracking

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.policies.guard import GuardLimits
-from agents.training.tasks import OF_MACHINES, environment_name, make_environments
+from agents.tasks import OF_MACHINES, environment_name, make_environments
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import given

@@ -15,7 +15,7 @@ from agents.evaluation.evaluation import Evaluation, GivenDrives, as_on_a_bus, e
 from agents.evaluation.on_the_bus import drives_for
 from agents.evaluation.served import Served, draw_machines, emulated, in_lockstep, in_real_time
 from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
-from agents.training.tasks import environment_name, make_environments
+from agents.tasks import environment_name, make_environments
 from drive_env.bus.config import Machine
 from drive_env.drives.interface import Drives
 from drive_env.emulator.emulated_drives import emulated_of

@@ -111,7 +111,7 @@ def tune_target(
     from drive_env import motion
     from drive_env.drives.observed import ObservedDrives
     from drive_env.drives.raw_gains import write_gains
-    from tuning.auto.fallback_gains import FallbackGains
+    from tuning.fallback_gains import FallbackGains
     from tuning.search.trial_bench import first_gains
 
     fallback = FallbackGains(target.num_axes, target.motor.rated_current, windows=PATIENCE)

@@ -55,7 +55,7 @@ PAGES = {
             ("drive_env.envs.gain_scheduling", "GainScheduling"),
             ("drive_env.envs.tracking", "Tracking"),
             ("drive_env.envs.vector_environment", "VectorEnvironment"),
-            ("drive_env.envs.randomisation", "Distributions Law Curriculum"),
+            ("drive_env.randomisation.random_machines", "Distributions Law Curriculum"),
         ),
     ),
     "tuning": (
@@ -68,7 +68,7 @@ PAGES = {
             ("tuning.runs.sweep", "run SweepResult"),
             ("tuning.runs.sweep_files", "save_sweep"),
             ("tuning.identify.identification", "identify"),
-            ("tuning.identify.estimate", "Identification"),
+            ("tuning.identify.identified_axis", "Identification"),
             ("drive_env.loops.linear_model", "Plant"),
             ("tuning.rules.rules_by_name", "propose"),
             ("tuning.auto.one_button", "auto"),
@@ -83,7 +83,7 @@ PAGES = {
         "The file of a trained agent, and how any policy is opened.",
         (
             ("agents.policies.agent_file", "AgentFile BundleError"),
-            ("agents.policies.open_policy", "open_policy LoadedPolicy"),
+            ("agents.evaluation.open_policy", "open_policy LoadedPolicy"),
             ("agents.policies.policy", "load_policy measure_latency"),
             ("agents.policies.guard", "GuardLimits GuardedPolicy"),
         ),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import sys
-import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -37,13 +35,10 @@ from drive_env.commands.options import (
     told_if_interrupted,
 )
 from drive_env.commands.tables import Column, print_table, print_text
-from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.quantities import Scale
-    from drive_env.drives.interface import DescribedAxes
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.identity import Identity
 
 Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
@@ -57,7 +52,6 @@ OtherDrive = Annotated[
 Unchecked = Annotated[
     bool, typer.Option("--unchecked", help="Accept a file that was changed, or that has no check sum; read it first.")
 ]
-SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 
 def backup(
@@ -73,6 +67,7 @@ def backup(
     json: Json = False,
 ) -> None:
     """Read all parameters of a drive into a file, without commands and services."""
+    from drive_env.master.parameter_files import parameters_text
     from drive_env.master.parameters import read_parameters
     from drive_env.whole_file import sealed, write_whole
 
@@ -110,6 +105,7 @@ def diff(
 ) -> None:
     """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
     from drive_env.fieldbus.description import describe
+    from drive_env.master.parameter_files import load_parameters
     from drive_env.master.parameters import Difference, compare
 
     with errors_as_exit_codes():
@@ -161,6 +157,7 @@ def restore(
     """
     from drive_env.fieldbus.description import describe
     from drive_env.master.identity import check_same_drive, read_identity
+    from drive_env.master.parameter_files import checked_origin, load_parameters
     from drive_env.master.parameters import check_no_commands
 
     with errors_as_exit_codes():
@@ -253,7 +250,14 @@ def _exchange(
         dry_run: Say what would be written, and write nothing.
     """
     from drive_env.fieldbus.description import describe
-    from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
+    from drive_env.master.parameters import (
+        SAVE,
+        check_at_rest,
+        compare,
+        list_differences,
+        restorable,
+        write_all_or_none,
+    )
 
     wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
@@ -306,22 +310,9 @@ def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, 
     print(f"{len(differences)} parameters would be written to node {node}{kept} (dry run: nothing was written)")
 
 
-def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
-    """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
-    from drive_env.master.identity import load_identity
-    from drive_env.whole_file import check_seal
-
-    table = _read_toml(file)
-    check_seal(file, table, unchecked=unchecked)
-    identity = table.get("identity")
-    if not isinstance(identity, dict):
-        return None, None
-    axis = identity.get("axis")
-    return load_identity(identity), axis if type(axis) is int else None
-
-
 def _tell_of_changes(file: Path) -> None:
     """Say on stderr that a file is not as it was written: to compare with it, it need not be."""
+    from drive_env.master.parameter_files import checked_origin
     from drive_env.whole_file import FileChangedError
 
     try:
@@ -346,63 +337,6 @@ def _connected(
 def _check_axis(drives: BusDrives, axis: int) -> None:
     if not 0 <= axis < drives.num_axes:
         raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
-
-
-def parameters_text(drives: DescribedAxes, axis: int, values: Mapping[tuple[int, int], int]) -> str:
-    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
-    from drive_env.master.identity import read_identity
-    from drive_env.whole_file import FORMAT
-
-    known = drives.description
-    lines = [
-        f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change, and restore refuses a "
-        "changed file.",
-        f"format = {FORMAT}",
-        f'read = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
-        "",
-        "[identity]",
-        *read_identity(drives).to_toml(),
-        f"axis = {axis}",
-    ]
-    lines += ["", "[parameters]  # index:sub-index, both hexadecimal"]
-    for (index, sub), value in values.items():
-        entry = known.dictionary.find((index, sub))
-        unit = f" [{entry.unit}]" if entry.unit else ""
-        lines.append(f'"{index:04X}:{sub:02X}" = {value}  # {entry.name}{unit}')
-    return "\n".join(lines) + "\n"
-
-
-def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
-    """Return the parameters of a file; ValueError for what is none."""
-    from drive_env.dictionary.access import check_in_range, check_writable
-
-    rows = _read_toml(path).get("parameters")
-    if not isinstance(rows, dict) or not rows:
-        raise ValueError(f"{path} has no table [parameters]; `drive-env backup` writes one")
-    import numpy as np
-
-    values = {}
-    for text, value in rows.items():
-        index, _, sub = text.partition(":")
-        try:
-            key = int(index, 16), int(sub or "0", 16)
-        except ValueError:
-            raise ValueError(f"{path}: {text!r} is not an index:sub-index; write it as 607D:01") from None
-        entry = dictionary.find(key)
-        check_writable(entry)
-        check_in_range(entry, np.asarray(value))
-        values[key] = int(value)
-    return values
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    """Return what a file holds; ValueError if it is no TOML."""
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
-    try:
-        return read_toml(path)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not TOML, or incomplete: {error}; take another copy") from error
 
 
 def _print(differences: Iterable[Any], found: str, wanted: str, scale: Scale, json: bool) -> None:

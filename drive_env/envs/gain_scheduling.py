@@ -29,10 +29,10 @@ from drive_env.envs.configuration import configured
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.online_margins import OnlineMargins
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
+from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
 

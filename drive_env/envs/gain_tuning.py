@@ -29,10 +29,10 @@ from drive_env.envs.gain_observation import (
     true_entries,
 )
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.motors import Motor, find_motor
+from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost
 from drive_env.trials.load_detection import is_load_detection
 from drive_env.trials.method import check_tried, method_of, new_score

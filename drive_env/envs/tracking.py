@@ -25,7 +25,6 @@ from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
 from drive_env.envs.vector_environment import (
@@ -39,6 +38,7 @@ from drive_env.envs.vector_environment import (
     check_choice,
 )
 from drive_env.motors import Motor, find_motor
+from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
 

@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.emulator.emulated_drives import EmulatedDrives, emulated_of
-from drive_env.envs.randomisation import Curriculum, Distributions
+from drive_env.randomisation.random_machines import Curriculum, Distributions
 from drive_env.saved_state import Saved, State, check_alike
 
 Floats = NDArray[np.float64]

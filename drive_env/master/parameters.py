@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Key = tuple[int, int]
 
+SAVE = 0x65766173  # CiA 301: "save", written to 1010h
+
 # What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
 COMMANDS = {
     0x1003: "error history: a service",

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from drive_env import cia402
-from drive_env.commands.parameters import SAVE, checked_origin, load_parameters, parameters_text
 from drive_env.dictionary import quantities
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits, check_writable
@@ -20,7 +19,9 @@ from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.quantities import Scale
 from drive_env.drives.interface import Drives
 from drive_env.master.identity import check_same_drive, read_identity
+from drive_env.master.parameter_files import checked_origin, load_parameters, parameters_text
 from drive_env.master.parameters import (
+    SAVE,
     Difference,
     check_no_commands,
     compare,
@@ -28,7 +29,7 @@ from drive_env.master.parameters import (
     read_parameters,
     write_all_or_none,
 )
-from drive_env.studio.single_axes import SingleAxes
+from drive_env.master.single_axes import SingleAxes
 from drive_env.whole_file import sealed
 
 if TYPE_CHECKING:

@@ -28,6 +28,7 @@ from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.master.parameters import parameters
+from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
@@ -35,7 +36,6 @@ from drive_env.studio.presence import Presence
 from drive_env.studio.recorder import Key, ScopeRecorder
 from drive_env.studio.sentences import sentence
 from drive_env.studio.shared_drives import PIECE, SharedDrives
-from drive_env.studio.single_axes import SingleAxes
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines

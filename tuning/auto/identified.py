@@ -15,13 +15,13 @@ from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.arrays import Integers, Mask
 from tuning.auto.checks import identified_plant, unsafe_gains
 from tuning.auto.stages import Basis, IdentifiedAxes
-from tuning.identify.estimate import TITLES
+from tuning.identify.identified_axis import TITLES
 from tuning.identify.working_state import cautious_bandwidth
 from tuning.target import Target
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
 
 Identify = Callable[[Target, Mask], "list[Identification]"]  # of the axes where the mask is true
 

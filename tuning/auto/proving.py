@@ -40,7 +40,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import TRIP, Terms, cost
-from tuning.auto.fallback_gains import FallbackGains
+from tuning.fallback_gains import FallbackGains
 from tuning.link_energy import bearable_speed, trial_reach
 from tuning.oscillation_watch import SOFTER
 from tuning.stop_causes import UNTOLD, stop_causes

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
     from tuning.arrays import Floats, Integers
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
 # quarter of a second that the robust cost looks at.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from drive_env.devices.gain_set import Gain
     from drive_env.loops.margins import Margins
     from drive_env.motors import Motor
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import AtLeast
     from tuning.target import Target
 

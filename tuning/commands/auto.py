@@ -52,7 +52,7 @@ def auto(
     state before, certificate.json and report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
-        from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files
+        from tuning.auto_to_files import BEFORE, auto_to_files, commission_to_files
         from tuning.runs import provenance
         from tuning.way_back import way_back
 

@@ -25,7 +25,7 @@ from tuning.target import Target, timed
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from tuning.arrays import Integers
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.rules.proposal import Proposal
 
 ENTRY_POINTS = "drive_env.tuners"

@@ -25,7 +25,7 @@ from drive_env.trials.gain_trial import Identified, Trial, measured_cost
 from drive_env.trials.method import method_of
 from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, longer_way, wrapped, write_profile
 from drive_env.trials.score import TRIP
-from tuning.auto.fallback_gains import FallbackGains
+from tuning.fallback_gains import FallbackGains
 from tuning.identify.connected_motors import check_motors
 from tuning.identify.working_state import GUESS
 from tuning.link_energy import trial_reach

@@ -13,7 +13,7 @@ from drive_env import cia402
 from drive_env.drives.interface import machine_of
 from drive_env.phase_current import LOAD_SHARE, holding_torque
 from drive_env.trials.working_moves import SETTLE, Steady, WorkingMoves
-from tuning.identify.linked_axes import are_independent
+from tuning.linked_axes import are_independent
 from tuning.stop_causes import told_causes
 from tuning.target import Target
 

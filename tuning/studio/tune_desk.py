@@ -24,9 +24,9 @@ from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machine
 
 if TYPE_CHECKING:
     from drive_env.studio.session import Session
-    from tuning.identify.estimate import Identification
+    from tuning.compare.side_by_side import AxisRules
+    from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import MeasuredLoop
-    from tuning.rules.side_by_side import AxisRules
 
 Floats = NDArray[np.float64]
 

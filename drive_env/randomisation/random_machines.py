@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.emulator.parameters import check_known, check_parameter
-from drive_env.envs.random_faults import RandomFaults, check_ranges
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS, names_of
+from drive_env.randomisation.random_faults import RandomFaults, check_ranges
 from drive_env.saved_state import Saved
 from mechanics.untrusted import read_toml
 
