@@ -250,45 +250,38 @@ def _exchange(
         dry_run: Say what would be written, and write nothing.
     """
     from drive_env.fieldbus.description import describe
-    from drive_env.master.parameters import (
-        SAVE,
-        check_at_rest,
-        compare,
-        list_differences,
-        restorable,
-        write_all_or_none,
-    )
+    from drive_env.master import parameters
 
-    wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
+    wanted = parameters.restorable(wanted, describe(bus.device, bus.eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
         look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
     with ExitStack() as written:
         with _connected(*bus) as drives:
             _check_axis(drives, axis)
             check(drives)
-            differences = compare(drives, wanted, axis)
+            differences = parameters.compare(drives, wanted, axis)
             scale = scales_of(drives)[axis]
             if not json:
                 _print(differences, "drive", name, scale, json)
             if dry_run:
-                check_at_rest(drives, wanted, axis)
+                parameters.check_at_rest(drives, wanted, axis)
                 _tell_plan(differences, scale, bus.node, store=store, json=json)
                 return
             if differences:
                 ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
-            changes = write_all_or_none(drives, wanted, axis)
+            changes = parameters.write_all_or_none(drives, wanted, axis)
             told = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
             written.enter_context(told_if_interrupted(f"{len(changes)} written to node {bus.node}{told}"))
             if store:
-                drives.write((0x1010, 1), SAVE)
+                drives.write((0x1010, 1), parameters.SAVE)
         # What was just written is not believed to whom wrote it: another connection reads it anew.
         with _connected(*bus) as drives:
-            left = compare(drives, wanted, axis)
+            left = parameters.compare(drives, wanted, axis)
     if left:
         fail(
             f"node {bus.node} does not have the values that were written, by a second reading: "
-            f"{list_differences(left)}; is another master writing to it? Look with `drive-env diff`, then restore "
-            "again",
+            f"{parameters.list_differences(left)}; is another master writing to it? Look with `drive-env diff`, "
+            "then restore again",
             REFUSED,
         )
     if json:
