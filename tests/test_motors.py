@@ -9,9 +9,9 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import gains_from_bandwidths
 from drive_env.devices.tmcm1636.commissioning import preset as rule
 from drive_env.firmware.record import get_lanes, set_lanes
-from drive_env.gains import gains_from_bandwidths
 from drive_env.motors import find_motor
 
 DEVICE = find_device("tmcm1636")

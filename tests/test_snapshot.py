@@ -20,9 +20,9 @@ from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning import snapshot as module
 from tuning.commands.cli import app
@@ -709,7 +709,7 @@ def test_an_object_of_one_emulated_axis_is_read_and_written_by_itself():
     drives = Played()
     drives.read = lambda name: np.array([4, 5, 6]) if name == CURRENT_LIMIT else None
     single = module._per_axis(drives)
-    entry = SimpleNamespace(index=0x2003, sub=0)
+    entry = SimpleNamespace(index=0x2003, sub=0, bits=16)
     assert [single.read_axis(entry, k) for k in range(3)] == [4, 5, 6]
     single.write_axis(entry, 1, 77)
     assert drives.log == [(CURRENT_LIMIT, 77, [False, True, False])]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation.scores import Episode
-from agents.policies.agent_file import plain
+from agents.plain import plain
 from agents.policies.guard import PATIENT, GuardedPolicy
 from drive_env.whole_file import write_arrays
 from mechanics.untrusted import parse_json, read_arrays

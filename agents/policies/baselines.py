@@ -23,7 +23,7 @@ from agents.policies.experts import (
     SwingUp,
     TorqueCascade,
 )
-from agents.training.tasks import environment_name
+from agents.tasks import environment_name
 
 Array = NDArray[np.float32]
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation

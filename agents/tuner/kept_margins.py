@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import cascade_columns
+from drive_env.devices.gains import cascade_columns
 from tuning.auto.correction import LOWERED
 from tuning.auto.loop_margins import MEASURED
 from tuning.auto.loop_model import LoopModel, loop_models

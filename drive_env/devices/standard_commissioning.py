@@ -41,7 +41,7 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
     Raises:
         ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
     """
-    from drive_env.gains import bandwidth_gains
+    from drive_env.devices.gains import bandwidth_gains
 
     dictionary = device.new_dictionary()
     found = _scale(device, dictionary, motor)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import MILLIAMPERE
 from drive_env.drives.interface import BasicDrives, Drives
 
-MILLIAMPERE = 1e-3
 _OF_PEAK = "1/32767 M-Ipeak"
 _WHOLE = 32767.0
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.master.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
+from drive_env.dictionary.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
 from drive_env.whole_file import write_table
 
 if TYPE_CHECKING:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.emulator.emulated_drives import emulated_of
+
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
     from drive_env.pictures.recording import Recorder
@@ -37,7 +39,7 @@ class Pictures:
     def __init__(self, drives: Drives, mode: str, period: float = 0.001) -> None:
         if drives.machine is None:
             raise ValueError("pictures need emulated machines; leave render_mode out on a bus")
-        self._drives = drives.machine.drives
+        self._drives = emulated_of(drives)
         self._period = period
         self._recorders: dict[int, Recorder] = {}
         self._picture: Picture | None = None

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import cascade_columns, gain_factors
+from drive_env.devices.gains import cascade_columns, gain_factors
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

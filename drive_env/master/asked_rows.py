@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Key
+from drive_env.fieldbus.description import Key
 
 Integers = NDArray[np.int64]
 CAN_BE_ASKED = ((cia402.STATUSWORD, 0),)

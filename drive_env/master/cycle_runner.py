@@ -15,14 +15,14 @@ from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.link import Link, Outputs, Samples
 from drive_env.master.asked_rows import CAN_BE_ASKED, AskedRows
-from drive_env.master.description import Description, Key
-from drive_env.master.link import Link, Outputs, Samples
 from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 
 if TYPE_CHECKING:
-    from drive_env.safety.envelope import Envelope
+    from drive_env.safety.watched_drives import CycleWatch
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class CycleRunner:
         self._running = threading.RLock()  # one user of SYNC at a time: the program, or its supervisor
         self._nothing = RecordCall((), ())
 
-    def pass_time(self, cycles: int, envelope: Envelope | None) -> None:
+    def pass_time(self, cycles: int, envelope: CycleWatch | None) -> None:
         """Let cycles pass by the clock: where this computer was late, SYNCs are left out."""
         with self._running:
             samples = None
@@ -105,8 +105,8 @@ class CycleRunner:
             self._run(cycles, None, samples, envelope, skip_missed=True)
             self._pace.end(self._link.receive)
 
-    def prepare(self, envelope: Envelope) -> None:
-        """Map the objects that the envelope watches, as far as they fit."""
+    def prepare(self, envelope: CycleWatch) -> None:
+        """Have mapped what the envelope watches, as far as it fits."""
         with self._running:
             self._map(self._nothing, envelope)
 
@@ -114,8 +114,8 @@ class CycleRunner:
         """Return the objects that are sampled with every SYNC."""
         return self._process.sampled_entries()
 
-    def poll(self, envelope: Envelope) -> bool | None:
-        """Send a SYNC of the supervisor's own and process its samples.
+    def poll(self, envelope: CycleWatch) -> bool | None:
+        """Send a SYNC of the supervisor's own and look at what comes back.
 
         Returns whether all of it came; None where the program's own cycles are under way, or nothing is mapped.
         """
@@ -191,7 +191,7 @@ class CycleRunner:
         return played
 
     def record(
-        self, call: RecordCall, played: Mapping[Entry, Integers], cycles: int, envelope: Envelope | None
+        self, call: RecordCall, played: Mapping[Entry, Integers], cycles: int, envelope: CycleWatch | None
     ) -> dict[Key, Integers]:
         """Let cycles pass and return the samples of each object, shape (cycles, num_axes)."""
         if envelope is not None:
@@ -217,8 +217,8 @@ class CycleRunner:
         return found
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _map(self, call: RecordCall, envelope: Envelope | None) -> None:
-        """Map a call's objects, and those that the envelope watches if they fit besides, from now on."""
+    def _map(self, call: RecordCall, envelope: CycleWatch | None) -> None:
+        """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
         watched = NOTHING if envelope is None else envelope.watched()
         played = tuple(dict.fromkeys(call.played))
         if call.watched is not watched:
@@ -259,7 +259,7 @@ class CycleRunner:
         cycles: int,
         outputs: Outputs | None,
         samples: Samples | None,
-        envelope: Envelope | None,
+        envelope: CycleWatch | None,
         *,
         skip_missed: bool = False,
         epoch: int | None = _NOW,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Key
+from drive_env.fieldbus.description import Key
 
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]

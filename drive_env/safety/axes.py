@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.master.description import Key
+from drive_env.fieldbus.description import Key
 from drive_env.safety.bounds import COUNTED
 from drive_env.safety.objects import CURRENT, DEMAND, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -64,7 +64,7 @@ class Axes:
         is_counted: Whether 606Ch counts what 6064h counts, per second.
     """
 
-    def __init__(self, drives: BusDrives) -> None:
+    def __init__(self, drives: WatchedDrives) -> None:
         self._drives = drives
         known = drives.description
         self.is_counted = known.has(VELOCITY) and known.dictionary.find(VELOCITY).unit == COUNTED

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
+from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, given
+from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
 from drive_env.safety.errors import SafetyError
-from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
 from drive_env.safety.objects import (
     CONTROLWORD,
@@ -47,7 +47,7 @@ from drive_env.safety.rotor import scale_objects
 from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -81,7 +81,7 @@ class Commands:
         modes: Returns the mode of operation of every axis.
     """
 
-    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
+    def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._current_limit = drives.description.role(Role.CURRENT_LIMIT)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
-from drive_env.master.errors import RefusedError
+from drive_env.drives.limits import NO_LIMIT, Limits
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
     FOLLOWING_WINDOW,
@@ -25,12 +26,11 @@ from drive_env.safety.bounds import (
     rotor_limits,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT, Limits
 from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ class LimitsInForce:
         latest: The limits as they were read last; None since something changed that they depend on.
     """
 
-    def __init__(self, user: Limits, drives: BusDrives, axes: Axes, lending: Lending) -> None:
+    def __init__(self, user: Limits, drives: WatchedDrives, axes: Axes, lending: Lending) -> None:
         self.user = user
         self.latest: Bounds | None = None
         self._generation = 0

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Key
+from drive_env.drives.limits import NO_LIMIT
+from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -28,7 +28,7 @@ ASK, ASK_AGAIN = 0.015, 0.010  # s for an answer to a look, where time passes, a
 SILENT = 0.05  # s for which one that did not answer is not asked again: it must not hold up the others
 
 
-def answer_time(drives: BusDrives, usual: float = ASK) -> float:
+def answer_time(drives: WatchedDrives, usual: float = ASK) -> float:
     """Return how long to wait for an answer to a look [s]: where time waits, nothing runs on meanwhile."""
     return drives.description.answer_timeout if drives.time_waits else usual
 
@@ -45,7 +45,7 @@ class Looks:
 
     def __init__(
         self,
-        drives: BusDrives,
+        drives: WatchedDrives,
         axes: Axes,
         limits: LimitsInForce,
         observe: Callable[[Mapping[Key, Integers], int, Mask], None],

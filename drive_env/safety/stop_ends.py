@@ -21,10 +21,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.master.description import Key
+from drive_env.drives.limits import NO_LIMIT
+from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN
 from drive_env.safety.objects import CSP, CSV, CURRENT, HM, IP, PP, TORQUE_MODES
 

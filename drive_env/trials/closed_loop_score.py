@@ -17,7 +17,7 @@ from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.phase_current import swing_period
 from drive_env.trials.closed_loop import CLOSING, OVERLOAD, full_step, held_in_trial
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW, with_run_current

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices.gain_set import LOAD_DETECTION, PID_ALONE
-from drive_env.gains import (
+from drive_env.devices.gains import (
     BASELINE_RULE,
     bandwidth_gains,
     rule_gains,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.phase_current import swing_period
 from drive_env.trials.open_loop import (
     ENCODER,

@@ -16,7 +16,7 @@ from drive_env import cia402
 from drive_env.devices.gain_set import PID_ALONE, ClosedLoop
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.phase_current import swing_period
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW
 from drive_env.trials.position_pid import PID_P, pid_terms, pid_time, steps_of

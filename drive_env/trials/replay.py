@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.drives import motion
-from drive_env.envs.randomisation import BESIDE, Distributions, Law
+from drive_env.randomisation.random_machines import BESIDE, Distributions, Law
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_rows
 

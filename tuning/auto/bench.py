@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.trials.positioning import wrapped
 from tuning.certificate.certificate import TAKEN, Correction
 from tuning.identify.wiring import Key, write_wiring

@@ -9,7 +9,7 @@ import numpy as np
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from tuning.identify.wiring import Key, changes, corrected, findings
 from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore

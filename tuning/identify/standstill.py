@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
+from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
-from tuning.identify.dead_time import dead_time
 from tuning.identify.encoder_check import able, stay_inside
-from tuning.identify.estimate import Estimate, refused
 from tuning.identify.winding import SUPPLY_IDLE, WIDEST
 from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, still_enabled, switch_off
+from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
 
 Floats = NDArray[np.float64]

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.gains import RAW_MAX, check_linear_model, write_gains
+from drive_env.devices.gains import RAW_MAX, check_linear_model
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.trials.method import check_tried
 from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials

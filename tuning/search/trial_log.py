@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.search.trial_bench import TrialBench, Tried, read_gains
 from tuning.target import DriveTime

@@ -28,7 +28,7 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
     Raises:
         ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
     """
-    from drive_env.gains import gains_from_bandwidths
+    from drive_env.devices.gains import gains_from_bandwidths
 
     gains = gains_from_bandwidths(
         device, motor, ROTORS * motor.inertia, current_hz=CURRENT_HZ, velocity_hz=VELOCITY_HZ, position_hz=POSITION_HZ

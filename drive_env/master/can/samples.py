@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.canopen.frames import SYNC
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can.pdo import RemotePdo
 from drive_env.master.can.port import Port
-from drive_env.master.description import Key
-from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.packing import Bytes, unpack_rows
 
 Integers = NDArray[np.int64]

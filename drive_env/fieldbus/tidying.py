@@ -1,11 +1,11 @@
-"""Putting a drive back as it was: every step is tried, also after a failure of others, and failures are reported."""
+"""Putting a drive back as it was: every step is tried, also after one that failed; the error names what failed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 
 SILENT = 2  # steps in a row without an answer, after which a node is not asked any more: each takes seconds
 

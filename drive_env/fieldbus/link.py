@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Key
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.description import Key
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 
 Integers = NDArray[np.int64]
 
@@ -48,8 +48,16 @@ class Wording(NamedTuple):
     sign_of_life: str
 
 
-class ObjectClient(Protocol):
-    """Reads and writes objects of a node, as bytes, for any thread; one transfer at a time."""
+class Timing(NamedTuple):
+    """How punctual the SYNCs of a run were: their number, those more than a cycle late, the worst lateness [s]."""
+
+    cycles: int
+    late: int
+    worst: float
+
+
+class ObjectReader(Protocol):
+    """Reads objects of a node, as bytes."""
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
         """Return the bytes of an object.
@@ -58,6 +66,10 @@ class ObjectClient(Protocol):
             ObjectAccessError: With the abort code, if the drive refuses.
             NoAnswerError: If it does not answer; one try may take `timeout` [s].
         """
+
+
+class ObjectClient(ObjectReader, Protocol):
+    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
 
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Write the bytes of an object, once: a repeated write may mean something else.
@@ -241,8 +253,8 @@ class OtherMastersHeard(Protocol):
 class Link(Protocol):
     """A fieldbus with the nodes of some drives.
 
-    Time passes by the clock, or by cycles alone (lockstep), as the drives' pace says: the link sends a cycle whenever
-    it is told to.
+    Time passes by the clock, or by cycles alone (lockstep), as the drives' pace says: the link sends a cycle
+    whenever `sync` is called.
     """
 
     @property
