@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from auto_stages import basis, recorded
+from tuning.identify.estimate import Identification
 
 from drive_env import cia402, motion
 from drive_env.drives.raw_gains import write_gains
@@ -17,7 +18,6 @@ from drive_env.loops.margins import Margins, margins
 from drive_env.loops.true_plant import true_plant
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
-from tuning.identify.estimate import Identification
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated, timed

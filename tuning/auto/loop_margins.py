@@ -20,7 +20,7 @@ from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.model_bounds import at_least_by_model, why_unbounded
 from tuning.auto.proving import STEP_SIZE
 from tuning.auto.trying import BY_TRIAL, watch_following
-from tuning.response.measured_loop import GOOD_MISFIT, merged
+from tuning.response.measured_loop import merged
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
