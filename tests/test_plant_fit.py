@@ -11,7 +11,8 @@ from drive_env.devices import find_device
 from drive_env.loops.linear_model import Plant, velocity_open_loop
 from drive_env.motors import find_motor
 from tuning.estimate import Estimate, refused
-from tuning.response.plant_fit import PlantFit
+from tuning.response.held_samples import seen_by_bus
+from tuning.response.plant_fit import PlantFit, fit_plant
 
 MOTOR = find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(find_device("tmcm1636"), MOTOR, 24.0, 3.0 * MOTOR.inertia)

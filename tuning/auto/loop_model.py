@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.identify.identified_axis import Identification
+    from tuning.response.measured_loop import MeasuredLoop
     from tuning.target import Target
 
 # Of the mass matrix over the axes' own inertia: a share that measures as much without being there, and the least own
