@@ -300,7 +300,7 @@ def _set_points(known: Description) -> list[Key]:
 
 
 def differences(drives: BusSide, snapshot: Snapshot) -> list[tuple[int, Difference]]:
-    """Return what is not as a snapshot says, as (number of the axis, difference), read anew from drives of a bus.
+    """Read drives of a bus; return the parameters that differ from a snapshot, as (number of the axis, difference).
 
     Set-points of speed and torque that would turn an axis once it is enabled are among them.
 

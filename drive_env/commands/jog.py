@@ -233,7 +233,7 @@ def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale:
 
 @contextlib.contextmanager
 def _what_stops(reasons: list[str]) -> Iterator[None]:
-    """Note what ends a movement early, in words of this command; what the bus says is none of it."""
+    """Record the stops that end a movement early; errors of the bus pass through."""
     from drive_env.fieldbus.errors import BusError
     from drive_env.safety.envelope import SafetyError
 
@@ -248,7 +248,7 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
 
 
 def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> str:
-    """Return what a speed is, and how rpm are written where it was a bare number."""
+    """Return a speed in words, and how to write rpm if it was a bare number."""
     from drive_env.dictionary import quantities
 
     text = quantities.show(velocity, entry, scale)

@@ -270,7 +270,7 @@ def ask(question: str, yes: bool) -> None:
 
 
 def scales_of(drives: BusDrives) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it."""
+    """Return the scale of every axis' units, as far as the drive tells it."""
     from drive_env.dictionary import quantities
 
     return quantities.scales_of(drives, drives.description.dictionary)

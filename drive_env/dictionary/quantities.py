@@ -98,7 +98,7 @@ def follows_scale(name: str) -> bool:
 
 
 def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
-    """Return what the units of every axis follow, as far as the drive says it.
+    """Return the scale of every axis' units, as far as the drive tells it.
 
     Args:
         drives: Emulated, or on a bus.

@@ -178,7 +178,7 @@ class ChosenWatch:
         self._whole.leave_alone(axes)
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first."""
+        """Return the objects to sample at every SYNC, the most important first."""
         return self._whole.watched()
 
     def stop(self, reason: str) -> None:

@@ -91,7 +91,7 @@ class DrivesProxy:
         return self._drives.record(objects, duration, play, period)
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return what the drives have said by themselves since the last call."""
+        """Return the emergencies that the drives have sent since the last call."""
         return self._drives.emergencies()
 
     def reset_node(self, where: Mask | None = None) -> None:

@@ -1,6 +1,6 @@
 """The Drives interface: what callers may ask of drives, emulated, on a bus, or behind an observer.
 
-It owns the protocols that it names: whoever has a machine, a bus or a watch fits them, and stands above.
+It owns the protocols that it names; classes with a machine, a bus or a watch fit them, and stand above.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class DescribedAxes(AxisObjects, Protocol):
         """Write an object of one axis."""
 
     def sdo(self, node: int) -> ObjectReader:
-        """Return what reads the objects of a node, by its position in `nodes`."""
+        """Return the reader of a node's objects, by its position in `nodes`."""
 
 
 class SafetyWatch(Protocol):
@@ -73,7 +73,7 @@ class SafetyWatch(Protocol):
         """Take note of axes that the program never moves."""
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first."""
+        """Return the objects to sample at every SYNC, the most important first."""
 
     def stop(self, reason: str) -> None:
         """Bring what is live to rest and switch it off."""

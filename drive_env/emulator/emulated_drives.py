@@ -184,7 +184,7 @@ class EmulatedDrives(Saved):
         self.inside.objects.write(name, value, axes)
 
     def _scales(self) -> list[Scale]:
-        """Return what the units of each axis follow, read again once it was written."""
+        """Return the scale of each axis' units, read again after a change."""
         if self._scale[0] != self.inside.objects.scale_changes:
             found = self.inside.objects.context()
             every = (found.position_scaler, found.velocity_ratio, found.peak_current)
@@ -294,7 +294,7 @@ class EmulatedDrives(Saved):
             group.load.restore_state(saved)
 
     def _description(self) -> State:
-        """Return what must be equal in two sets of drives so that one can restore the state of the other."""
+        """Return the properties that two sets of drives must share for one to restore the other's state."""
         groups = [(group.load.copies, group.load.h, group.load.staggered) for group in self.inside.groups]
         return {
             "device": self.device.name, "load": str(self.load.name), "motor": self.motor.name,

@@ -69,7 +69,7 @@ class ObjectReader(Protocol):
 
 
 class ObjectClient(ObjectReader, Protocol):
-    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
+    """Reads and writes objects of a node, as bytes; one transfer at a time."""
 
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Write the bytes of an object, once: a repeated write may mean something else.

@@ -396,7 +396,7 @@ class BusDrives:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _scales(self) -> list[Scale]:
-        """Return what the units of every axis follow, as far as the drive says it; it is asked."""
+        """Read the scale of every axis' units, as far as the drive tells it."""
         return scales_of(self, self._description.dictionary)
 
     def _place_of(self, entry: Entry, axis: int) -> tuple[int, int, int, str]:

@@ -49,7 +49,7 @@ class Identity(NamedTuple):
 
 
 def read_identity(drives: DescribedAxes, node: int = 0) -> Identity:
-    """Return what a node says of itself.
+    """Read a node's identity.
 
     Args:
         drives: Drives on a bus.

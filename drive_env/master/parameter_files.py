@@ -53,7 +53,7 @@ def parameters_text(drives: DescribedAxes, axis: int, values: Mapping[tuple[int,
 
 
 def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int, int], int]:
-    """Return the parameters of a file; ValueError for what is none."""
+    """Read the parameters of a file; ValueError for other files."""
     rows = _read_toml(path).get("parameters")
     if not isinstance(rows, dict) or not rows:
         raise ValueError(f"{path} has no table [parameters]; `drive-env backup` writes one")
@@ -72,7 +72,7 @@ def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int,
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Return what a file holds; ValueError if it is no TOML."""
+    """Read a TOML file; ValueError if it is not TOML."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
     try:

@@ -131,7 +131,7 @@ def compare(drives: DescribedAxes, wanted: Mapping[Key, int], axis: int = 0) -> 
 
 
 def write_all_or_none(drives: DescribedAxes, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
-    """Write what differs, read everything back, and take it all back if anything fails; return what was changed.
+    """Write the differing parameters and read them back; undo all if one fails. Return the changes.
 
     Raises:
         CommandObjectError: If there is a command or a service among them; nothing was written.

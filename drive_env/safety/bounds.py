@@ -112,7 +112,7 @@ class RotorLimits:
 
 
 def rotor_limits(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
-    """Return what the user's limits are of the rotors now.
+    """Return the user's limits as rotor angles and speeds of now.
 
     Args:
         limits: The user's.
@@ -236,7 +236,7 @@ REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filt
 
 
 def _own_range(drives: WatchedDrives) -> tuple[Integers, Integers]:
-    """Return 607Dh, corrected by the home offset (CiA 402); what is no range is none."""
+    """Return 607Dh, corrected by the home offset (CiA 402); an empty range is no limit."""
     low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
     # The ends of the type, which are the factory's, are no limits; neither is an empty range.
     empty = low >= high

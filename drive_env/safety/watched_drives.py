@@ -26,7 +26,7 @@ class CycleWatch(Protocol):
         """What samples are asked for in: it grows with every controlword."""
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        """Return the objects to sample at every SYNC, the most important first; the same while the limits stay."""
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
         """Take note of what comes with every SYNC."""
@@ -71,7 +71,7 @@ class WatchedDrives(Protocol):
 
     @property
     def is_dry(self) -> bool:
-        """Whether what would be sent is printed, and nobody is there."""
+        """Whether this is a dry run: frames are printed, and no node answers."""
 
     @property
     def link(self) -> Link:
@@ -105,7 +105,7 @@ class WatchedDrives(Protocol):
         """Let one cycle pass."""
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every SYNC."""
+        """Return the objects that come with every SYNC."""
 
     def prepare_watch(self, watch: CycleWatch) -> None:
         """Have mapped what is watched."""
