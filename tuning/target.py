@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
@@ -154,7 +155,7 @@ class Target:
 
 
 def emulated(
-    device: str = "tmcm1636",
+    device: str = DEFAULT_DEVICE,
     load: str | Path | Load = "two_mass",
     motor: str | None = None,
     *,
@@ -263,7 +264,7 @@ def of_machines(
 
 
 def on_bus(
-    device: str = "tmcm1636",
+    device: str = DEFAULT_DEVICE,
     motor: str | None = None,
     *,
     interface: str | None = None,

@@ -21,6 +21,7 @@ from drive_env.commands.options import (
     errors_as_exit_codes,
     names_a_bus,
 )
+from drive_env.default_device import DEFAULT_DEVICE
 
 KBIT = 1000  # bit/s
 
@@ -33,7 +34,7 @@ def export(
     channel: Channel = None,
     node: Node = None,
     axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     motor: Annotated[
         str | None,

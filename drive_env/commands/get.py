@@ -35,6 +35,7 @@ from drive_env.commands.options import (
     scales_of,
     told_if_interrupted,
 )
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
@@ -50,7 +51,7 @@ def get(
     channel: Channel = None,
     node: Nodes = None,
     axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
@@ -86,7 +87,7 @@ def set_object(
     channel: Channel = None,
     node: Nodes = None,
     axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,

@@ -32,6 +32,7 @@ from drive_env.commands.options import (
     scales_of,
 )
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectDictionary
@@ -57,7 +58,7 @@ def jog(
     channel: Channel = None,
     node: Node = None,
     axis: AxisNumber = 0,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,

@@ -29,6 +29,7 @@ from drive_env.commands.options import (
     scales_of,
 )
 from drive_env.commands.tables import Column, tables
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def monitor(
     channel: Channel = None,
     node: Nodes = None,
     axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,

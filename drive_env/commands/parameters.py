@@ -37,6 +37,7 @@ from drive_env.commands.options import (
     told_if_interrupted,
 )
 from drive_env.commands.tables import Column, print_table, print_text
+from drive_env.default_device import DEFAULT_DEVICE
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def backup(
     channel: Channel = None,
     node: Node = None,
     axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
@@ -101,7 +102,7 @@ def diff(
     channel: Channel = None,
     node: Node = None,
     axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
@@ -142,7 +143,7 @@ def restore(
     channel: Channel = None,
     node: Node = None,
     axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
@@ -186,7 +187,7 @@ def commission(
     channel: Channel = None,
     node: Node = None,
     axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
     store: Store = False,

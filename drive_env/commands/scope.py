@@ -32,6 +32,7 @@ from drive_env.commands.options import (
     print_json,
     scales_of,
 )
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -62,7 +63,7 @@ def scope(
     channel: Channel = None,
     node: Nodes = None,
     axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,

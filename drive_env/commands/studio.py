@@ -27,6 +27,7 @@ from drive_env.commands.options import (
     was_typed,
 )
 from drive_env.commands.scope import refuse_other_masters
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
@@ -38,7 +39,7 @@ LOOK = 0.02  # s between two looks whether the bus is open
 
 def studio(
     context: typer.Context,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     load: Annotated[str, typer.Option(help="Load of the emulated machine, a name or an MJCF file.")] = "two_mass",
     motor: Annotated[
         str | None, typer.Option(help="Its motor, a name or a TOML file; the device's usual one by default.")

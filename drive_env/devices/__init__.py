@@ -14,12 +14,13 @@ from drive_env import cia402
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
-from drive_env.devices.own_folder import BINDINGS, check_scale, is_own_folder, naming, own_bindings, own_data
+from drive_env.devices.own_folder import BINDINGS, bindings_of, check_scale, is_own_folder, naming, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
 from drive_env.devices.variants import (
     check_rates,
     compose_eds,
     converted_preset,
+    device_data,
     merged,
     own_variant,
     parse_key,
@@ -276,17 +277,15 @@ class Device(NamedTuple):
         preset: dict[str, int]
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(read_toml(path)["objects"])
+        elif (table := self.presets.parent / "commissioning.toml").exists():
+            preset = importlib.import_module("drive_env.devices.commissioning").preset(self, motor, read_toml(table))
         elif self.commissioning == STANDARD_COMMISSIONING:
-            rule = importlib.import_module("drive_env.devices.standard_commissioning")
-            preset = rule.preset(self, motor)
-        elif self.presets.parent.parent != FOLDER:
+            preset = importlib.import_module("drive_env.devices.commissioning").standard_preset(self, motor)
+        else:
             raise ValueError(
                 f"{self.name} has no preset for a {motor.name}; write {path} with [objects], name = integer, or take a "
                 f"motor that it has one for: {', '.join(sorted(one.stem for one in self.presets.glob('*.toml')))}"
             )
-        else:
-            rule = importlib.import_module(f"drive_env.devices.{self.presets.parent.name}.commissioning")
-            preset = rule.preset(self, motor)
         if not self.variant_of:
             return preset
         before = find_device(self.variant_of).bindings
@@ -332,9 +331,9 @@ def find_device(name: str) -> Device:
     if name not in device_names() and is_own_folder(name):
         return _own_device(Path(name))
     if name.endswith(".toml"):
-        own = own_variant(Path(name), {known: _read(FOLDER / known) for known in device_names()})
+        own = own_variant(Path(name), {known: device_data(FOLDER / known) for known in device_names()})
     elif name in device_names():
-        own = _read(folder)
+        own = device_data(folder)
     else:
         near = did_you_mean(name, device_names())
         raise ValueError(
@@ -345,13 +344,12 @@ def find_device(name: str) -> Device:
     if "variant_of" in own:
         base = find_device(own["variant_of"])
         folder = FOLDER / base.name
-        data = merged(_read(folder), own)
+        data = merged(device_data(folder), own)
         eds: Path | EdsText = compose_eds(f"{name}.eds", eds_text(base.eds), own)
         bindings = variant_bindings(base.bindings, own["objects"])
     else:
-        rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
-        eds, bindings = folder / data["eds"], {(row.index, row.sub): row for row in rows}
-    return _device(data, folder, eds, bindings, _roles(folder), load_gain_set(folder / "gains.toml"))
+        eds, bindings = folder / data["eds"], bindings_of(folder, data)
+    return _device(data, folder, eds, bindings, _roles(folder, data), load_gain_set(folder / "gains.toml"))
 
 
 def _own_device(folder: Path) -> Device:
@@ -360,9 +358,9 @@ def _own_device(folder: Path) -> Device:
         data = own_data(folder)
         eds = folder / data["eds"]
     with naming(folder / BINDINGS):
-        bindings = own_bindings(folder)
+        bindings = bindings_of(folder, data)
     with naming(folder / "roles.toml"):
-        roles = _roles(folder)
+        roles = _roles(folder, data)
     with naming(folder / "gains.toml"):
         gains = load_gain_set(folder / "gains.toml")
         if missing := [f"{index:04X}h:{sub:02X}" for index, sub in gains.keys if (index, sub) not in bindings]:
@@ -434,12 +432,8 @@ def _device(
     )
 
 
-def _read(folder: Path) -> dict[str, Any]:
-    return read_toml(folder / "device.toml")
-
-
-def _roles(folder: Path) -> dict[Role, tuple[int, int]]:
-    rows = read_toml(folder / "roles.toml")
+def _roles(folder: Path, data: Mapping[str, Any]) -> dict[Role, tuple[int, int]]:
+    rows: dict[str, str] = data.get("roles", {}) | read_toml(folder / "roles.toml")
     return {Role[name.upper()]: parse_key(text) for name, text in rows.items()}
 
 

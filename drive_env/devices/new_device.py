@@ -479,7 +479,7 @@ class _Draft:
             f"[current]  # A of peak i_q\nrated = {current:.6g}  # base of thousandths: {self._motor.name}\n",
         )
         if info.get("LSS_Supported", "0") not in ("", "0"):
-            text = text.replace("lss = false", "lss = true")
+            text += "\n[canopen.services]\nlss = true\n"
         return f"{head}{text}\n{self._tables()}"
 
     def _axis_offsets(self) -> str:
@@ -506,9 +506,9 @@ class _Draft:
         services = [
             _text((index, sub)) for index in (STORE, RESTORE) for i, sub in self._types if i == index and sub > 0
         ]
-        lines = ["[states]", "", "[values]  # objects that know a few values only"]
+        lines = ["[values]  # objects that know a few values only"]
         lines += [f'"{key}" = [{", ".join(map(_toml, row))}]' for key, row in values.items()]
-        lines += ["", "[strict_transmission_types]", "", "[unsupported]  # without a node on a bus"]
+        lines += ["", "[unsupported]  # without a node on a bus"]
         lines += [f"objects = [{', '.join(map(_quoted, services))}]", "", "[canopen.store_groups]  # CiA 301, 1010h"]
         motors = [f"motor {axis}" for axis in range(self._axes)] + ["module"]
         groups = {

@@ -31,6 +31,9 @@ from mechanics.untrusted import read_toml
 
 Key = tuple[int, int]
 
+FAMILIES = ("stepper",)  # each a file beside `DEFAULTS`
+DEFAULTS = Path(__file__).parent / "defaults.toml"
+
 # Data types of CiA 301, table 44; codes of object types of CiA 306.
 TYPES = {
     "i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07,
@@ -49,6 +52,25 @@ def parse_key(text: str) -> Key:
     """Return index and sub-index of "2042:5"."""
     index, sub = text.split(":")
     return int(index, 16), int(sub)
+
+
+def device_data(folder: Path) -> dict[str, Any]:
+    """Return what a folder's `device.toml` says, over `defaults.toml` and what the family that it is `like` has.
+
+    A variant's is returned as it is.
+
+    Raises:
+        ValueError: If it cannot be read, or names a family that there is not.
+    """
+    own = read_toml(folder / "device.toml")
+    if "variant_of" in own:
+        return own
+    data = read_toml(DEFAULTS)
+    if like := own.get("like"):
+        if like not in FAMILIES:
+            raise ValueError(f"like = {like!r} names no family of devices; there are {', '.join(FAMILIES)}")
+        data = merged(data, read_toml(DEFAULTS.with_name(f"{like}.toml")))
+    return merged(data, own)
 
 
 def merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.cores import usable_cores
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
@@ -107,7 +108,7 @@ class EmulatedDrives(Saved):
 
     def __init__(
         self,
-        device: str = "tmcm1636",
+        device: str = DEFAULT_DEVICE,
         load: str | Path | Load = "two_mass",
         motor: str | Path | Motor | None = None,
         num_machines: int = 1,

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import can
 
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.entries import ObjectName
 from drive_env.master.bus_drives import BusDrives, checked_limits
 from drive_env.master.can.bus_time import BIT_RATE, BusTime
@@ -57,7 +58,7 @@ class CanDrives(BusDrives):
 
     def __init__(
         self,
-        device: str = "tmcm1636",
+        device: str = DEFAULT_DEVICE,
         *,
         eds: str | Path | None = None,
         interface: str | None = None,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives import motion
 from mechanics.untrusted import read_toml
@@ -60,7 +61,7 @@ class PictureFormat:
 class Demonstration:
     """A run: see demonstration.toml for units; None is chosen to suit load and motor."""
 
-    device: str = "tmcm1636"
+    device: str = DEFAULT_DEVICE
     motor: str = "qbl4208"
     load: str = "two_mass"
     seed: int = 0

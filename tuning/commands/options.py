@@ -28,6 +28,7 @@ from drive_env.commands.options import ask as ask
 from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus
 from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
@@ -131,7 +132,7 @@ class DriveOptions:
     """The options that name a drive, emulated or on a bus; `takes` gives them to a command."""
 
     bus: Bus = False
-    device: DeviceName = "tmcm1636"
+    device: DeviceName = DEFAULT_DEVICE
     eds: ForeignEds = None
     motor: MotorName = None
     load: LoadName = "two_mass"
