@@ -8,9 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from mechanics.load import Load, Parameter
-
-Floats = NDArray[np.float64]
 
 # Columns of the frictions, contacts and rolls as the rows give them.
 FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")

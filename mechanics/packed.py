@@ -14,14 +14,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
 from mechanics.load import Load
 from mechanics.load_values import FRICTION_COLUMNS, VALUE_ARRAYS, LoadValues
 from mechanics.modal import Corrections, corrections
 from mechanics.plant import PackedPlant
 from mechanics.template import Template, template_of
-
-Floats = NDArray[np.float64]
 
 # Above this phase per step [rad] the discrete resonance cannot be put at the true one any more with good accuracy.
 MAX_PHASE_PER_STEP = 0.7

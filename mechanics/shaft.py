@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from mechanics.load import Load
 from mechanics.packed import PackedLoad
-
-Floats = NDArray[np.float64]
 
 POSES = 16  # at which gravity and inertia are looked at, where they change
 

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.roles import Role
 from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, highest_ramp, plan_move
+from mechanics.arrays import Floats
 
 if TYPE_CHECKING:
     from drive_env.motors import Motor
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
 
 LINK_SHARE = 0.8  # of what the link holds, that is filled: the supply may be higher than what was entered
 SLOWER = 0.9  # by which positioning moves are made slower in turn that would overcharge the link

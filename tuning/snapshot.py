@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_writable
 from drive_env.drives.interface import Drives, device_of
 from drive_env.held_signals import held_signals
-from drive_env.master.description import Description, Key, describe
+from drive_env.master.description import Description, describe
 from drive_env.master.errors import BusError
 from drive_env.master.identity import Identity, check_same_drive, load_identity, read_identity
 from drive_env.master.parameters import (
@@ -39,6 +39,7 @@ from drive_env.master.parameters import (
 )
 from drive_env.safety.envelope import SafetyError
 from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
+from mechanics.arrays import Mask
 from mechanics.untrusted import read_toml
 from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
     from tuning.target import Target
 
-Mask = NDArray[np.bool_]
 
 SWITCH_OFF = 1000  # cycles that switching the voltage off may take
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h

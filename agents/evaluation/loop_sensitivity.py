@@ -24,8 +24,7 @@ from drive_env.envs import environment_of
 from drive_env.envs.tracking import Tracking
 from drive_env.loops.dynamics import Dynamics
 from drive_env.motors import find_motor
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 MACHINES = 32  # that are drawn
 REPEATS = 4  # of every machine, with other trajectories and phases, against what is not linear

@@ -18,9 +18,8 @@ from drive_env.devices import find_device
 from drive_env.envs.gain_scheduling import base_inertia
 from drive_env.gains import Rule, rule_gains
 from drive_env.motors import find_motor
+from mechanics.arrays import Floats
 from mechanics.loads import find_load
-
-Floats = NDArray[np.float64]
 
 AXIS_ENTRIES = 8
 ERROR, SPEED_ERROR, POSITION, SPEED, TORQUE, WANTED_SPEED, WANTED_SPEED_LATER = range(7)  # of an axis in Tracking

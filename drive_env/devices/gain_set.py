@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.cia402 import Key
+from mechanics.arrays import Integers, Mask
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import BasicDrives
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Key = tuple[int, int]
 
 
 class Gain(NamedTuple):

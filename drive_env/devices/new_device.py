@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from canopen.objectdictionary import ODVariable
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices.eds_process_data import repair_process_data
 from drive_env.devices.standard_objects import (
     BY_THEMSELVES,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from drive_env.firmware.common.modes import Mode
     from drive_env.motors import Motor
 
-Key = tuple[int, int]
 Types = Mapping[Key, ODVariable]
 
 TEMPLATE = Path(__file__).parent / "template.toml"

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from drive_env.devices.variants import Key, device_data, parse_key
+from drive_env.cia402 import Key
+from drive_env.devices.variants import device_data, parse_key
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.dictionary.position_scale import COARSEST, FINEST, is_scale, position_scale

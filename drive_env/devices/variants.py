@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices.drive_quirks import NO_SWITCH
 from drive_env.devices.services import OPTIONAL_EMERGENCIES
 from drive_env.dictionary import units
@@ -28,8 +29,6 @@ from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
-
-Key = tuple[int, int]
 
 FAMILIES = ("stepper",)  # each a file beside `DEFAULTS`
 DEFAULTS = Path(__file__).parent / "defaults.toml"

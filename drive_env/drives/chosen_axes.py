@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.drives.arguments import checked_mask
-from drive_env.drives.interface import Drives, Integers, Mask
+from drive_env.drives.interface import Drives
 from drive_env.drives.trace import Trace
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

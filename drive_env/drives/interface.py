@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
     from drive_env.master.bus_drives import BusDrives
     from drive_env.safety.envelope import Envelope
-
-Mask = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 
 class BasicDrives(Protocol):

@@ -9,8 +9,9 @@ from contextlib import contextmanager
 import numpy as np
 
 from drive_env.drives.arguments import checked_mask
-from drive_env.drives.interface import Drives, Mask
+from drive_env.drives.interface import Drives
 from drive_env.held_signals import held_signals
+from mechanics.arrays import Mask
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,7 @@ from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Mask
 
 SHARE = 0.95  # of the current limit, from which on a current is at it: samples are noisy
 HELD = 0.5  # s, for which it stands so: to set off takes all the current, too, and less time

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.cores import usable_cores
 from drive_env.default_device import DEFAULT_DEVICE
@@ -43,14 +43,11 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.master.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.motors import Motor, find_motor
 from drive_env.saved_state import Saved, State, check_alike
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import copies_per_model
 from mechanics.packed import PackedLoad, pack
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
 

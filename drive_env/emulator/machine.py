@@ -21,13 +21,12 @@ from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.record import get_lanes, set_lanes
+from mechanics.arrays import Floats, Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
     from drive_env.emulator.parameters import MachineParameter
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors

@@ -13,11 +13,10 @@ from drive_env.emulator.machine_numbers import machine_numbers
 from drive_env.firmware.common.encoder import encoder_count
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Mask
 from mechanics.load import Load
 from mechanics.near_names import did_you_mean
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Records = NDArray[np.void]
 
 VELOCITY_FILTER_DAMPING = 0.7

@@ -10,10 +10,8 @@ from drive_env import motors
 from drive_env.devices import Device
 from drive_env.emulator.parameters import (
     WIRING,
-    Floats,
     MachineKind,
     MachineParameter,
-    Mask,
     Records,
     change_encoder,
     set_encoder_counts,
@@ -21,6 +19,7 @@ from drive_env.emulator.parameters import (
 )
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Mask
 
 # Parameters that are a field of the record as they stand: name -> (field, part).
 _FIELDS = {

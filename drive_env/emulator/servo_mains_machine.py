@@ -12,18 +12,12 @@ import numpy as np
 
 from drive_env.devices import Device
 from drive_env.emulator import servo_machine
-from drive_env.emulator.parameters import (
-    Floats,
-    MachineKind,
-    MachineParameter,
-    Mask,
-    Records,
-    check_one_supply,
-)
+from drive_env.emulator.parameters import MachineKind, MachineParameter, Records, check_one_supply
 from drive_env.emulator.servo_machine import SERVO
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Mask
 
 AXES = 2  # that share a link
 OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off

@@ -9,10 +9,8 @@ import numpy as np
 from drive_env import motors
 from drive_env.devices import Device
 from drive_env.emulator.parameters import (
-    Floats,
     MachineKind,
     MachineParameter,
-    Mask,
     Records,
     change_encoder,
     set_encoder_counts,
@@ -20,6 +18,7 @@ from drive_env.emulator.parameters import (
 )
 from drive_env.firmware.record import set_lanes
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Mask
 
 # Parameters that are a field of the record as they stand.
 _FIELDS = {

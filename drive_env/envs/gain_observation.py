@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env.motors import Motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 RATIO_MAX = 100.0  # of a true parameter over its default
 

@@ -37,15 +37,13 @@ from drive_env.gains import (
 )
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
 
 if TYPE_CHECKING:
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains

@@ -28,7 +28,7 @@ from drive_env.envs.gain_observation import (
 )
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
-from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
+from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.gains import read_gains
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.motors import Motor, find_motor
@@ -37,8 +37,7 @@ from drive_env.trials.load_detection import is_load_detection
 from drive_env.trials.method import check_tried, method_of, new_score
 from drive_env.trials.positioning import TRIAL, reach
 from drive_env.trials.score import RobustScore
-
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers, Mask
 
 JUDGED = ("incumbent", "trial")
 

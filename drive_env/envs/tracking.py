@@ -27,17 +27,9 @@ from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
-from drive_env.envs.vector_environment import (
-    Floats,
-    Info,
-    Mask,
-    Observation,
-    Reward,
-    Stepped,
-    VectorEnvironment,
-    check_choice,
-)
+from drive_env.envs.vector_environment import Info, Observation, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.motors import Motor, find_motor
+from mechanics.arrays import Floats, Mask
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
 

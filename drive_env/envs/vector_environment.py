@@ -24,9 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.envs.randomisation import Curriculum, Distributions
 from drive_env.saved_state import Saved, State, check_alike
+from mechanics.arrays import Floats, Mask
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Info = dict[str, Any]
 Observation = Any  # an array with environments first, or a dict of such arrays
 Stepped = tuple[Observation, Floats, Mask, Mask, Info]

@@ -28,12 +28,11 @@ from drive_env.faults.effects import (
 from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
 from drive_env.faults.table import FaultRow, checked_parameters, find_fault
 from drive_env.firmware.record import get_lanes, set_lanes
+from mechanics.arrays import Floats, Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _CHANGING = ("axes", "state", "begins", "ends")  # of a fault, beside what its order says
 ABSENT, WAITING, DUE, ON, OVER = range(5)  # a machine: not concerned, waits for the condition, for the time, ...

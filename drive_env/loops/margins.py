@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from mechanics.arrays import Floats
 
 
 class Margins(NamedTuple):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env import cia402
 from drive_env.canopen.frames import INVALID
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.held_signals import held_signals
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from drive_env.devices import MasterHints
     from drive_env.master.bus_drives import BusDrives
 
-Key = tuple[int, int]
 
 # What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
 COMMANDS = {

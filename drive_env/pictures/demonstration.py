@@ -10,19 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives import motion
+from mechanics.arrays import Floats
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
     from drive_env.pictures.recording import Recorder, Recording
 
-Floats = NDArray[np.float64]
 
 DEFAULT = Path(__file__).parent / "demonstration.toml"
 TARGETS = {

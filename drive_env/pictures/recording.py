@@ -15,13 +15,12 @@ from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from mechanics.arrays import Floats, Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (
     (cia402.POSITION_DEMAND, 0),

@@ -23,12 +23,12 @@ from drive_env.pictures.picture_files import check_out, write_film
 from drive_env.pictures.recording import CYCLE
 from drive_env.pictures.scene import Scene
 from drive_env.pictures.scope_picture import ScopePicture
+from mechanics.arrays import Image
 
 if TYPE_CHECKING:
     from drive_env.pictures.recording import Recording
     from mechanics.load import Load
 
-Image = NDArray[np.uint8]
 Progress = Callable[[float], None]
 
 FILM_LENGTH = 8.0  # s, about what one watches

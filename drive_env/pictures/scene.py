@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.pictures.opengl import OpenGLError, import_mujoco, new_context
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from mechanics.arrays import Floats, Image
 
 FIELD_OF_VIEW = 30.0  # degrees, vertical: a long lens, so that parallel edges look parallel
 ELEVATION = -28.0  # degrees: seen from above

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
 from drive_env.safety.errors import SafetyError
@@ -45,12 +45,11 @@ from drive_env.safety.objects import (
 )
 from drive_env.safety.rotor import scale_objects
 from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Objects whose magnitude is a command, and which limit holds it.
 _MAGNITUDES = {

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Integers = NDArray[np.int64]
 PerAxis = float | Sequence[float | None]
 
 NO_LIMIT = 2**62  # beyond what any object holds

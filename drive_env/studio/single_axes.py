@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from drive_env.dictionary.entries import Entry, ObjectName
-from drive_env.drives.interface import Drives, Integers
+from drive_env.drives.interface import Drives
+from mechanics.arrays import Integers
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives

@@ -10,7 +10,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gain_set import LOAD_ANGLE
@@ -33,10 +32,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import LOAD_SHARE, CurrentSwings, StepperScore, Terms, swings
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 PUSH = 1.3  # torque over what the trial's run current holds
 AWAY = 4.0  # full steps

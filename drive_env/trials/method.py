@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices.gain_set import LOAD_DETECTION, PID_ALONE
 from drive_env.gains import (
@@ -27,6 +27,7 @@ from drive_env.trials.open_loop import OpenLoopTrials, acceleration_share, open_
 from drive_env.trials.position_pid import PID_I, PID_P, PidTrials, load_step_error, pid_time, plan_pid
 from drive_env.trials.positioning import SPEED_SHARE, highest_ramp, plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
+from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
     from drive_env.trials.positioning import Move
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
 FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}

@@ -10,7 +10,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.gains import write_gains
@@ -27,9 +26,7 @@ from drive_env.trials.open_loop import (
 )
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
 from drive_env.trials.score import CurrentSwings, Scores, StepperScore
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers
 
 
 class OpenLoopScore(StepperScore):

@@ -10,7 +10,6 @@ import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gain_set import PID_ALONE, ClosedLoop
@@ -22,9 +21,7 @@ from drive_env.trials.open_loop import ENCODER, NO_WINDOW
 from drive_env.trials.position_pid import PID_P, pid_terms, pid_time, steps_of
 from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
 from drive_env.trials.score import CurrentSwings, StepperScore, Terms
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers
 
 CLOSING = 0.01  # s: a PID has no initialisation
 

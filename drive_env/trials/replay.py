@@ -18,17 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.drives import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
+from mechanics.arrays import Floats, Integers
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_rows
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Key = tuple[int, int]
 
 CYCLE = 0.001  # s
 # What the drive was told, in the order in which it is looked for: object, mode in which it is played, and played as.

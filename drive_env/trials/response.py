@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 ROUNDING = 1e-9  # of the record: t = k * dt may miss a given time by this without costing a sample
 

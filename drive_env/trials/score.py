@@ -64,6 +64,7 @@ from drive_env.trials.positioning import (
     wrapped,
     write_profile,
 )
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
@@ -71,9 +72,6 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TRIP = 30.0
 BENT = TRIP / 2.0  # where J begins to bend towards it

@@ -15,6 +15,7 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
 from drive_env.safety.envelope import swinging_allowed
+from mechanics.arrays import Floats, Mask
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
@@ -46,8 +47,6 @@ from tuning.target import Target, timed
 if TYPE_CHECKING:
     from tuning.response.plant_fit import PlantFit
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HOLD, STEADY = 160, 80  # cycles at rest before anything moves, and how many of them count
 FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # of the loops in which the response is measured

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.units import RPM
@@ -26,6 +25,7 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import as_chip, write_gains
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.momentum_balance import BalanceRows, Motion, Solved, balance_rows, motion, solve, step
@@ -36,10 +36,6 @@ from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import SOFTER, OscillationError, watch_of
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MOST_RATIO = 30.0  # over the rotor's: beyond, a cautious excitation hardly moves the load (Yaskawa: 15 to 30)
 SPEED_SHARE, CURRENT_SHARE, ROOM_SHARE = 0.7, 0.5, 0.75  # of the limits

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from mechanics.arrays import Complex, Floats
 
 KINDS = ("multisine", "chirp")
 CREST = 2.5  # peak over RMS that is counted with before the wave is known

@@ -22,12 +22,9 @@ from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.trials.positioning import wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.response.excitation import Lines, periodic
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 SET_POINT = {"velocity": (cia402.TARGET_VELOCITY, 0), "position": (cia402.TARGET_POSITION, 0)}
 OFFSET = {

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
@@ -22,6 +21,7 @@ from drive_env.gains import check_linear_model, read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency
+from mechanics.arrays import Complex, Floats, Integers, Mask
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.lateness import told_lateness
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
@@ -40,10 +40,6 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LOOPS = ("velocity", "position")
 RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz

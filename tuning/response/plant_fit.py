@@ -19,15 +19,13 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from drive_env.loops.linear_model import Plant, controllers, velocity_open_loop, velocity_plant
+from mechanics.arrays import Complex, Floats
 from tuning.response.held_samples import seen_by_bus
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.identify.estimate import Estimate
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
 
 LINEAR = 0.01  # share by which the linear model may be off at a line for reasons that repeat: friction, cogging
 VALLEY, NEIGHBOURS = 0.02, 5  # the same, of the greatest among so many neighbours

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from drive_env.drives.interface import Drives, device_of
 from drive_env.studio.runs_folder import RUNS
+from mechanics.arrays import Floats
 from tuning.runs.provenance import run_folder
 from tuning.snapshot import Snapshot, check_place, load_snapshot, take_of
 from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machines
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
     from tuning.rules.side_by_side import AxisRules
 
-Floats = NDArray[np.float64]
 
 LAST = 5  # step responses under the present one
 MOST_STEPS = 1000  # changes of gains that can be taken back one by one

@@ -7,9 +7,10 @@ import struct
 import time
 from collections.abc import Sequence
 
+from drive_env.cia402 import Key
 from drive_env.ethercat import registers
 from drive_env.master.changed_objects import REMEDY, ChangedObjects
-from drive_env.master.description import Description, Key
+from drive_env.master.description import Description
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster
 from drive_env.master.ethercat.image_data import EtherCatProcessData
 from drive_env.master.link import NoWatchdogError, ObjectClient
