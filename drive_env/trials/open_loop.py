@@ -114,15 +114,7 @@ class OpenLoopTerms(NamedTuple):
 
     def each(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> OpenLoopTerms:
         """Return the terms with a function applied to each."""
-        return OpenLoopTerms(
-            function(self.settling),
-            function(self.disturbance),
-            function(self.noise),
-            function(self.overshoot),
-            function(self.tripped),
-            function(self.load_angle),
-            function(self.effort),
-        )
+        return OpenLoopTerms(*map(function, self))
 
 
 def open_loop_cost(terms: OpenLoopTerms) -> Floats:
