@@ -8,36 +8,28 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drive_env.commands.options import (
     REFUSED,
-    Bitrate,
-    Channel,
-    DeviceName,
+    AxisOptions,
     Eds,
-    Interface,
     Json,
-    Node,
-    Timeout,
     WouldDo,
     Yes,
     ask,
     check_free,
-    chosen_node,
-    connect,
     errors_as_exit_codes,
     fail,
-    look_first,
+    grouped,
     names_a_bus,
     print_json,
     scales_of,
     told_if_interrupted,
 )
 from drive_env.commands.tables import Column, print_table, print_text
-from drive_env.default_device import DEFAULT_DEVICE
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -45,7 +37,6 @@ if TYPE_CHECKING:
     from drive_env.master.identity import Identity
     from drive_env.master.quantities import Scale
 
-Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
 Store = Annotated[
     bool,
@@ -60,16 +51,12 @@ Unchecked = Annotated[
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 
+@grouped
 def backup(
     file: Annotated[Path, typer.Argument(help="New file (TOML); - prints it.")],
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = DEFAULT_DEVICE,
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     json: Json = False,
 ) -> None:
     """Read all parameters of a drive into a file, without commands and services."""
@@ -79,11 +66,10 @@ def backup(
     with errors_as_exit_codes():
         if str(file) != "-":
             check_free(file)
-        node = chosen_node(interface, node)
-        with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
-            _check_axis(drives, axis)
-            values = read_parameters(drives, axis)
-            text = sealed(parameters_text(drives, axis, values))
+        with bus.connect(eds, safety=False) as drives:
+            _check_axis(drives, bus.axis)
+            values = read_parameters(drives, bus.axis)
+            text = sealed(parameters_text(drives, bus.axis, values))
         if str(file) == "-":
             print_text(text)
             return
@@ -91,21 +77,17 @@ def backup(
         if json:
             print_json({"file": str(file), "parameters": len(values)})
         else:
-            print(f"{len(values)} parameters of node {node} written to {file}")
+            print(f"{len(values)} parameters of node {bus.number} written to {file}")
 
 
+@grouped
 def diff(
     context: typer.Context,
     file: File,
     other: Annotated[Path | None, typer.Argument(help="Another file to compare with, instead of the drive.")] = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = DEFAULT_DEVICE,
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     json: Json = False,
 ) -> None:
     """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
@@ -116,7 +98,7 @@ def diff(
         if other is not None:
             if names_a_bus(context):
                 raise ValueError(f"{file} is compared with {other}, and with no drive; leave the bus out, or {other}")
-            dictionary = describe(device, eds).dictionary
+            dictionary = describe(bus.device, eds).dictionary
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             _tell_of_changes(file)
             _tell_of_changes(other)
@@ -127,26 +109,22 @@ def diff(
             ]
             scale = None
         else:
-            with _connected(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout) as drives:
-                _check_axis(drives, axis)
-                differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
+            with bus.connect(eds, safety=False) as drives:
+                _check_axis(drives, bus.axis)
+                differences = compare(drives, load_parameters(file, drives.description.dictionary), bus.axis)
                 _tell_of_changes(file)
-                scale = scales_of(drives)[axis]
+                scale = scales_of(drives)[bus.axis]
         _print(differences, "drive" if other is None else other.name, file.name, scale, json)
         if differences:
             raise typer.Exit(REFUSED)
 
 
+@grouped
 def restore(
     file: File,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = DEFAULT_DEVICE,
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     store: Store = False,
     other_drive: OtherDrive = False,
     unchecked: Unchecked = False,
@@ -164,32 +142,27 @@ def restore(
     from drive_env.master.parameters import check_no_commands
 
     with errors_as_exit_codes():
-        known = describe(device, eds)
+        known = describe(bus.device, eds)
         wanted = load_parameters(file, known.dictionary)
         written, axis_then = checked_origin(file, unchecked=unchecked)
         check_no_commands(wanted, file, known.hints)
-        bus = _Bus(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout)
 
         def check(drives: BusDrives) -> None:
             check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
-            if axis_then not in (None, axis) and not other_drive:
+            if axis_then not in (None, bus.axis) and not other_drive:
                 raise ValueError(
-                    f"{file} was read from axis {axis_then}, and --axis is {axis}; nothing was written. To write it "
-                    "to this axis all the same, add --other-drive"
+                    f"{file} was read from axis {axis_then}, and --axis is {bus.axis}; nothing was written. To write "
+                    "it to this axis all the same, add --other-drive"
                 )
 
-        _exchange(bus, wanted, axis, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
+        _exchange(bus, eds, wanted, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
 
 
+@grouped
 def commission(
     motor: Annotated[str, typer.Argument(help="Motor whose preset is written; ? lists them.")],
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = DEFAULT_DEVICE,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
+    *,
+    bus: AxisOptions,
     store: Store = False,
     yes: Yes = False,
     json: Json = False,
@@ -203,34 +176,21 @@ def commission(
         from drive_env.devices import find_device
         from drive_env.motors import find_motor
 
-        known = find_device(device)
+        known = find_device(bus.device)
         if motor == "?":
             print("\n".join(known.motors))
             return
         preset = known.preset(find_motor(motor))
         dictionary = known.new_dictionary()
         wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
-        bus = _Bus(interface, channel, chosen_node(interface, node), device, None, bitrate, timeout)
         name = f"preset {motor}"
-        _exchange(bus, wanted, axis, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
-
-
-class _Bus(NamedTuple):
-    """A node, as the options name it."""
-
-    interface: str | None
-    channel: str | None
-    node: int
-    device: str
-    eds: Path | None
-    bitrate: int | None
-    timeout: float | None
+        _exchange(bus, None, wanted, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
 
 
 def _exchange(
-    bus: _Bus,
+    bus: AxisOptions,
+    eds: Path | None,
     wanted: dict[tuple[int, int], int],
-    axis: int,
     name: str,
     check: Callable[[Any], None],
     *,
@@ -242,9 +202,9 @@ def _exchange(
     """Write parameters and say what the drive holds then, as another connection reads it.
 
     Args:
-        bus: The node.
+        bus: The axis.
+        eds: What describes the drive in place of its device.
         wanted: The parameters.
-        axis: Of the node.
         name: What they are from.
         check: Raises for a drive that they are not meant for.
         store: Have the drive keep them.
@@ -255,11 +215,12 @@ def _exchange(
     from drive_env.master.description import describe
     from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
 
-    wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
+    axis, node = bus.axis, bus.number
+    wanted = restorable(wanted, describe(bus.device, eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
-        look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
+        bus.look_first(eds)
     with ExitStack() as written:
-        with _connected(*bus) as drives:
+        with bus.connect(eds, safety=False) as drives:
             _check_axis(drives, axis)
             check(drives)
             differences = compare(drives, wanted, axis)
@@ -268,21 +229,21 @@ def _exchange(
                 _print(differences, "drive", name, scale, json)
             if dry_run:
                 check_at_rest(drives, wanted, axis)
-                _tell_plan(differences, scale, bus.node, store=store, json=json)
+                _tell_plan(differences, scale, node, store=store, json=json)
                 return
             if differences:
-                ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
+                ask(f"Write {len(differences)} parameters to node {node}?", yes)
             changes = write_all_or_none(drives, wanted, axis)
             told = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
-            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {bus.node}{told}"))
+            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {node}{told}"))
             if store:
                 drives.write((0x1010, 1), SAVE)
         # What was just written is not believed to whom wrote it: another connection reads it anew.
-        with _connected(*bus) as drives:
+        with bus.connect(eds, safety=False) as drives:
             left = compare(drives, wanted, axis)
     if left:
         fail(
-            f"node {bus.node} does not have the values that were written, by a second reading: "
+            f"node {node} does not have the values that were written, by a second reading: "
             f"{list_differences(left)}; is another master writing to it? Look with `drive-env diff`, then restore "
             "again",
             REFUSED,
@@ -328,19 +289,6 @@ def _tell_of_changes(file: Path) -> None:
         checked_origin(file, unchecked=False)
     except FileChangedError as error:
         print(f"drive-env: note: {error}", file=sys.stderr)
-
-
-def _connected(
-    interface: str | None,
-    channel: str | None,
-    node: int,
-    device: str,
-    eds: Path | None,
-    bitrate: int | None,
-    timeout: float | None,
-) -> Any:
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
-    return connect(interface, channel, [node], device, eds, **options)
 
 
 def _check_axis(drives: BusDrives, axis: int) -> None:

@@ -7,10 +7,10 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
 
 import typer
 
@@ -25,7 +25,7 @@ from drive_env.commands.options import Json as Json
 from drive_env.commands.options import Nodes as Nodes
 from drive_env.commands.options import Yes as Yes
 from drive_env.commands.options import ask as ask
-from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus
+from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus, options_of, with_options
 from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
 from drive_env.default_device import DEFAULT_DEVICE
@@ -234,11 +234,7 @@ def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callab
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        hints = get_type_hints(options, include_extras=True)
-        shared = [
-            inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
-            for f in fields(options)
-        ]
+        shared = options_of(options)
         own = inspect.signature(command, eval_str=True).parameters
         mine = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, p in own.items() if name != "drive"]
 
@@ -251,10 +247,7 @@ def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callab
             command(drive=chosen, **given)
 
         context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        taken = [context, *mine, *shared]
-        run.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]  # what typer reads
-        run.__annotations__ = {p.name: p.annotation for p in taken}
-        return run
+        return with_options(run, [context, *mine, *shared])
 
     return decorate
 
