@@ -22,7 +22,6 @@ from typing import Any
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.devices.drive_quirks import NO_SWITCH
 from drive_env.devices.services import OPTIONAL_EMERGENCIES
 from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
@@ -148,7 +147,6 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
         **base,
         "emergencies": {**more, **emergencies},
         "canopen": {**canopen, "objects": objects},
-        "quirks": {**NO_SWITCH, **base["quirks"]},
     }
 
 
