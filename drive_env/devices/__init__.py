@@ -198,6 +198,11 @@ class Device(NamedTuple):
     beyond_range: Mapping[tuple[int, int], str] = MappingProxyType({})
 
     @property
+    def cycle(self) -> float:
+        """Communication cycle [s]."""
+        return 1.0 / self.communication_rate
+
+    @property
     def firmware(self) -> Firmware:
         """What runs in the drive; it is composed at the first look, and compiled at its first use."""
         return find_firmware(self.firmware_name)

@@ -122,7 +122,7 @@ class EmulatedCyclicControl(CyclicControl):
     def __init__(
         self, drives: EmulatedDrives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int
     ) -> None:
-        super().__init__(drives, objects, play, cycles, 1.0 / drives.device.communication_rate)
+        super().__init__(drives, objects, play, cycles, drives.device.cycle)
         self._emulated = drives
         self._cycles = cycles
         self._scale_changes = -1

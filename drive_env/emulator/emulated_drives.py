@@ -254,7 +254,7 @@ class EmulatedDrives(Saved):
         cycles = self._cycles(duration)
         every = self._cycles(period)
         if every < 1:
-            raise ValueError(f"period must be at least {self._cycle:g} s, not {period:g} s")
+            raise ValueError(f"period must be at least {self.device.cycle:g} s, not {period:g} s")
         objects, play = object_names(objects), play or {}
         names = (*objects, None, *play)
         prepared = self._prepared.get(names)
@@ -285,7 +285,7 @@ class EmulatedDrives(Saved):
         return self._trace(result, rows, every)
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
-        t = np.arange(rows, dtype=np.float64) * (every * self._cycle)
+        t = np.arange(rows, dtype=np.float64) * (every * self.device.cycle)
         scale = self._scales()
         return Trace(t, values, self._objects.entries, lambda: scale)
 
@@ -491,12 +491,8 @@ class EmulatedDrives(Saved):
         set_lanes(self._records, "J_rotor", inertia)
 
     # --- time -----------------------------------------------------------------------------------------------------
-    @property
-    def _cycle(self) -> float:
-        return 1.0 / self.device.communication_rate
-
     def _cycles(self, duration: float) -> int:
-        return whole_cycles(duration, self._cycle)
+        return whole_cycles(duration, self.device.cycle)
 
     def _run(self, cycles: int, call: Call) -> None:
         begin, done, diverged = self._now, 0, False

@@ -197,7 +197,7 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
             known.num_axes,
             known,
             known.master,
-            cycle=1.0 / known.communication_rate,
+            cycle=known.cycle,
             _types=read_types(known.eds),
         )
     path = Path(eds)

@@ -21,6 +21,7 @@ from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.drives import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
+from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_rows
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
 
-CYCLE = 0.001  # s
 # What the drive was told, in the order in which it is looked for: object, mode in which it is played, and played as.
 # A position demand comes first: it is what a profile in the drive (pp) made of its target.
 COMMANDS: tuple[tuple[Key, str, Key], ...] = (

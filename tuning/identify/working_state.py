@@ -23,6 +23,7 @@ from drive_env.drives.interface import Drives, axis_number
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import bandwidth_gains, write_gains
 from drive_env.motors import Motor
+from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.identify.wiring import FINDINGS
 from tuning.stop_causes import told_causes
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
 
 
-CYCLE = 0.001  # s
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 

@@ -21,7 +21,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-from drive_env.trials.positioning import wrapped
+from drive_env.trials.positioning import CYCLE, wrapped
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.response.excitation import Lines, periodic
 from tuning.target import Target
@@ -34,7 +34,6 @@ OFFSET = {
 SEEN = {"velocity": cia402.VELOCITY_ACTUAL, "position": cia402.POSITION_ACTUAL}
 MODE = {"velocity": "csv", "position": "csp"}
 INTERPOLATION = ((cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2))
-CYCLE = 0.001  # s
 RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until what it left has died away
 FADE = 20  # cycles
 IN_RAMPS = 0.3  # share of the shaking while the speed changes
