@@ -15,6 +15,7 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
 from drive_env.safety.envelope import swinging_allowed
+from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Mask
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
@@ -27,7 +28,6 @@ from tuning.identify.working_state import (
     ALIGNED_BY_HALLS,
     BY_ENCODER,
     BY_HALLS,
-    CYCLE,
     GUESS,
     Working,
     cautious_bandwidth,

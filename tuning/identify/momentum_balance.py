@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers
-from tuning.identify.working_state import CYCLE
 
 SMOOTHED = 9  # samples over which a signal is averaged
 STANDS, SLOWEST = 0.02, 0.5  # share of the greatest speed, and rad/s: about standstill the sign of friction changes

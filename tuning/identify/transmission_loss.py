@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats
 from tuning.identify.momentum_balance import Motion, Solved, balance_rows, smoothed, solve, step
-from tuning.identify.working_state import CYCLE
 
 if TYPE_CHECKING:
     from drive_env.motors import Motor

@@ -21,13 +21,14 @@ from drive_env.gains import check_linear_model, read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency
+from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Complex, Floats, Integers, Mask
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.lateness import told_lateness
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import OscillationError, shaken, watch_of
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
-from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
+from tuning.response.excitation_run import MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.response.held_samples import split, unhold
 from tuning.response.measured_loop import COHERENT, GOOD_MISFIT, MeasuredLoop, merged
 from tuning.response.plant_fit import PlantFit, Seen, fit_plant
