@@ -425,9 +425,9 @@ class EmulatedDrives(Saved):
 
     def _apply_to_records(self, name: str, values: Floats, axes: Mask) -> bool:
         """Write a motor or stage parameter into the records; return False for one that is the mechanics'."""
-        if name not in self._kind.known:
+        if (write := self._kind.writes.get(name)) is None:
             return False
-        self._kind.apply(self._records, self.device, self.motor, name, values, axes)
+        write(self._records, self.device, self.motor, values, axes)
         return True
 
     def _armature(self) -> Floats:

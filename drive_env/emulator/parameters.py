@@ -18,6 +18,7 @@ from mechanics.load import Load
 from mechanics.near_names import did_you_mean
 
 Records = NDArray[np.void]
+Write = Callable[[Records, Device, Motor, Floats, Mask], None]
 
 VELOCITY_FILTER_DAMPING = 0.7
 
@@ -43,18 +44,16 @@ class MachineKind(NamedTuple):
     Attributes:
         motor_parameters: (motor) -> parameters of the motor, in the order in which they are drawn.
         wiring_parameters: (motor) -> those of its cables, drawn after all others.
-        known: Names of all parameters that `apply` brings into the records.
         set_constants: (records, device, motor): writes the fields that no parameter is.
-        apply: (records, device, motor, name, values, axes): brings a parameter's values, one per axis, into records.
+        writes: Name of a parameter -> what brings its values, one per axis, into the records of some axes.
         noise: Field that is the state of the axes' noise generator; "" without one.
         connect: (records, device, axes): connects what the axes of one drive have in common; None: nothing.
     """
 
     motor_parameters: Callable[[Motor], list[MachineParameter]]
     wiring_parameters: Callable[[Motor], list[MachineParameter]]
-    known: frozenset[str]
     set_constants: Callable[[Records, Device, Motor], None]
-    apply: Callable[[Records, Device, Motor, str, Floats, Mask], None]
+    writes: Mapping[str, Write]
     noise: str
     connect: Callable[[Records, Device, Mask], None] | None = None
 
@@ -69,8 +68,8 @@ def parameter_table(
     """
     rows = kind.motor_parameters(motor)
     for name, row in device.stage.items():
-        if f"stage.{name}" not in kind.known:
-            known = sorted(one.removeprefix("stage.") for one in kind.known if one.startswith("stage."))
+        if f"stage.{name}" not in kind.writes:
+            known = sorted(one.removeprefix("stage.") for one in kind.writes if one.startswith("stage."))
             raise ValueError(
                 f"{device.name}: [stage.{name}] is no parameter of firmware {device.firmware_name!r}; there are "
                 f"{', '.join(known)}{did_you_mean(name, known)}"
@@ -207,6 +206,23 @@ def velocity_filter(cutoff: Floats, rate: float) -> tuple[Floats, Floats, Floats
     return K * K * norm, 2.0 * (K * K - 1.0) * norm, (1.0 - 2.0 * VELOCITY_FILTER_DAMPING * K + K * K) * norm
 
 
+def field(name: str, part: int = 0, live: str = "") -> Write:
+    """Return what writes a parameter that is a field of the record as it stands.
+
+    Args:
+        name: The field.
+        part: Of a deep one.
+        live: Field that the thermal model sets once a period; until then it is the value at 25 degC. "" for none.
+    """
+
+    def write(records: Records, device: Device, motor: Motor, values: Floats, axes: Mask) -> None:
+        set_lanes(records, name, values, axes, part)
+        if live:
+            set_lanes(records, live, values, axes)
+
+    return write
+
+
 def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> None:
     """Let encoders count otherwise from here on, by a field of the record: what they have counted they keep."""
 
@@ -242,3 +258,36 @@ def set_velocity_filter(records: Records, device: Device, cutoff: Floats, axes: 
     set_lanes(records, "velocity_filter_b", b, axes)
     set_lanes(records, "velocity_filter_a", a1, axes, 0)
     set_lanes(records, "velocity_filter_a", a2, axes, 1)
+
+
+# Of the machines of every firmware.
+COMMON: dict[str, Write] = {
+    "motor.R_s": field("R_nominal", live="R_s"),
+    "motor.psi_m": field("psi_nominal", live="psi_m"),
+    "motor.thermal_resistance": field("thermal_resistance"),
+    "motor.thermal_time": field("thermal_time"),
+    "motor.ambient": field("ambient"),
+    "motor.encoder_broken": field("encoder_broken"),
+    "motor.encoder_direction": lambda records, device, motor, values, axes: change_encoder(
+        records, "encoder_true_direction", values, axes
+    ),
+    "motor.encoder_interpolation": lambda records, device, motor, values, axes: set_encoder_counts(
+        records, motor, values, axes
+    ),
+    "motor.encoder_line_error": field("encoder_line_error"),
+    "motor.encoder_line_phase": field("encoder_line_phase"),
+    "motor.index_angle": field("index_angle"),
+    "motor.open_a": field("open_a"),
+    "motor.open_b": field("open_b"),
+    "stage.velocity_filter": lambda records, device, motor, values, axes: set_velocity_filter(
+        records, device, values, axes
+    ),
+    "stage.supply_resistance": field("supply_resistance"),
+    "stage.dc_capacitance": field("dc_capacitance"),
+    "stage.idle_current": field("idle_current"),
+    "stage.supply_sinks": field("supply_sinks"),
+    "stage.on_resistance": field("on_resistance"),
+    "stage.thermal_resistance": field("stage_thermal_resistance"),
+    "stage.thermal_time": field("stage_thermal_time"),
+    "stage.short_conductance": field("short_conductance"),
+}
