@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 STANDARD_COMMISSIONING = "standard"
+OF_INDICES = ("timeouts", "commands", "addresses")  # tables of `master` whose keys are indices
 HIGHEST, MASK = "highest", "mask"  # the object's highest value; the bits of its highest value
 
 
@@ -479,33 +480,19 @@ def _values(item: int | str) -> Sequence[int]:
     return range(int(first), int(last) + 1)
 
 
-def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
-    return CanopenBehaviour(
-        sdo_timeout=data["sdo_timeout"],
-        boot_time=data["boot_time"],
-        sdo_time=data["sdo_time"],
-        store_time=data["store_time"],
-        frames_per_cycle=data["frames_per_cycle"],
-        receive_buffer=data["receive_buffer"],
-        inhibit_unit=data["inhibit_unit"],
-        event_unit=data["event_unit"],
-        error_behaviour={int(value): state for value, state in data["error_behaviour"].items()},
-        objects={role: parse_key(text) for role, text in data["objects"].items()},
-        save_signature=data["save_signature"],
-        load_signature=data["load_signature"],
-        bootloader_signature=data["bootloader_signature"],
-        store_groups={int(sub): tuple(sections) for sub, sections in data["store_groups"].items()},
-        services=services_of(data),
-        quirks=node_quirks_of(data),
-    )
+def _canopen(data: Mapping[str, Any]) -> CanopenBehaviour:
+    rows = {name: data[name] for name in CanopenBehaviour._fields}
+    rows |= {
+        "error_behaviour": {int(value): state for value, state in data["error_behaviour"].items()},
+        "objects": {role: parse_key(text) for role, text in data["objects"].items()},
+        "store_groups": {int(sub): tuple(sections) for sub, sections in data["store_groups"].items()},
+        "services": services_of(data),
+        "quirks": node_quirks_of(data),
+    }
+    return CanopenBehaviour(**rows)
 
 
-def _master(data: dict[str, Any]) -> MasterHints:
-    return MasterHints(
-        rpdo_type=data["rpdo_type"],
-        timeout=data["timeout"],
-        timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
-        turns_positions_round=tuple(parse_key(text) for text in data["turns_positions_round"]),
-        commands={int(index, 16): what for index, what in data.get("commands", {}).items()},
-        addresses={int(index, 16): what for index, what in data.get("addresses", {}).items()},
-    )
+def _master(data: Mapping[str, Any]) -> MasterHints:
+    by_index = {name: {int(index, 16): row for index, row in data[name].items()} for name in OF_INDICES}
+    turns = tuple(parse_key(text) for text in data["turns_positions_round"])
+    return MasterHints(data["rpdo_type"], data["timeout"], turns_positions_round=turns, **by_index)

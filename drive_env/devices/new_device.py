@@ -22,7 +22,6 @@ from drive_env.devices.standard_objects import (
     GAINS,
     HOMING_METHODS,
     MOTOR,
-    MOTOR_ROLES,
     NEEDED,
     QUICK_STOP_OPTIONS,
     STANDARD,
@@ -323,8 +322,8 @@ class _Draft:
             fields.add("position_scaler")
         others = [
             row
-            for row, modes in NEEDED
-            if row.field not in fields and (modes is None or any(mode in self._modes for mode in modes))
+            for row in NEEDED
+            if row.field not in fields and (not row.modes or any(mode in self._modes for mode in row.modes))
         ]
         groups: tuple[tuple[str, Sequence[OwnObject]], ...] = (
             ("Emulator: gains", GAINS), ("Emulator: motor", MOTOR), ("Emulator: what the EDS lacks", others)
@@ -338,9 +337,8 @@ class _Draft:
                 self._write_own(self._base + offset + axis * OWN_PER_AXIS, title, rows)
         told = self._units.increments
         for key, row in self._own:
-            role = {"position_scaler": "position_scale", "i_max": "current_limit"} | MOTOR_ROLES
-            if row.field in role:
-                self._roles[role[row.field]] = key
+            if row.role:
+                self._roles[row.role] = key
             if row.field == "position_scaler" and told:
                 why = f"{told} units a turn by {self._units.sources['position']}, which no object has"
             else:
