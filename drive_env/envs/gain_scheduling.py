@@ -284,9 +284,8 @@ class GainScheduling(VectorEnvironment):
         self._margins: OnlineMargins | None = None
         c = self.config
         self._payload = find_payload(row, c.payload, c.payload_low, c.payload_high)
-        self._pictures: Pictures | None = None
         self._owned = drives is None
-        self.drives = self._new_drives() if drives is None else drives
+        self.drives = self._new_drives(num_envs) if drives is None else drives
         try:
             if render_mode:
                 self._pictures = Pictures(self.drives, render_mode)
@@ -359,22 +358,7 @@ class GainScheduling(VectorEnvironment):
         info = self._tell(fault) | {"reward_terms": terms}
         return self._observe(*self._samples), np.asarray(reward, float), terminated, self._now >= self._steps, info
 
-    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        return None if self._pictures is None else self._pictures.draw(lane)
-
-    def _close_environments(self) -> None:
-        if self._pictures is not None:
-            self._pictures.close()
-        if self._owned:
-            self.drives.close()
-
     # --- construction ---------------------------------------------------------------------------------------------
-    def _new_drives(self) -> Any:
-        from drive_env.emulator.emulated_drives import EmulatedDrives
-
-        c = self.config
-        return EmulatedDrives(c.device, c.load, c.motor, self.num_envs, friction=c.friction, num_threads=c.num_threads)
-
     def _prepare(self, load: Load) -> None:
         n, axes = self.num_envs, self.drives.num_axes
         if axes != n * self._axes:

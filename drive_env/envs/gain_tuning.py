@@ -227,7 +227,6 @@ class GainTuning(VectorEnvironment):
         self.motor, self._device = find_motor(self.config.motor), find_device(self.config.device)
         self._machines: RandomMachines | None = None
         self._score: RobustScore | None = None
-        self._pictures: Pictures | None = None
         self._owned = drives is None
         self.drives = self._new_drives(num_envs) if drives is None else drives
         try:
@@ -257,14 +256,6 @@ class GainTuning(VectorEnvironment):
         return int(self.config.trials)
 
     # --- construction ---------------------------------------------------------------------------------------------
-    def _new_drives(self, num_envs: int) -> Any:
-        from drive_env.emulator.emulated_drives import EmulatedDrives
-
-        c = self.config
-        return EmulatedDrives(
-            c.device, c.load, c.motor, max(num_envs, 1), friction=c.friction, num_threads=c.num_threads
-        )
-
     def _make_world(self, num_envs: int) -> None:
         c = self.config
         laws = c.distributions
@@ -509,9 +500,6 @@ class GainTuning(VectorEnvironment):
                 found[lane] = (*found[lane], message.name)
         return found
 
-    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        return None if self._pictures is None else self._pictures.draw(lane)
-
     def _dead(self) -> Mask:
         return np.asarray(self._trials.down().reshape(self.num_envs, -1).any(axis=1))
 
@@ -519,9 +507,6 @@ class GainTuning(VectorEnvironment):
         return np.asarray(machine_of(self.drives).supply.reshape(self.num_envs, -1)[:, 0])
 
     def _close_environments(self) -> None:
-        if self._pictures is not None:
-            self._pictures.close()
         if self._score is not None:
             self._score.close()
-        if self._owned:
-            self.drives.close()
+        super()._close_environments()

@@ -335,19 +335,6 @@ class Tracking(VectorEnvironment):
         return int(self.config.steps)
 
     # --- construction ---------------------------------------------------------------------------------------------
-    def _new_drives(self, num_envs: int) -> Any:
-        from drive_env.emulator.emulated_drives import EmulatedDrives
-
-        config = self.config
-        return EmulatedDrives(
-            config.device,
-            config.load,
-            config.motor,
-            max(num_envs, 1),
-            friction=config.friction,
-            num_threads=config.num_threads,
-        )
-
     def _spaces(self, num_envs: int) -> tuple[Box, Box]:
         axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
         if rest or not axes:
@@ -661,12 +648,3 @@ class Tracking(VectorEnvironment):
         for message in self.drives.emergencies():
             if message.code:
                 self._causes[message.axis // self._axes].append(message.name)
-
-    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        return None if self._pictures is None else self._pictures.draw(lane)
-
-    def _close_environments(self) -> None:
-        if getattr(self, "_pictures", None) is not None:
-            self._pictures.close()  # type: ignore[union-attr]
-        if self._owned:
-            self.drives.close()
