@@ -12,13 +12,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.envs.gain_scheduling import base_inertia
 from drive_env.gains import Rule, rule_gains
 from drive_env.motors import find_motor
-from mechanics.arrays import Floats
+from mechanics.arrays import Floats, Singles
 from mechanics.loads import find_load
 
 AXIS_ENTRIES = 8
@@ -57,11 +56,11 @@ class Expert:
     def reset(self, mask: Any = None) -> None:
         """Forget what belongs to episodes that have ended."""
 
-    def act(self, observation: Any) -> NDArray[np.float32]:
+    def act(self, observation: Any) -> Singles:
         """Return the action for one observation, or one for each environment."""
         rows = np.atleast_2d(np.asarray(observation, float))
         action = np.clip(self.actions(rows), -1.0, 1.0).astype(np.float32)
-        found: NDArray[np.float32] = action[0] if np.ndim(observation) == 1 else action
+        found: Singles = action[0] if np.ndim(observation) == 1 else action
         return found
 
     def actions(self, rows: Floats) -> Floats:

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from agents.policies.agent_file import AgentFile, BundleError
-from mechanics.arrays import Singles
+from mechanics.arrays import Mask, Singles
 
 ACTOR = "observation"  # the entry of a dict observation that the actor sees
 
@@ -171,7 +171,7 @@ class MlpPolicy:
             x = x @ self._last[0] + self._last[1]
         return self._ends.leave(x, observation)
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Mask | None = None) -> None:
         """Do nothing: there is no state."""
 
 
@@ -211,7 +211,7 @@ class LstmPolicy:
             x = x @ self._last[0] + self._last[1]
         return self._ends.leave(x, observation)
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Mask | None = None) -> None:
         """Reset the state, in all environments or where the mask is true."""
         keep = np.zeros(len(self._state), bool) if mask is None else ~np.asarray(mask, bool)
         if len(keep) != len(self._state):  # of an earlier number of environments

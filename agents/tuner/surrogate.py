@@ -19,12 +19,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.policy import PolicyError, sigmoid
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
-from mechanics.arrays import Mask, Singles
+from mechanics.arrays import Floats, Mask, Singles
 
 # Of an axis's observation (the class docstring of GainTuning): what was identified, then gains, then two trials.
 IDENTIFIED, SHOWN = 4, 16
@@ -175,7 +175,7 @@ class SurrogatePolicy:
         else:
             self._known[np.repeat(mask, len(self._known) // len(mask))] = False
 
-    def act(self, observation: ArrayLike) -> NDArray[np.float64]:
+    def act(self, observation: ArrayLike) -> Floats:
         """Return the change of the log gains to try, in steps, in the observation's shape.
 
         Raises:
@@ -190,7 +190,7 @@ class SurrogatePolicy:
         chosen = self._least(memory, np.concatenate([chosen[:, None], self._around(chosen)], axis=1))
         return self._leave(chosen - incumbent, observation)
 
-    def answer(self, observation: ArrayLike) -> NDArray[np.float64]:
+    def answer(self, observation: ArrayLike) -> Floats:
         """Return the change of the log gains to the final choice, in steps: to a trial's gains, or the rule's.
 
         All axes of an environment get the same trial: that whose worst axis is best, of those that were not stopped. It
@@ -265,11 +265,11 @@ class SurrogatePolicy:
         """Return candidates around gains of shape (machines, gains), within the range."""
         return np.asarray(np.clip(gains[:, None] + self._near, self._low, self._high))
 
-    def _leave(self, change: Singles, observation: ArrayLike) -> NDArray[np.float64]:
+    def _leave(self, change: Singles, observation: ArrayLike) -> Floats:
         lanes = np.atleast_2d(observation)
         # Not float32: times the step it is to be the change again, to the integer that was tried.
         action = np.clip(change.astype(float), -self._step, self._step).reshape(len(lanes), -1) / self._step
-        found: NDArray[np.float64] = action[0] if np.ndim(observation) == 1 else action
+        found: Floats = action[0] if np.ndim(observation) == 1 else action
         return found
 
 

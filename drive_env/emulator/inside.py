@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from drive_env.emulator.group import Group
 from drive_env.emulator.live_dictionary import LiveDictionary
 from drive_env.faults.machine_faults import MachineFaults
+from mechanics.arrays import Floats
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -46,7 +47,7 @@ class Inside:
         return self._drives._faults
 
     @property
-    def noise_seeds(self) -> NDArray[np.float64]:
+    def noise_seeds(self) -> Floats:
         """State from which each axis' noise goes on, shape (num_axes,)."""
         return self._drives._noise_seeds
 

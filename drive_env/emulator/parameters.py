@@ -13,7 +13,7 @@ from drive_env.emulator.machine_numbers import machine_numbers
 from drive_env.firmware.common.encoder import encoder_count
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
-from mechanics.arrays import Floats, Mask
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
 from mechanics.near_names import did_you_mean
 
@@ -139,7 +139,7 @@ _MAY_VANISH = (
 )  # fmt: skip
 
 
-def check_one_supply(volts: Floats, links: NDArray[np.int64]) -> None:
+def check_one_supply(volts: Floats, links: Integers) -> None:
     """Raise ValueError for axes that share a DC link and would have different supplies [V]."""
     axes = np.flatnonzero(volts != volts[links])
     if axes.size:

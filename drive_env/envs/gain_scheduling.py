@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import find_device
@@ -37,7 +36,7 @@ from drive_env.gains import (
 )
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
-from mechanics.arrays import Floats, Integers, Mask
+from mechanics.arrays import Floats, Integers, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
 
@@ -301,7 +300,7 @@ class GainScheduling(VectorEnvironment):
 
     # --- Environments
     # ----------------------------------------------------------------------------------------------------
-    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Singles, Info]:
         axes = np.repeat(mask, self._axes)
         # First, so that it is the same on a bus, where no machine is drawn.
         self._programme.draw(self.config.excitation, self.reach, self.rngs, mask)
@@ -333,7 +332,7 @@ class GainScheduling(VectorEnvironment):
         self._samples = error, velocity, current
         return self._present()
 
-    def _present(self) -> tuple[NDArray[np.float32], Info]:
+    def _present(self) -> tuple[Singles, Info]:
         return self._observe(*self._samples), self._tell(np.full(self.num_envs, "", object))
 
     def _step_environments(self, action: Any) -> Stepped:
@@ -504,7 +503,7 @@ class GainScheduling(VectorEnvironment):
         arrived = came.transpose(2, 0, 1, 3).reshape(3, self._cycles, -1)
         return arrived[0], arrived[1], arrived[2]
 
-    def _observe(self, error: Floats, velocity: Floats, current: Floats) -> NDArray[np.float32]:
+    def _observe(self, error: Floats, velocity: Floats, current: Floats) -> Singles:
         ahead = np.array([0, self._cycles])
         _, speeds, accelerations = self._programme.rows(self._now * self._cycles, ahead, self.reach)
         scaled = error / self._error_scale
@@ -540,7 +539,7 @@ class GainScheduling(VectorEnvironment):
             terms["tracking"] *= self._margins.share(self._in_force)
         return terms | {"trip": -1.0 * terminated}
 
-    def _faults(self, tripped: Mask) -> NDArray[np.object_]:
+    def _faults(self, tripped: Mask) -> Texts:
         """Return the name of what ended each environment, "" where nothing did."""
         names = np.full(self.num_envs, "", object)
         if tripped.any():
@@ -552,7 +551,7 @@ class GainScheduling(VectorEnvironment):
             names[self.drives.machine.diverged] = "diverged"
         return names
 
-    def _tell(self, fault: NDArray[np.object_]) -> Info:
+    def _tell(self, fault: Texts) -> Info:
         info: Info = {"fault": fault}
         if self._machines is not None:
             info["parameters"] = self._parameters

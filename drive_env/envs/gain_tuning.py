@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
@@ -37,7 +37,7 @@ from drive_env.trials.load_detection import is_load_detection
 from drive_env.trials.method import check_tried, method_of, new_score
 from drive_env.trials.positioning import TRIAL, reach
 from drive_env.trials.score import RobustScore
-from mechanics.arrays import Floats, Integers, Mask
+from mechanics.arrays import Floats, Integers, Mask, Texts
 
 JUDGED = ("incumbent", "trial")
 
@@ -491,7 +491,7 @@ class GainTuning(VectorEnvironment):
             info["parameters"] = self._parameters
         return info
 
-    def _faults(self) -> NDArray[np.object_]:
+    def _faults(self) -> Texts:
         found = np.empty(self.num_envs, object)
         found[:] = [()] * self.num_envs
         for message in self.drives.emergencies():

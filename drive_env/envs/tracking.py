@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import Device, find_device
@@ -29,7 +29,7 @@ from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
 from drive_env.envs.vector_environment import Info, Observation, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.motors import Motor, find_motor
-from mechanics.arrays import Floats, Mask
+from mechanics.arrays import Floats, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
 
@@ -439,7 +439,7 @@ class Tracking(VectorEnvironment):
         return np.asarray(per_rad * 2.0 * np.pi / self._per_turn)
 
     # --- an episode -----------------------------------------------------------------------------------------------
-    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Singles, Info]:
         axes = np.repeat(mask, self._axes)
         self._draw_references(
             mask, options.get("trajectory")
@@ -476,7 +476,7 @@ class Tracking(VectorEnvironment):
         cycle.describe_lanes(own.address, mask)
         return self._present()
 
-    def _present(self) -> tuple[NDArray[np.float32], Info]:
+    def _present(self) -> tuple[Singles, Info]:
         observation = self._episodes.observation.copy()
         if self._machines is None:
             return observation, {}
@@ -628,7 +628,7 @@ class Tracking(VectorEnvironment):
                 if attempt == tries - 1:
                     raise
 
-    def _faults(self, lanes: Mask) -> NDArray[np.object_]:
+    def _faults(self, lanes: Mask) -> Texts:
         """Return what ended each lane: emergencies by name, "diverged", "fell", "not enabled"; "" where nothing did."""
         self._take_emergencies()
         machine = self.drives.machine

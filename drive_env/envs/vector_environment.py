@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.envs.randomisation import Curriculum, Distributions
 from drive_env.saved_state import Saved, State, check_alike
-from mechanics.arrays import Floats, Mask
+from mechanics.arrays import Floats, Mask, Texts
 
 if TYPE_CHECKING:
     from drive_env.envs.pictures import Pictures
@@ -535,7 +535,7 @@ def _told(info: Info, key: str, mask: Mask) -> Mask:
     return there
 
 
-def _rows(tree: Observation, mask: Mask) -> NDArray[np.object_]:
+def _rows(tree: Observation, mask: Mask) -> Texts:
     """Return one observation per environment where the mask is true, None elsewhere: Gymnasium's final observations."""
     rows = np.full(len(mask), None, object)
     for lane in np.flatnonzero(mask):

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.pictures.opengl import OpenGLError, import_mujoco, new_context
-from mechanics.arrays import Floats, Image
+from mechanics.arrays import Floats, Image, Integers
 
 FIELD_OF_VIEW = 30.0  # degrees, vertical: a long lens, so that parallel edges look parallel
 ELEVATION = -28.0  # degrees: seen from above
@@ -194,7 +194,7 @@ def _joint_limits(mujoco: Any, model: Any) -> Floats:
     return np.array(poses)
 
 
-def _spread(count: int, wanted: int) -> NDArray[np.int64]:
+def _spread(count: int, wanted: int) -> Integers:
     return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))
 
 

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mechanics.arrays import Floats
 
 PerAxis = float | Sequence[float | None]
 
@@ -74,12 +75,12 @@ class Limits:
                 raise ValueError(f"{name} has {count} values for {num_axes} axes; give one for all, or one each")
 
 
-def given(value: PerAxis | None, num_axes: int) -> NDArray[np.float64]:
+def given(value: PerAxis | None, num_axes: int) -> Floats:
     """Return what the user gave for each axis, nan where the drive's own limit counts, shape (num_axes,)."""
     return np.broadcast_to(_values(value, math.nan), (num_axes,)).astype(float)
 
 
-def _values(value: PerAxis | None, absent: float) -> NDArray[np.float64]:
+def _values(value: PerAxis | None, absent: float) -> Floats:
     if value is None or np.ndim(value) == 0:  # type: ignore[arg-type]
         return np.asarray(absent if value is None else value, float)
     return np.array([absent if one is None else one for one in value], np.float64)  # type: ignore[union-attr]

@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.drives import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
 from drive_env.trials.positioning import CYCLE
-from mechanics.arrays import Floats, Integers
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_rows
 
@@ -337,7 +336,7 @@ def _candidates(
     return np.asarray(np.where(folded > 1.0, 2.0 - folded, folded))
 
 
-def _give(drives: EmulatedDrives, values: Mapping[str, Floats]) -> NDArray[np.bool_]:
+def _give(drives: EmulatedDrives, values: Mapping[str, Floats]) -> Mask:
     """Set parameters; return which machines can have them."""
     machine, possible = drives.machine, np.ones(drives.num_machines, bool)
     try:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
@@ -16,7 +15,7 @@ from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import CYCLE
-from mechanics.arrays import Floats, Mask
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
@@ -306,7 +305,7 @@ class Experiments:
                         "noise (backlash, or several resonances)"
                     ))  # fmt: skip
 
-    def response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
+    def response_gains(self, working: Working, inertia: Floats) -> Integers:
         """Return raw gains for measuring a response, (num_axes, count), for total inertias [kg*m^2]."""
         target, motor = working.target, working.target.motor
         rows = []

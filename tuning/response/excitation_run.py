@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
@@ -164,7 +164,7 @@ class Shaker:
         trace = self._drives.record([cia402.TORQUE_ACTUAL], (REST + LOOK) * CYCLE)
         return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
 
-    def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, NDArray[np.bool_]]:
+    def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, Mask]:
         """Return the steady velocity of every cycle, (cycles, axes), and which cycles are looked at."""
         rows, inside, before = [], [], np.zeros_like(speed)
         long = SETTLING + periods * self._lines.samples

@@ -12,12 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drive_env.drives.interface import Drives, device_of
 from drive_env.studio.runs_folder import RUNS
-from mechanics.arrays import Floats
+from mechanics.arrays import Floats, Integers
 from tuning.runs.provenance import run_folder
 from tuning.snapshot import Snapshot, check_place, load_snapshot, take_of
 from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machines
@@ -144,7 +141,7 @@ class TuneDesk:
     def __init__(self, session: Session) -> None:
         self.session = session
         self.entries = MachineEntries()
-        self.gains: NDArray[np.int64] | None = None
+        self.gains: Integers | None = None
         self.changes: list[GainChange] = []
         self.before: Snapshot | None = None
         self.before_file: Path | None = None
