@@ -451,9 +451,3 @@ def what_an_interrupt_leaves(folder: Path) -> str:
     if unfinished.unfinished_folder(folder).exists():
         return f"interrupted; the completed part is kept; continue with --out {folder} --resume"
     return "interrupted; nothing was written"
-
-
-def interrupted() -> NoReturn:
-    """End the command as Ctrl-C does while nothing has been written yet."""
-    print("drive-tune: interrupted; nothing was written", file=sys.stderr)
-    sys.exit(INTERRUPTED)
