@@ -190,7 +190,7 @@ def policy_loop() -> dict[str, float]:
     from drive_env import motion
     from drive_env.bus.config import Machine
     from drive_env.envs.tracking import Tracking
-    from drive_env.master.realtime_section import undisturbed
+    from drive_env.realtime_section import undisturbed
 
     policy = load_policy(shipped("tracking_two_mass"))
     options = {

@@ -342,7 +342,7 @@ def emulator_imperfections(path: Path) -> None:
 def score_move(path: Path) -> None:
     """Plot the trial that J is made of, with lively gains: move, rest, load step."""
     from drive_env import EmulatedDrives, cia402
-    from drive_env.gains import write_gains
+    from drive_env.drives.raw_gains import write_gains
     from drive_env.trials.positioning import plan_move, power_up, reach, start, write_profile
 
     _score().close()
@@ -458,7 +458,7 @@ def certificate_bode(path: Path) -> None:
 def certificate_rest(path: Path) -> None:
     """Plot the current at rest of a belt axis, with gains that pass a move and with calmer ones."""
     from drive_env import EmulatedDrives, motion
-    from drive_env.gains import write_gains
+    from drive_env.drives.raw_gains import write_gains
 
     figure, ((axes,),) = _axes(2.6)
     for factor, colour, name in ((3.0, RED, "velocity P x 3"), (1.0, GREEN, "lively")):

@@ -17,7 +17,7 @@ from PIL import Image
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import SUITE_TASKS
 from agents.shipped import shipped, shipped_names
-from agents.training.tasks import short_name
+from agents.tasks import short_name
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.suite import TASKS, SuiteTask

@@ -9,12 +9,12 @@ from drive_env.envs import register
 if TYPE_CHECKING:
     from drive_env.dictionary.aborts import ObjectAccessError as ObjectAccessError
     from drive_env.drives import motion as motion
+    from drive_env.drives.limits import Limits as Limits
     from drive_env.drives.trace import Trace as Trace
     from drive_env.emulator.emulated_drives import EmulatedDrives as EmulatedDrives
     from drive_env.master.can_drives import CanDrives as CanDrives
     from drive_env.master.ethercat_drives import EtherCatDrives as EtherCatDrives
     from drive_env.safety.envelope import SafetyError as SafetyError
-    from drive_env.safety.limits import Limits as Limits
 
 __version__ = "0.2.0"  # the one home of the version: the package and all three programs take it from here
 
@@ -26,7 +26,7 @@ _HOMES = {
     "CanDrives": "master.can_drives",
     "EmulatedDrives": "emulator.emulated_drives",
     "EtherCatDrives": "master.ethercat_drives",
-    "Limits": "safety.limits",
+    "Limits": "drives.limits",
     "ObjectAccessError": "dictionary.access",
     "SafetyError": "safety.envelope",
     "Trace": "drives.trace",

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from drive_env.motors import MOTORS
 from tuning.runs import sweep
+from tuning.runs.sweep_files import save_sweep
 
 
 @dataclass
@@ -32,7 +33,7 @@ def main(arguments: Arguments) -> None:
         )
     print(f"{result.usable.sum()} of {len(result.order)} points are usable")
     if arguments.out:
-        print(f"written to {result.save(arguments.out)}")
+        print(f"written to {save_sweep(result, arguments.out)}")
 
 
 if __name__ == "__main__":

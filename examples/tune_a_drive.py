@@ -8,7 +8,7 @@ import argparse
 import numpy as np
 
 from drive_env import motion
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.linear_model import Plant
 from mechanics.loads import LOADS
 from tuning.identify.identification import identify

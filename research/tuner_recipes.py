@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.envs.randomisation import Distributions, laws_of
 from drive_env.loops.dynamics import DEFAULT, known_dynamics
+from drive_env.randomisation.random_machines import Distributions, laws_of
 from mechanics.loads import find_load
 
 FORCES = ("kg", "N")  # what the units of masses and inertias, of forces and of all that is counted by them begin with

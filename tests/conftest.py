@@ -9,7 +9,7 @@ from thinning import STRIDE
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.master.description import Description
+from drive_env.fieldbus.description import Description
 
 ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
 

@@ -23,7 +23,7 @@ from drive_env.ethercat.namespaces import Namespaces
 from drive_env.ethercat.slave import EtherCatSlave
 from drive_env.ethercat.ways import RawSocket
 from drive_env.ethercat.world import EtherCatWorld
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.ethercat_drives import EtherCatDrives
 
 SILENCE = 0.3  # s

@@ -34,10 +34,10 @@ from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.cia402 import State
 from drive_env.dictionary import entries
+from drive_env.fieldbus import description
+from drive_env.fieldbus.errors import BusError
 from drive_env.firmware.record import LANES
-from drive_env.master import description
 from drive_env.master.can.port import open_bus
-from drive_env.master.errors import BusError
 
 TURN = 65536  # increments
 RADIANS = 2.0 * np.pi / TURN

@@ -9,7 +9,7 @@ import numpy as np
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, VALUE_RANGE, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
-from drive_env.master.errors import refused
+from drive_env.fieldbus.errors import refused
 
 CURRENT_LIMIT = (0x2003, 0)
 UNITS = {0x606C: "pps", 0x6081: "pps", 0x6083: "pps^2", 0x6084: "pps^2", 0x6085: "pps^2", 0x609A: "pps^2"}
@@ -45,7 +45,9 @@ class HeldObjects:
         self.description = SimpleNamespace(
             num_axes=1, cycle=0.001, has=self.entries.__contains__, hints=SimpleNamespace(turns_positions_round=()),
             role=lambda role: CURRENT_LIMIT if role is Role.CURRENT_LIMIT and CURRENT_LIMIT in self.entries else None,
-            dictionary=SimpleNamespace(find=lambda key: self.entries[key], roles={}),
+            dictionary=SimpleNamespace(
+                find=lambda key: self.entries[key], has=self.entries.__contains__, roles={}
+            ),
         )  # fmt: skip
 
     def _check(self, entry, what):

@@ -18,11 +18,11 @@ import numpy as np
 
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable
+from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError, NoAnswerError, refused
+from drive_env.fieldbus.link import NoWatchdogError, ReceivedEmergency, Wording
 from drive_env.master.bus_drives import BusDrives, checked_limits
 from drive_env.master.changed_objects import ChangedObjects
-from drive_env.master.description import describe
-from drive_env.master.errors import BusError, NoAnswerError, refused
-from drive_env.master.link import NoWatchdogError, ReceivedEmergency, Wording
 from drive_env.master.pace import LockstepPace, RealTimePace
 from drive_env.master.packing import Member, pack_rows, unpack_rows
 from drive_env.node.axis import Axis

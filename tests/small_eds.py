@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env.dictionary.drive_eds import read_types
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
-from drive_env.master.description import CIA_402, Description
+from drive_env.fieldbus.description import CIA_402, Description
 
 I8, I16, I32, U8, U16, U32, TEXT, I64 = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09, 0x15
 

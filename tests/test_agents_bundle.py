@@ -11,8 +11,9 @@ import warnings
 import numpy as np
 import pytest
 
+from agents.plain import plain
 from agents.policies import policy as runtime
-from agents.policies.agent_file import ABOUT, AgentFile, BundleError, plain
+from agents.policies.agent_file import ABOUT, AgentFile, BundleError
 from agents.policies.policy import ACTIVATIONS, PolicyError, load_policy, measure_latency, policy_of
 
 ENTRIES, ACTIONS = 6, 2

@@ -15,7 +15,7 @@ pytest.importorskip("stable_baselines3")
 from agents.commands import train as train_command
 from agents.commands.cli import app
 from agents.policies.agent_file import AgentFile
-from agents.training.seeds import EVALUATION
+from agents.seeds import EVALUATION
 
 
 def run(*arguments):

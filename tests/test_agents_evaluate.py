@@ -19,15 +19,15 @@ from agents.evaluation import episode_log, evaluation_plots, gap
 from agents.evaluation.evaluation import Evaluation, GivenDrives, as_on_a_bus, evaluate
 from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
 from agents.evaluation.on_the_bus import target_for
+from agents.evaluation.open_policy import PolicyNotFoundError, open_policy, opened
 from agents.evaluation.scores import interval
 from agents.evaluation.served import draw_machines, emulated
 from agents.evaluation.sim_versus_bus import ROBUST_COST, on_both_sides
 from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.guard import GuardLimits
-from agents.policies.open_policy import PolicyNotFoundError, open_policy, opened
 from agents.policies.policy import PolicyError, policy_of
-from agents.training.seeds import EVALUATION
-from agents.training.tasks import make_environments
+from agents.seeds import EVALUATION
+from agents.tasks import make_environments
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server

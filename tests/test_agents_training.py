@@ -13,18 +13,19 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
+from agents import hyperparameter_search as search
 from agents.evaluation.evaluation import evaluate
+from agents.evaluation.open_policy import open_policy
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
-from agents.policies.open_policy import open_policy
 from agents.policies.policy import policy_of
 from agents.shipped import TUNER, shipped
-from agents.training import checkpoint, hyperparameters, search
+from agents.tasks import ENVIRONMENTS, environment_name, make_environments
+from agents.training import checkpoint, hyperparameters
 from agents.training import train as training
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import HyperparameterError, read_value
 from agents.training.imitation import imitate
-from agents.training.tasks import ENVIRONMENTS, environment_name, make_environments
 from agents.training.train import DivergedError, train
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, TrainingRun
 from tuning.runs import provenance

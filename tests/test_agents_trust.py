@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from agents.commands import evaluate
 from agents.commands.cli import app
-from agents.policies.open_policy import open_policy
+from agents.evaluation.open_policy import open_policy
 from agents.training import checkpoint
 from agents.training.checkpoint import CheckpointError, UntrustedError
 from agents.training.train import bundle_of_checkpoint, run_to_resume

@@ -9,8 +9,8 @@ import pytest
 
 from drive_env.dictionary import aborts
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, ObjectAccessError
-from drive_env.master.description import EMERGENCY_NAMES
-from drive_env.master.errors import _ABORTS, refused
+from drive_env.fieldbus.description import EMERGENCY_NAMES
+from drive_env.fieldbus.errors import _ABORTS, refused
 from drive_env.master.identity import Identity, OtherDriveError, check_same_drive, load_identity, read_identity
 
 

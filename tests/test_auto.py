@@ -15,8 +15,9 @@ from thinning import part
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, rule_gains
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import Gains, rule_gains, write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins
@@ -243,7 +244,8 @@ def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before,
 # --- rolling back -----------------------------------------------------------------------------------------------------
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
-    from tuning.identify.estimate import Estimate, Identification, refused
+    from tuning.estimate import Estimate, refused
+    from tuning.identify.identified_axis import Identification
 
     found = []
     for axis in range(target.num_axes):

@@ -7,7 +7,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from drive_env.gains import RAW_MAX
+from drive_env.devices.gains import RAW_MAX
 from tuning.auto import settings as auto_settings
 from tuning.auto.one_button import BUDGET
 from tuning.certificate.certificate_files import is_unchanged

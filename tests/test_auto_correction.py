@@ -9,7 +9,8 @@ import pytest
 from auto_stages import basis, recorded
 
 from drive_env.devices import find_device
-from drive_env.gains import cascade_columns, rule_gains, write_gains
+from drive_env.devices.gains import cascade_columns, rule_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, step_overshoot, window
 from drive_env.loops.true_plant import true_machines, true_plant

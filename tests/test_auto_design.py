@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drive_env.devices import find_device
-from drive_env.gains import cascade_columns
+from drive_env.devices.gains import cascade_columns
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto import design as module

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from drive_env import cia402, motion
+from drive_env.devices.gains import Gains
 from drive_env.drives.currents import ampere_per_count
-from drive_env.gains import Gains, write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.true_plant import true_plant
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore

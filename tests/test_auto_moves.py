@@ -11,11 +11,12 @@ from auto_stages import basis, designs, recorded, short_designs
 from test_auto import gains, standing_in
 
 from drive_env import cia402, motion
-from drive_env.gains import Gains, Rule, rule_gains, write_gains
+from drive_env.devices.gains import Gains, Rule, rule_gains
+from drive_env.drives.raw_gains import write_gains
+from drive_env.fieldbus.link import Timing
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.true_plant import true_plant
-from drive_env.master.pace import Timing
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import WATCH
 from tuning.auto import correction
@@ -31,7 +32,8 @@ from tuning.auto.moves import keep_what_is_better
 from tuning.auto.one_button import auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown, without_noise
 from tuning.auto.trying import faster
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.rules.rules_by_name import propose
 from tuning.target import emulated

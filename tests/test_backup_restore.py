@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from drive_env import CanDrives
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
+from drive_env.fieldbus.description import CIA_402
 from drive_env.master import parameters
-from drive_env.master.description import CIA_402
 from drive_env.master.parameters import CommandObjectError, command, restorable, write_all_or_none
 
 DONE, REFUSED, USER_ERROR = 0, 1, 2

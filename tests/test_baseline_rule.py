@@ -9,12 +9,12 @@ import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.envs.randomisation import Distributions, RandomMachines
-from drive_env.gains import BASELINE_RULE, rule_gains
+from drive_env.devices.gains import BASELINE_RULE, rule_gains
 from drive_env.loops.dynamics import find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines
 from drive_env.loops.worst_margins import worst_margins
+from drive_env.randomisation.random_machines import Distributions, RandomMachines
 from drive_env.trials.method import SAFE_RULE
 from drive_env.trials.score import RobustScore
 from tuning.identify.moved_inertia import moved_inertia

@@ -12,18 +12,19 @@ from typer.testing import CliRunner
 
 pytest.importorskip("stable_baselines3")
 
+from agents import seeds
 from agents.benchmark import report, runs
 from agents.benchmark.results import RESULT, Row, RowError
 from agents.benchmark.statistics import interquartile_mean, probability_of_improvement
 from agents.commands.cli import app
 from agents.evaluation.evaluation import evaluate
+from agents.hyperparameter_search import search
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
 from agents.policies.policy import policy_of
-from agents.training import hyperparameters, seeds
+from agents.tasks import make_environments
+from agents.training import hyperparameters
 from agents.training.imitation import imitate
-from agents.training.search import search
-from agents.training.tasks import make_environments
 from agents.training.train import IMITATION, make_env, make_model, train
 from agents.training.training_run import TrainingRun, segment_seed
 from drive_env.envs.suite import TASKS

@@ -14,10 +14,10 @@ from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.node import Node
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can.block_transfer import BLOCK_FROM
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError, NoAnswerError
 
 DEVICE = str(Path(__file__).parent / "all_services.toml")
 TEXT, DATA = 0x2F00, 0x2F01

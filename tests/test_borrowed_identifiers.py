@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.borrowed_identifiers import LOOK, BorrowedIdentifiers
-from drive_env.master.errors import BusError
 
 
 class Bus:

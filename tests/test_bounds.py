@@ -9,8 +9,8 @@ import pytest
 from held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.bounds import increments_per_count, read_bounds, rotor_limits
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.rotor import RotorAngle
 
 TURN = 65536.0

@@ -13,10 +13,10 @@ from drive_env import Limits
 from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
+from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.bus_drives import BusDrives, checked_limits
-from drive_env.master.description import describe
-from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.link import ReceivedEmergency
 from drive_env.master.pace import LockstepPace, RealTimePace
 
 IDENTITY = [(0x1000, 0), (0x1018, 1), (0x1018, 2)]

@@ -7,10 +7,10 @@ import json
 import pytest
 
 from drive_env import EmulatedDrives, motion
+from drive_env.bus.bus_faults import DISTURBANCES, OF_ONE_NODE, BusFaults
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
-from drive_env.faults.bus_faults import DISTURBANCES, OF_ONE_NODE, BusFaults
 from drive_env.faults.schedule import Order, parse_order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.record import get_lanes

@@ -10,11 +10,11 @@ from drive_env import CanDrives, EmulatedDrives, ObjectAccessError
 from drive_env.bus.bits import frame_bits
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.fieldbus.description import describe
 from drive_env.master.can import bus_time
 from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.can_link import CanLink
 from drive_env.master.can.port import Port
-from drive_env.master.description import describe
 
 SIX = describe("tmcm6212", None)
 FIND = SIX.dictionary.find

@@ -17,11 +17,11 @@ from scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
-from drive_env.master import quantities
+from drive_env.dictionary import quantities
+from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
 from drive_env.master.can.mapping import Slots, pack
 from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, slots
-from drive_env.master.description import describe
-from drive_env.master.errors import BusError, NoAnswerError, OpenError
 from drive_env.master.packing import integers
 
 EDS = find_device("tmcm1636").eds.read_text(encoding="utf-8")

@@ -9,11 +9,11 @@ import pytest
 from small_eds import U16, U32, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can import can_link
 from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.can_link import CanLink
 from drive_env.master.can.dry_run import DryPort
-from drive_env.master.errors import BusError
 
 STATUS = (0x6041, "Statusword", U16, "ro", 1)
 HEARTBEAT = (0x1017, "Producer heartbeat time", U16, "rw", 0)

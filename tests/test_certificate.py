@@ -18,7 +18,7 @@ from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from drive_env.devices import find_device
-from drive_env.gains import Gains, bandwidths_from_gains, gains_in_si
+from drive_env.devices.gains import Gains, bandwidths_from_gains, gains_in_si
 from drive_env.loops.margins import Margins, margins
 from drive_env.motors import find_motor
 from tuning.certificate.certificate import (
@@ -43,7 +43,8 @@ from tuning.certificate.certificate_files import is_unchanged, load_certificate,
 from tuning.certificate.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
 from tuning.certificate.report import to_html
 from tuning.commands.cli import app
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 from tuning.response.measured_loop import AtLeast
 
 DEVICE = find_device("tmcm1636")

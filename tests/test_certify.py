@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from auto_stages import recorded
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins

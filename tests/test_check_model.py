@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from drive_env import motion
 from drive_env.commands.check_model import _print
 from drive_env.commands.cli import app
-from drive_env.envs.randomisation import Distributions
+from drive_env.randomisation.random_machines import Distributions
 from drive_env.trials.replay import Log, LogDifference
 
 DONE, USER_ERROR = 0, 2

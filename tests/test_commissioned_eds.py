@@ -10,9 +10,9 @@ import pytest
 from drive_env.devices import find_device
 from drive_env.dictionary.eds_file import object_section
 from drive_env.dictionary.entries import EdsText, eds_file
+from drive_env.fieldbus.description import describe
 from drive_env.master import commissioned_eds as module
 from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
-from drive_env.master.description import describe
 
 EDS = find_device("tmcm1636").eds
 VELOCITY, PRODUCER, LACKING, SUB_LACKING = (0x6081, 0), (0x1017, 0), (0x5ABC, 0), (0x607D, 9)

@@ -13,8 +13,8 @@ import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
+from drive_env.devices.gains import bandwidth_gains, cascade_columns, rule_gains
 from drive_env.dictionary.roles import Role
-from drive_env.gains import bandwidth_gains, cascade_columns, rule_gains
 from drive_env.motors import find_motor
 from drive_env.trials.positioning import plan_move, reach
 from drive_env.trials.score import RobustScore

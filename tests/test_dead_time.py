@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tuning.identify.dead_time import dead_time, dead_time_resistance
+from tuning.response.dead_time import dead_time, dead_time_resistance
 from tuning.target import emulated
 
 TURN = 2.0 * math.pi

@@ -9,7 +9,7 @@ import pytest
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import CIA_402, LONGEST_TIMEOUT, NODE_CODES, check_timeout, describe
+from drive_env.fieldbus.description import CIA_402, LONGEST_TIMEOUT, NODE_CODES, check_timeout, describe
 
 SERVO = describe("tmcm1636", None)
 SERVO_EDS = find_device("tmcm1636").eds

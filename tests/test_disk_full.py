@@ -113,7 +113,7 @@ def test_no_room_for_the_way_back_changes_nothing(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("quick")
 def test_a_drive_that_refuses_to_keep_the_gains_leaves_no_certificate_of_them(tmp_path, monkeypatch):
-    from drive_env.master.errors import BusError
+    from drive_env.fieldbus.errors import BusError
     from tuning.snapshot import Transaction
 
     def refuses(self, where=None):

@@ -12,7 +12,7 @@ import pytest
 from drive_env import motion
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from tuning import drive_audit as module
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.identification import identify

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from test_description import eds_of
 
+from drive_env.fieldbus.description import describe
 from drive_env.master.can.dry_run import DryPort, DrySdoClient, show_frame
-from drive_env.master.description import describe
 
 
 @pytest.mark.parametrize(("frame", "text"), [

@@ -10,8 +10,9 @@ import pytest
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import bandwidth_gains, cascade_columns
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import bandwidth_gains, cascade_columns, read_gains, write_gains
 from drive_env.loops.dynamics import DEFAULT, OFF_NOMINAL, Dynamics, find_dynamics, known_dynamics, loop_clearance
 from drive_env.loops.linear_model import position_open_loop, velocity_open_loop
 from drive_env.loops.margins import margins

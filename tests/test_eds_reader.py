@@ -13,7 +13,7 @@ from canopen.objectdictionary import ODVariable
 from drive_env.dictionary.eds_file import parse_eds
 from drive_env.dictionary.eds_values import node_id_sum, number_of
 from drive_env.dictionary.entries import ObjectDictionary, eds_file, read_eds
-from drive_env.master.description import describe
+from drive_env.fieldbus.description import describe
 from mechanics.untrusted import UntrustedFileError
 
 FOLDER = Path(__file__).parent / "data" / "eds"

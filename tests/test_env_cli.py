@@ -24,8 +24,8 @@ from drive_env.bus.world import World
 from drive_env.commands import scan
 from drive_env.commands.cli import PANELS, app
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.safety.limits import Limits
+from drive_env.drives.limits import Limits
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.trials.replay import command_of, read_log
 
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130

@@ -10,7 +10,7 @@ from test_envelope_limits import ABORT_CONNECTION, ENCODER_RESOLUTION, MAX_PROFI
 from drive_env import CanDrives, Limits, SafetyError, motion
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.errors import NoAnswerError
+from drive_env.fieldbus.errors import NoAnswerError
 
 TURN = 65536
 SCALE, CURRENT, STORE = (0x2058, 0), (0x2003, 0), (0x1010, 1)

@@ -11,7 +11,7 @@ from held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits, SafetyError, cia402
 from drive_env.dictionary.roles import Role
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety import envelope as module
 from drive_env.safety.axes import Axes
 from drive_env.safety.envelope import Envelope, swinging_allowed

@@ -461,7 +461,7 @@ def test_a_wrong_value_names_the_valid_ones(kind, options, says):
 @EVERY_KIND
 def test_a_configuration_comes_back_from_json(kind):
     """As agents and datasets keep it: JSON has no infinity, which Tracking's `fall` is where nothing falls."""
-    from agents.training.tasks import configuration_of
+    from agents.tasks import configuration_of
 
     with lanes_of(kind) as lanes:
         kept = json.loads(json.dumps(configuration_of(lanes), allow_nan=False))

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 import pytest
 
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, VALUE_RANGE, ObjectAccessError
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.link import NoWatchdogError
 from drive_env.master.can import error_control as module
 from drive_env.master.can.error_control import MASTERS, Beats, ErrorControl, ErrorControls, Heartbeats, is_of_a_watchdog
 from drive_env.master.changed_objects import ChangedObjects
-from drive_env.master.errors import BusError
-from drive_env.master.link import NoWatchdogError
 
 CONSUMER, CONSUMER_2, GUARD, LIFE, BEHAVIOUR, LOST = (
     (0x1016, 1), (0x1016, 2), (0x100C, 0), (0x100D, 0), (0x1029, 1), (0x6007, 0)

@@ -22,8 +22,8 @@ from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.controller import LOGICAL, WRITING
 from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.ways import UdpSocket
-from drive_env.master import link
-from drive_env.master.errors import BusError, NoAnswerError, OpenError, RefusedError
+from drive_env.fieldbus import link
+from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError, RefusedError
 from drive_env.master.ethercat import frame_ways
 from drive_env.master.ethercat.ethercat_link import EtherCatLink, OtherEtherCatMasters
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster

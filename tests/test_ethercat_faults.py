@@ -13,12 +13,12 @@ import pytest
 from ethercat_segment import EmulatedSegment
 
 from drive_env import motion
+from drive_env.drives.limits import Limits
 from drive_env.ethercat import registers
+from drive_env.fieldbus.errors import BusError
 from drive_env.firmware.record import get_lanes
-from drive_env.master.errors import BusError
 from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.safety.envelope import SafetyError
-from drive_env.safety.limits import Limits
 
 STRIDE = int(os.environ.get("FAULT_STRIDE", "1"))
 STEP = 25  # frames from fault to fault in the slow run

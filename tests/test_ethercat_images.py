@@ -13,8 +13,8 @@ import pytest
 from small_eds import I8, I16, I32, U8, U16, U32, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.description import describe
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.ethercat import image_data
 from drive_env.master.ethercat.ethercat_master import ImageSizes
 from drive_env.master.ethercat.image_data import EtherCatProcessData

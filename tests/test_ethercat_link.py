@@ -12,7 +12,8 @@ from small_eds import I16, I32, U16, described, small_eds
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
-from drive_env.master.errors import BusError, NoAnswerError, OpenError
+from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
+from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.ethercat import ethercat_link, frame_ways
 from drive_env.master.ethercat.clocks import check_clocks, set_offsets, start_sync0
 from drive_env.master.ethercat.ethercat_link import EtherCatLink
@@ -21,7 +22,6 @@ from drive_env.master.ethercat.frame_ways import CallWay, RawWay, UdpWay
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 from drive_env.master.ethercat.slave_objects import SlaveObjects
 from drive_env.master.ethercat.state_names import refusal, state_name
-from drive_env.master.link import ReceivedEmergency
 
 PRE_OP, SAFE_OP, OP = 2, 4, 8
 

@@ -14,7 +14,7 @@ from drive_env.ethercat.application import AlState
 from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.segment import HOP
 from drive_env.ethercat.ways import UdpSocket
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.ethercat.clocks import FramePhase, delays_in_a_line, set_offsets
 from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.master.pace import RealTimePace

@@ -14,6 +14,7 @@ from test_tgz import SIZES, structure
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
+from drive_env.drives.limits import Limits
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.esi import esi_text
 from drive_env.ethercat.sii_content import sii_content
@@ -21,7 +22,6 @@ from drive_env.firmware.record import set_lanes
 from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.node.node_axes import NodeAxes
 from drive_env.safety.errors import SafetyError
-from drive_env.safety.limits import Limits
 
 FACTORY = (0x1701, 0x1B01)
 SAMPLED = [0x6041, 0x6064, 0x606C, 0x6077]

@@ -20,7 +20,7 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.master.description import Description
+from drive_env.fieldbus.description import Description
 from drive_env.master.parameters import read_parameters
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import load_snapshot

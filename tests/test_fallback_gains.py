@@ -10,7 +10,7 @@ import pytest
 from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from tuning.auto.fallback_gains import FallbackGains
+from tuning.fallback_gains import FallbackGains
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 

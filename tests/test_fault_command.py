@@ -18,11 +18,11 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, motion
+from drive_env.bus.fault_control import PORT, Control, ControlError, ask
 from drive_env.commands.cli import app
 from drive_env.commands.fault import CONTROL_PORT
-from drive_env.faults.control import PORT, Control, ControlError, ask
 from drive_env.faults.table import FAULTS
-from drive_env.master.errors import NoAnswerError
+from drive_env.fieldbus.errors import NoAnswerError
 
 ROOT = Path(__file__).parent.parent
 SERVE = "import typer; from drive_env.commands.serve import serve; typer.run(serve)"

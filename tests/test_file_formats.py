@@ -26,9 +26,9 @@ from drive_env.bus.faults import Faults
 from drive_env.commands.cli import app as drive_env_app
 from drive_env.commands.log import FORMATS, WRITTEN
 from drive_env.devices import device_names, find_device
-from drive_env.envs import randomisation
 from drive_env.master.identity import Identity
 from drive_env.motors import MOTORS, NUMBERS, find_motor
+from drive_env.randomisation import random_machines as randomisation
 from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,

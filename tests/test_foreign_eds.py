@@ -10,7 +10,7 @@ from scripted_drive import ABORT, ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, Limits, motion
 from drive_env.devices import find_device
-from drive_env.master.errors import RefusedError
+from drive_env.fieldbus.errors import RefusedError
 
 TURN = 65536
 VALUES = {(0x2058, 0): (TURN, 4), (0x6085, 0): (1000 * TURN, 4), (0x605A, 0): (2, 2)}

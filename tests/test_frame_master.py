@@ -14,7 +14,7 @@ from ethercat_rig import Rig, category
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.datagrams import DatagramCommand, at_station
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.ethercat import frame_master
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.frame_master import FrameMaster

@@ -10,7 +10,8 @@ from test_parity import served
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
-from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, write_gains
+from drive_env.devices.gains import BASELINE_RULE, rule_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.linear_model import Plant, position_open_loop, velocity_open_loop
 from drive_env.loops.margins import margins
 from drive_env.loops.true_plant import true_plant

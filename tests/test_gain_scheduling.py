@@ -6,10 +6,11 @@ from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
+from drive_env.devices.gains import rule_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.envs.gain_scheduling import GainScheduling, GainSchedulingConfig
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.online_margins import OnlineMargins
-from drive_env.gains import read_gains, rule_gains
 from drive_env.loops.dynamics import find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines

@@ -9,8 +9,8 @@ from test_parity import served
 
 from drive_env import EmulatedDrives, Limits, cia402
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, rule_gains, small_time_constants
 from drive_env.envs.gain_tuning import GainTuning
-from drive_env.gains import Gains, rule_gains, small_time_constants
 from drive_env.trials import gain_trial
 from drive_env.trials.gain_trial import Trials, measured_cost, softness
 from drive_env.trials.positioning import plan_move, power_up, reach

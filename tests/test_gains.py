@@ -7,7 +7,7 @@ import math
 import pytest
 
 from drive_env.devices import find_device
-from drive_env.gains import Gains, bandwidths_from_gains, gains_from_bandwidths
+from drive_env.devices.gains import Gains, bandwidths_from_gains, gains_from_bandwidths
 from drive_env.motors import MOTORS
 
 DEVICE = find_device("tmcm1636")

@@ -27,9 +27,9 @@ from drive_env.bus.slcan import MAX_LINE, TOKEN_WANTED, Channel, format_frame, p
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.fieldbus.errors import OpenError
 from drive_env.master.can.port import open_bus
 from drive_env.master.can.slcan_socket import SlcanSocket
-from drive_env.master.errors import OpenError
 
 HERE = Path(__file__).resolve().parent
 

@@ -19,15 +19,16 @@ from test_suite import open_machines
 
 from drive_env import cia402, motion
 from drive_env.devices import find_device
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.gains import write_gains
 from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group
-from tuning.identify.estimate import NAMES, refused
+from tuning.estimate import refused
 from tuning.identify.experiments import current_bandwidth
 from tuning.identify.identification import identify
+from tuning.identify.identified_axis import NAMES
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly, pushed_inertia
 from tuning.identify.working_state import borrowed

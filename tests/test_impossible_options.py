@@ -14,7 +14,7 @@ from drive_env.bus.faults import Faults
 from drive_env.commands.cli import app as env_app
 from drive_env.devices import find_device
 from drive_env.dictionary.drive_eds import KINDS
-from drive_env.master.description import check_timeout, describe
+from drive_env.fieldbus.description import check_timeout, describe
 from drive_env.trials.replay import read_log
 from tuning.commands.cli import app as tune_app
 from tuning.target import emulated

@@ -30,7 +30,9 @@ from test_parity import SCRIPTS, TURN, assert_equal, emulated, run, served
 
 from drive_env import EmulatedDrives, Limits, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.devices import find_device
-from drive_env.master import link, parameters
+from drive_env.fieldbus import link
+from drive_env.fieldbus.errors import NoAnswerError, RefusedError
+from drive_env.master import parameters
 from drive_env.master.can.can_link import CanLink
 from drive_env.master.can.dry_run import DrySdoClient
 from drive_env.master.can.error_control import ErrorControls
@@ -38,7 +40,6 @@ from drive_env.master.can.other_masters import OtherMasters
 from drive_env.master.can.process_data import PdoProcessData, RpdoRows
 from drive_env.master.can.samples import PdoSamples
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import NoAnswerError, RefusedError
 from drive_env.master.identity import read_identity
 from drive_env.motors import find_motor
 from drive_env.safety.envelope import swinging_allowed

@@ -19,7 +19,7 @@ from drive_env.commands import get
 from drive_env.commands.cli import app
 from drive_env.commands.options import BusOptions
 from drive_env.drives.lent_object import lent
-from drive_env.master.errors import NoAnswerError
+from drive_env.fieldbus.errors import NoAnswerError
 from drive_env.master.parameters import NotRestoredError, read_parameters, write_all_or_none
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")

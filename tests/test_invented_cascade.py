@@ -20,7 +20,7 @@ from agents.commands.cli import app as agent_app
 from agents.tuner.tune_target import surrogate
 from drive_env import motion
 from drive_env.devices import find_device
-from drive_env.gains import (
+from drive_env.devices.gains import (
     Gains,
     bandwidth_gains,
     bandwidths_from_gains,

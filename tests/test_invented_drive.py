@@ -24,12 +24,12 @@ from agents.tuner.tune_target import gains_for, surrogate
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
+from drive_env.devices.gains import check_linear_model, gain_factors, rule_gains
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.units import UNITS, Context
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.tracking import Tracking
-from drive_env.gains import check_linear_model, gain_factors, rule_gains
 from drive_env.loops.linear_model import controllers
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto

@@ -9,9 +9,9 @@ import pytest
 from held_objects import HeldObjects
 
 from drive_env import Limits, SafetyError
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.judging import CURRENT_CYCLES, Judging
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.oscillation import SWINGS
 from drive_env.safety.stop_ends import LATENCY
 

@@ -12,7 +12,7 @@ from agents.shipped import shipped
 from agents.tuner.kept_margins import KeptMargins
 from agents.tuner.known_range import HOLDS, outside
 from drive_env.devices import find_device
-from drive_env.gains import rule_gains
+from drive_env.devices.gains import rule_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.motors import find_motor

@@ -16,7 +16,8 @@ from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.drives.observed import ObservedDrives
-from drive_env.master.pace import RealTimePace, Timing
+from drive_env.fieldbus.link import Timing
+from drive_env.master.pace import RealTimePace
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.one_button import auto
 from tuning.identify.identification import identify

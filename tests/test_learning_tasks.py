@@ -17,13 +17,13 @@ from agents.benchmark.unlearnt import unlearnt_scores
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.loop_sensitivity import check_kept, measure_sensitivity
 from agents.evaluation.sim_versus_bus import on_both_sides
-from agents.policies.agent_file import plain
+from agents.plain import plain
 from agents.policies.baselines import SUITE_TASKS, baseline
 from agents.policies.guard import GuardLimits
-from agents.training.tasks import configuration_of, environment_name, make_environments
-from drive_env.envs.randomisation import SHIPPED
+from agents.tasks import configuration_of, environment_name, make_environments
 from drive_env.envs.suite import TASKS
 from drive_env.loops.dynamics import find_dynamics
+from drive_env.randomisation.random_machines import SHIPPED
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 # A trial of a tuning costs as much as 750 steps.

@@ -6,7 +6,7 @@ import pytest
 from held_objects import HeldObjects
 
 from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.safety.lending import Lending
 
 KEY, OTHER = (0x6065, 0), (0x607F, 0)

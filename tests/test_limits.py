@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drive_env import Limits
-from drive_env.safety.limits import given
+from drive_env.drives.limits import given
 
 
 def test_what_holds_unless_it_is_said():

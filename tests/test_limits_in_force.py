@@ -9,9 +9,9 @@ import pytest
 from held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce, bound_text
 
 TURN = 65536

@@ -9,8 +9,9 @@ from scipy.linalg import expm
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, gains_from_bandwidths, gains_in_si
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.loop_trace import trace_loops
-from drive_env.gains import Gains, gains_from_bandwidths, gains_in_si, write_gains
 from drive_env.loops.linear_model import (
     Controllers,
     Plant,
@@ -26,7 +27,8 @@ from drive_env.loops.linear_model import (
 from drive_env.loops.sampled import exponential
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1.5e-5)

@@ -8,9 +8,10 @@ from test_identification import truth
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import rule_gains
 from drive_env.dictionary.roles import Role
+from drive_env.drives.raw_gains import write_gains
 from drive_env.firmware.record import get_lanes
-from drive_env.gains import rule_gains, write_gains
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto.identified import calm_gains

@@ -8,7 +8,7 @@ import pytest
 from drive_env import cia402, motion
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one
-from tuning.identify.linked_axes import are_linked
+from tuning.linked_axes import are_linked
 from tuning.response.frequency_response import Signal, measure
 from tuning.target import emulated
 

@@ -7,13 +7,13 @@ import pytest
 
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.envs.gain_tuning import GainTuning
-from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import run_and_standby
 from drive_env.trials.load_reading import angle_of, falls
 from drive_env.trials.method import check_tried
-from tuning.identify.linked_axes import are_independent
+from tuning.linked_axes import are_independent
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.stepper.obstacle import prove_with_load

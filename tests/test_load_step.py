@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from drive_env import motion
-from drive_env.gains import Gains, gains_in_si, write_gains
+from drive_env.devices.gains import Gains, gains_in_si
+from drive_env.drives.raw_gains import write_gains
 from mechanics.shaft import one, way
 from tuning.auto import load_step as module
 from tuning.auto.load_step import BEFORE, NAME, load_step
@@ -85,7 +86,7 @@ class Played:
         log = self.log
 
         class Machine:
-            drives = SimpleNamespace(load="belt")
+            load = "belt"
 
             def __setattr__(self, name, value):
                 log.append((name, np.round(value, 9).tolist()))

@@ -9,8 +9,8 @@ import pytest
 from held_objects import HeldObjects
 
 from drive_env.dictionary.entries import Entry
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety import looks as module
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.looks import Looks
 
 NODES, AXES = 6, 2

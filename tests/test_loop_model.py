@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drive_env.devices import find_device
-from drive_env.gains import rule_gains
+from drive_env.devices.gains import rule_gains
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
@@ -18,7 +18,7 @@ from drive_env.motors import find_motor
 from drive_env.trials.score import RobustScore
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_axis, one_plant, two_ends
 from tuning.auto.stages import IdentifiedAxes
-from tuning.identify.estimate import Identification
+from tuning.identify.identified_axis import Identification
 from tuning.target import emulated
 
 DEVICE, MOTOR, STANDARD = find_device("tmcm1636"), find_motor("qbl4208"), find_dynamics("standard")

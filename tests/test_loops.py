@@ -19,6 +19,7 @@ from numba import njit, typeof
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import gains_from_bandwidths
 from drive_env.emulator.group import rates_of
 from drive_env.firmware.cycle import mechanics_window
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
@@ -27,7 +28,6 @@ from drive_env.firmware.servo.loops import current_loop, motion_loops
 from drive_env.firmware.servo.power_stage import convert_energy, power_stage, refresh_winding
 from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.firmware.servo.stages import FIRMWARE
-from drive_env.gains import gains_from_bandwidths
 from drive_env.motors import MOTORS
 from mechanics.compiled import OPTIONS
 

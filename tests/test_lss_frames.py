@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drive_env.canopen.lss import LssIdentity
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can import lss
 from drive_env.master.can.lss import (
     LssError,
@@ -16,7 +17,6 @@ from drive_env.master.can.lss import (
     row_of,
     show,
 )
-from drive_env.master.errors import BusError, NoAnswerError
 
 IDENTITY = LssIdentity(0x286, 0x664, 0x10009, 5)
 REQUEST, RESPONSE = 0x7E5, 0x7E4

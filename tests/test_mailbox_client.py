@@ -10,7 +10,7 @@ import pytest
 from drive_env.dictionary.aborts import TOGGLE_NOT_ALTERNATED
 from drive_env.ethercat.coe import CoeService, message, split
 from drive_env.ethercat.mailbox import COUNTER_SHIFT, MailboxProtocol
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.ethercat import mailbox_client
 from drive_env.master.ethercat.mailbox_client import MailboxClient, SdoAbortError
 

@@ -9,7 +9,7 @@ import pytest
 from test_dynamics import machine_of
 
 from drive_env.devices import find_device
-from drive_env.gains import bandwidth_gains
+from drive_env.devices.gains import bandwidth_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS, velocity_open_loop
 from drive_env.loops.margins import margins

@@ -12,11 +12,11 @@ from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
 from drive_env.loops.true_plant import true_plant
 from tuning.auto.certify import certificate
+from tuning.auto.model_bounds import at_least_by_model, why_unbounded
 from tuning.auto.one_button import auto
 from tuning.certificate.report import to_html
 from tuning.commands.auto import _margins
 from tuning.identify.quick_identification import identify_briefly
-from tuning.response.model_bounds import at_least_by_model, why_unbounded
 from tuning.rules.rules_by_name import propose
 from tuning.target import emulated
 

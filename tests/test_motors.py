@@ -10,8 +10,8 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.devices.commissioning import preset as rule
+from drive_env.devices.gains import gains_from_bandwidths
 from drive_env.firmware.record import get_lanes, set_lanes
-from drive_env.gains import gains_from_bandwidths
 from drive_env.motors import find_motor
 from mechanics.untrusted import read_toml
 

@@ -7,7 +7,7 @@ import pytest
 from thinning import part
 
 TABLE = mutation.read_table()
-QUICK = ["drive_env/safety/oscillation.py", "tuning/auto/fallback_gains.py", "tuning/identify/confidence.py"]
+QUICK = ["drive_env/safety/oscillation.py", "tuning/fallback_gains.py", "tuning/identify/confidence.py"]
 
 
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: row.files[0])
@@ -20,9 +20,9 @@ def test_every_row_has_files_of_its_own_and_tests_that_are_there(row):
 def test_tests_that_name_a_file_come_first():
     table = [mutation.Row(("tuning/*",), ("test_swings.py", "test_fallback_gains.py"), ("tuning/auto/*",))]
     assert mutation.tests_of("tuning/target.py", table) == ("test_swings.py", "test_fallback_gains.py")
-    assert mutation.tests_of("tuning/auto/fallback_gains.py", table) == ()
+    assert mutation.tests_of("tuning/fallback_gains.py", table) == ()
     named = [mutation.Row(("tuning/*",), ("test_swings.py", "test_fallback_gains.py"))]
-    assert mutation.tests_of("tuning/auto/fallback_gains.py", named) == ("test_fallback_gains.py", "test_swings.py")
+    assert mutation.tests_of("tuning/fallback_gains.py", named) == ("test_fallback_gains.py", "test_swings.py")
 
 
 def test_what_is_only_read_by_a_type_checker_is_left_alone():
@@ -65,6 +65,6 @@ def test_a_sample_of_changes_is_noticed():
 
 def test_tests_that_fail_as_it_is_are_no_judges(monkeypatch):
     monkeypatch.setattr(mutation.Copy, "passes", lambda self, tests: False)
-    mutant = mutation.Mutant("tuning/auto/fallback_gains.py", 1, "core/NumberReplacer", 0)
+    mutant = mutation.Mutant("tuning/fallback_gains.py", 1, "core/NumberReplacer", 0)
     with pytest.raises(ValueError, match=r"tests/test_fallback_gains.py fails as the sources are; mend it first"):
         next(mutation.run([mutant], TABLE))

@@ -27,12 +27,12 @@ from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
+from drive_env.devices.gains import check_linear_model
 from drive_env.devices.new_device import new_device
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import check_linear_model
-from drive_env.master.description import describe
+from drive_env.fieldbus.description import describe
 from drive_env.motors import find_motor
 
 FILES = sorted(path.stem for path in FOLDER.glob("*.eds"))

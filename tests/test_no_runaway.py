@@ -39,8 +39,8 @@ from fault_injection import (
 
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.devices import find_device
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import open_bus
-from drive_env.master.errors import BusError
 
 SLOW, FAST = 2 * TURN, 15 * TURN  # pps
 PP, PV = cia402.MODES["pp"], cia402.MODES["pv"]

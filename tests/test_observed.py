@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.drives.interface import bus_of, machine_of
-from drive_env.drives.observed import ObservedDrives, Observer
+from drive_env.drives.interface import Observer, bus_of, machine_of
+from drive_env.drives.observed import ObservedDrives
 
 POSITION, CURRENT = 0x6064, 0x6077
 

@@ -8,11 +8,11 @@ import pytest
 
 from drive_env import Limits
 from drive_env.ethercat.datagrams import PORT
+from drive_env.fieldbus.errors import OpenError
 from drive_env.master import can_drives, ethercat_drives, open_drives
 from drive_env.master.bus_drives import BusDrives
 from drive_env.master.can.bus_time import BIT_RATE
 from drive_env.master.can_drives import CanDrives
-from drive_env.master.errors import OpenError
 from drive_env.master.ethercat import frame_master, frame_ways, soem_master
 from drive_env.master.ethercat_drives import EtherCatDrives, check_positions, open_frames, open_master
 from drive_env.master.pace import LockstepPace, RealTimePace

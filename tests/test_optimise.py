@@ -16,8 +16,9 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import Gains, write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import Trials, measured_cost, softness
 from drive_env.trials.method import Cascade

@@ -9,10 +9,10 @@ from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.drives.observed import ObservedDrives
+from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.trace import Trace
-from drive_env.gains import write_gains
-from tuning.identify.estimate import NAMES
 from tuning.identify.identification import identify
+from tuning.identify.identified_axis import NAMES
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken
 from tuning.target import emulated
 

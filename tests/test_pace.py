@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import pytest
 
+from drive_env.fieldbus.link import Timing
 from drive_env.master import pace as module
-from drive_env.master.pace import LockstepPace, RealTimePace, Timing
+from drive_env.master.pace import LockstepPace, RealTimePace
 from drive_env.master.sampling import run_cycles
 
 CYCLE = 0.001

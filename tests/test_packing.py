@@ -8,10 +8,10 @@ import pytest
 from drive_env.devices.image_rows import ImageField
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, UNSUPPORTED_ACCESS, ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.mapping import Slots, pack
 from drive_env.master.can.pdo import RemotePdo
 from drive_env.master.can.samples import PdoSamples
-from drive_env.master.errors import BusError
 from drive_env.master.packing import Member, integers, pack_rows, unpack_rows
 from drive_env.node import mapping
 from drive_env.node.axis import ObjectPort

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 import agents.training.train
 from agents.commands.cli import app
-from agents.policies.open_policy import open_policy
+from agents.evaluation.open_policy import open_policy
 from agents.training.checkpoint import CheckpointError, UntrustedError
 from agents.training.learning_curve import draw_learning_curve
 from drive_env import EmulatedDrives, motion

@@ -10,7 +10,7 @@ import pytest
 from drive_env.devices import find_device
 from drive_env.loops.linear_model import Plant
 from drive_env.motors import find_motor
-from tuning.identify.estimate import Estimate, refused
+from tuning.estimate import Estimate, refused
 from tuning.response.plant_fit import PlantFit
 
 MOTOR = find_motor("qbl4208")

@@ -9,9 +9,9 @@ from collections import deque
 import can
 import pytest
 
+from drive_env.fieldbus.errors import BusError, OpenError
 from drive_env.master.can import port as module
 from drive_env.master.can.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE, MOST_FRAMES, TOKEN_VARIABLE, Port, open_bus
-from drive_env.master.errors import BusError, OpenError
 
 
 class Bus:

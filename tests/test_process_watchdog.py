@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from drive_env.ethercat import registers
+from drive_env.fieldbus.link import NoWatchdogError
 from drive_env.master.ethercat import process_watchdog
 from drive_env.master.ethercat.process_watchdog import OUTPUTS_CONTROL, ProcessWatchdog
-from drive_env.master.link import NoWatchdogError
 
 
 class Slaves:

@@ -9,8 +9,7 @@ import pytest
 from held_objects import HeldObjects
 
 from drive_env.dictionary.entries import Entry
-from drive_env.dictionary.roles import Role
-from drive_env.master.quantities import (
+from drive_env.dictionary.quantities import (
     UNITS,
     AxisScale,
     find_unit,
@@ -23,6 +22,7 @@ from drive_env.master.quantities import (
     scales_of,
     show,
 )
+from drive_env.dictionary.roles import Role
 
 TURN = 1000.0  # increments
 
@@ -168,7 +168,7 @@ def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
     drives = HeldObjects(values, 2)
     drives.description.dictionary.roles.update(roles)
     drives.read = lambda name: np.array(drives.values[roles.get(name, name)])
-    assert scales_of(drives) == expected
+    assert scales_of(drives, drives.description.dictionary) == expected
 
 
 @pytest.mark.parametrize(("unit", "follows"), [

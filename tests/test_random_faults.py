@@ -8,9 +8,9 @@ import pytest
 from drive_env import EmulatedDrives
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
-from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.tracking import Tracking
 from drive_env.faults.table import FAULTS
+from drive_env.randomisation.random_machines import Distributions, RandomMachines
 
 ALL = {"probability": 1.0, "names": ["enable_lost"], "at": [0.05, 0.05]}
 NUMBER = {name: 1.0 + k for k, name in enumerate(FAULTS)}

@@ -5,7 +5,7 @@ import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.envs.bus_delays import BusDelays
-from drive_env.envs.randomisation import BESIDE, Distributions, Law, RandomMachines, shipped
+from drive_env.randomisation.random_machines import BESIDE, Distributions, Law, RandomMachines, shipped
 from mechanics.loads import LOADS
 
 DEFAULTS = {"load.inertia": 1e-5, "load.coulomb": 2e-3, "motor.R_s": 0.4, "stage.adc_offset_a": 0.02}

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drive_env.gains import rule_gains, write_gains
+from drive_env.devices.gains import rule_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
 from tuning.commands.cli import app

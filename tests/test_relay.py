@@ -10,9 +10,10 @@ import pytest
 
 from drive_env import cia402
 from drive_env.devices import find_device
+from drive_env.devices.gains import gains_in_si
 from drive_env.dictionary.roles import Role
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.gains import gains_in_si, write_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins
 from drive_env.loops.true_plant import true_plant

@@ -13,12 +13,12 @@ import pytest
 from small_eds import I8, I16, I32, TEXT, U16, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError, NoAnswerError, RefusedError
 from drive_env.master.can import pdo
 from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.network import Network, check_nodes
 from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, PdoConfiguration, RemotePdo
 from drive_env.master.can.process_data import PdoProcessData
-from drive_env.master.errors import BusError, NoAnswerError, RefusedError
 from drive_env.master.packing import Member
 
 ROWS = [

@@ -8,7 +8,7 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from drive_env.commands.scope import write_table
 from drive_env.dictionary.entries import Entry
-from drive_env.envs.randomisation import Distributions, Law
+from drive_env.randomisation.random_machines import Distributions, Law
 from drive_env.trials import replay as module
 from drive_env.trials.replay import Log, _candidates, command_of, compare, fit, read_log, replay
 

@@ -12,15 +12,18 @@ from scipy import signal
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import RAW_MAX, Gains, gains_in_si
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant, current_open_loop, position_open_loop, velocity_open_loop
 from drive_env.loops.margins import Margins, margins
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import MOTORS, find_motor
-from tuning.identify.estimate import Estimate, Identification, refused
-from tuning.rules import side_by_side
+from tuning.compare import side_by_side
+from tuning.compare.side_by_side import outer_margins, slacks
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 from tuning.rules.internal_model import imc_first_order, simc_first_order, simc_integrating
 from tuning.rules.lags import current_lag, slow_enough, velocity_lag, velocity_noise
 from tuning.rules.margin_targets import TARGETS, _greatest
@@ -29,7 +32,6 @@ from tuning.rules.pole_placement import place_first_order
 from tuning.rules.proposal import Workbench
 from tuning.rules.relay import Swing, gains_from_swing
 from tuning.rules.rules_by_name import MEANINGS, RULES, propose
-from tuning.rules.side_by_side import outer_margins, slacks
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
+from agents.evaluation.open_policy import open_policy
 from agents.policies.agent_file import AgentFile
-from agents.policies.open_policy import open_policy
 from agents.policies.policy import policy_of
 from agents.training.train import run_to_resume, train
 from drive_env import motors
@@ -37,6 +37,7 @@ from tuning.runs import inputs, sweep
 from tuning.runs.experiment import ExperimentError, load_experiment
 from tuning.runs.inputs import Input, InputError, found_again, hashes, taken, write_inputs
 from tuning.runs.pools import open_pool
+from tuning.runs.sweep_files import save_sweep
 from tuning.runs.unfinished import shard_log
 from tuning.search import searches
 from tuning.search.optimise import Settings
@@ -272,7 +273,7 @@ def test_settings_of_a_sweep_repeat_it_from_its_folder_alone(own, decoys, monkey
     """Before: whatever lay at the path in the present folder."""
     experiment = load_experiment(write(own / "grid.toml", own_grid(motor="mine.toml", load="arm/arm.xml")))
     first = sweep.run(experiment)
-    first.save(own / "out")
+    save_sweep(first, own / "out")
     shipped = contents(own / "out")
     settings = tomllib.loads((own / "out" / "settings.toml").read_text())
     assert (settings["motor"], settings["load"]) == ("inputs/motor/mine.toml", "inputs/load/arm.xml")
@@ -284,7 +285,7 @@ def test_settings_of_a_sweep_repeat_it_from_its_folder_alone(own, decoys, monkey
         (own / file).unlink()
     shutil.rmtree(own / "arm")
     monkeypatch.chdir(decoys)
-    sweep.run(load_experiment("moved/settings.toml")).save("again")
+    save_sweep(sweep.run(load_experiment("moved/settings.toml")), "again")
     assert contents(decoys / "again") == shipped
     (decoys / "again" / "inputs" / "load" / "meshes" / "disc.obj").unlink()
     with pytest.raises(ExperimentError, match="there is no such file in"):
@@ -608,9 +609,9 @@ def test_a_grid_of_a_million_is_split_and_its_shards_are_points_of_it(own):
 
 def test_a_table_is_written_in_parts_to_the_same_bytes(own, monkeypatch):
     result = sweep.run(load_experiment(write(own / "grid.toml", SMALL)))
-    result.save(own / "whole")
-    monkeypatch.setattr(sweep, "ROWS", 4)
-    result.save(own / "parts")
+    save_sweep(result, own / "whole")
+    monkeypatch.setattr("tuning.runs.sweep_files.ROWS", 4)
+    save_sweep(result, own / "parts")
     assert contents(own / "parts") == contents(own / "whole")
     assert len(list(csv.reader((own / "parts" / "results.csv").open()))) == 10
     assert set(FILES) <= {path.name for path in (own / "parts").iterdir()}

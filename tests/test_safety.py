@@ -19,7 +19,7 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety.supervisor import Supervisor
 
 QUICK_STOP = bytes.fromhex("2B 40 60 00 02 00 00 00")

@@ -21,8 +21,8 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.cia402 import STATE_CODING, State
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port, open_bus
-from drive_env.master.errors import BusError
 from drive_env.safety.model import drive as drive_model
 from drive_env.safety.model.drive import Drive
 from drive_env.safety.model.exploration import GIVEN_UP, LEFT, RUNS_ON, TAKEN_FOR_OFF, UNRAMPED, UNWATCHED, explore

@@ -24,6 +24,7 @@ from tuning.runs import pools, provenance, sweep
 from tuning.runs.experiment import load_experiment, resolve
 from tuning.runs.pools import PoolError, in_order, open_pool, parse_cluster
 from tuning.runs.shard_log import ShardLog, ShardLogError
+from tuning.runs.sweep_files import save_sweep
 from tuning.runs.unfinished import SHARDS, shard_log, unfinished_folder
 
 ROOT = Path(__file__).parent.parent
@@ -85,7 +86,7 @@ def whole(experiment):
 @pytest.fixture(scope="module")
 def saved(whole, tmp_path_factory):
     """Its files, as bytes."""
-    return contents(whole.save(tmp_path_factory.mktemp("saved") / "run"))
+    return contents(save_sweep(whole, tmp_path_factory.mktemp("saved") / "run"))
 
 
 def contents(folder):
@@ -298,7 +299,7 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process
                 os.kill(victim, 0)
     assert sorted(log.done) == list(range(0, 2304, 256))
     equal(whole, result)
-    assert contents(result.save(tmp_path / "run")) == saved
+    assert contents(save_sweep(result, tmp_path / "run")) == saved
 
 
 @pytest.fixture

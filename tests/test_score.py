@@ -11,9 +11,7 @@ import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.dictionary.roles import Role
-from drive_env.emulator.parameters import WIRING
-from drive_env.gains import (
+from drive_env.devices.gains import (
     BASELINE_RULE,
     Gains,
     bandwidth_gains,
@@ -22,6 +20,8 @@ from drive_env.gains import (
     rule_gains,
     small_time_constants,
 )
+from drive_env.dictionary.roles import Role
+from drive_env.emulator.parameters import WIRING
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.true_plant import elastic_lags, true_plant
 from drive_env.motors import MOTORS

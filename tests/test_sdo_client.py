@@ -9,9 +9,9 @@ from collections import deque
 import pytest
 
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can import sdo as module
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError, NoAnswerError
 
 READ_6041 = bytes.fromhex("40 41 60 00 00 00 00 00")
 IS_0237 = bytes.fromhex("4B 41 60 00 37 02 00 00")

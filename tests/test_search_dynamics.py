@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from drive_env.drives.raw_gains import read_gains
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.gains import read_gains
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines

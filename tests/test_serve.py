@@ -21,9 +21,9 @@ from drive_env.bus.faults import Faults
 from drive_env.bus.hub import Hub
 from drive_env.canopen.frames import Frame
 from drive_env.commands.serve import serve
+from drive_env.fieldbus.errors import OpenError
 from drive_env.master.can.port import open_bus
 from drive_env.master.can_drives import CanDrives
-from drive_env.master.errors import OpenError
 from drive_env.motors import MOTORS
 
 ROOT = Path(__file__).parent.parent

@@ -16,10 +16,10 @@ from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import VALUE_RANGE
+from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.description import describe
-from drive_env.master.errors import BusError
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import pytest
 from agents.shipped import shipped_names
 from drive_env.devices import device_names, find_device
 from drive_env.envs import ENVIRONMENTS
-from drive_env.envs.randomisation import shipped
 from drive_env.motors import MOTORS
+from drive_env.randomisation.random_machines import shipped
 from mechanics.loads import LOADS
 
 MACHINERY = Path(__file__).parent.parent / "docs" / "machinery"

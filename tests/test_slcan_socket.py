@@ -12,10 +12,10 @@ from types import SimpleNamespace
 import can
 import pytest
 
+from drive_env.fieldbus.errors import BusError, OpenError
 from drive_env.master.can import slcan_socket
 from drive_env.master.can.port import Port
 from drive_env.master.can.slcan_socket import SlcanSocket
-from drive_env.master.errors import BusError, OpenError
 
 TOKEN = "a-token-of-some-length"
 

@@ -20,9 +20,9 @@ from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning import snapshot as module
 from tuning.commands.cli import app

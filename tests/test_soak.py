@@ -19,11 +19,11 @@ from soak_cycle import BRIDGE, CHOPPER, COPPER, IDLE, LEAP, OFF_CURRENT, SHAFT, 
 from thinning import part
 
 from drive_env import EmulatedDrives, motion
+from drive_env.bus.bus_faults import MOST_BABBLE, BusFaults
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import TRANSMIT_BUFFER, World
 from drive_env.canopen.frames import Frame
 from drive_env.cia402 import STATE_CODING, State
-from drive_env.faults.bus_faults import MOST_BABBLE, BusFaults
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.record import get_lanes
@@ -106,7 +106,7 @@ class Soak:
         if drives.inside.cycle % 20 == 0:
             self.command()
         self.order_faults()
-        drives.inside.faults.act(drives.inside.cycle)
+        drives.faults.act(drives.inside.cycle)
         magnetic, capacitor, driven = self.stored()
         theta, measured, gain = self.lanes("theta_m"), self.lanes("theta_meas"), self.lanes("encoder_gain")
         wired, told = self.lanes("encoder_true_direction"), self.lanes("encoder_direction")

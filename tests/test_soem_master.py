@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from drive_env.ethercat.coe import CoeService, message, split
-from drive_env.master.errors import BusError, NoAnswerError, OpenError
+from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
 from drive_env.master.ethercat import clocks, mailbox_client, soem_master
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.mailbox_client import SdoAbortError

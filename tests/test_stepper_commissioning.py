@@ -16,7 +16,7 @@ from drive_env import CanDrives, EmulatedDrives, cia402
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.motors import MOTORS
 from drive_env.phase_current import RESERVE, amplitude, holding_torque, run_and_standby
 from drive_env.trials.load_reading import STALL_ANGLE

@@ -10,9 +10,9 @@ from held_objects import HeldObjects
 
 from drive_env import SafetyError, cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.stop_runner import StopRunner
 from drive_env.safety.stopping import Phase
 

@@ -12,7 +12,7 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.faults.table import FAULTS
-from drive_env.master.description import describe
+from drive_env.fieldbus.description import describe
 from drive_env.pictures.opengl import OpenGLError
 from drive_env.studio import machine_jobs, motion_jobs
 from drive_env.studio.machine_camera import HEIGHT, PERIOD, SHARE, WIDTH, MachineCamera
@@ -55,7 +55,7 @@ def test_what_is_known_of_a_machine(session):
     assert known.meanings["load.stiffness"]
     assert "encoder_stuck" in known.faults
     assert not {name for name in known.faults if FAULTS[name].group == "bus"}
-    assert known.torque == pytest.approx(session.glimpse(lambda machine: machine.drives.motor.rated_torque))
+    assert known.torque == pytest.approx(session.glimpse(lambda machine: machine.inside.motor.rated_torque))
 
 
 def test_parameters_torque_and_supply_act(session):

@@ -13,7 +13,7 @@ from drive_env import EmulatedDrives, cia402, motion
 from drive_env.cia402 import State
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
-from drive_env.master.description import describe
+from drive_env.fieldbus.description import describe
 from drive_env.studio import dictionary_jobs, motion_jobs, presence
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.presence import Presence

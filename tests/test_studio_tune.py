@@ -12,9 +12,9 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.devices import find_device
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
+from drive_env.fieldbus.description import describe
 from drive_env.loops.margins import Margins
-from drive_env.master.description import describe
 from drive_env.studio import motion_jobs
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.session import Session
@@ -257,7 +257,7 @@ def test_auto_is_stopped_and_everything_is_as_before(desk, tmp_path, when):
 
 def test_auto_is_asked_for_the_dynamics_of_the_page(monkeypatch, tmp_path):
     asked = {}
-    monkeypatch.setattr("tuning.auto.run_to_files.auto_to_files", lambda *_, **options: asked.update(options))
+    monkeypatch.setattr("tuning.auto_to_files.auto_to_files", lambda *_, **options: asked.update(options))
     target = SimpleNamespace(device=find_device("tmcm1636"))
     tune_jobs.auto(True, "soft")(target, TunerSession("auto", tmp_path), lambda what, share: None)
     assert asked == {"keep": True, "dynamics": "soft"}

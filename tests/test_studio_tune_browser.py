@@ -14,7 +14,7 @@ from selenium.webdriver.common.keys import Keys
 from studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, studio, until
 
 from drive_env import EmulatedDrives
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
 from tuning.snapshot import DEVICE_OBJECTS, take_of
 
 pytestmark = needs_chromium

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety import signals
 from drive_env.safety import supervisor as module
 from drive_env.safety.supervisor import PERIOD, SWITCH_INTERVAL, Supervisor

@@ -26,6 +26,7 @@ from tuning.runs.experiment import (
     resolve,
 )
 from tuning.runs.metrics import METRICS, TRACKING, MoveRecording
+from tuning.runs.sweep_files import save_sweep
 
 P, I, TORQUE_P = "2042h:01", "2042h:02", "2041h:01"
 SHORT = Excitation(
@@ -135,9 +136,9 @@ def test_an_object_that_acts_is_not_reported_as_without_effect(small):
 
 
 def test_a_run_repeats_from_its_settings_to_the_last_byte(tmp_path, small):
-    small.save(tmp_path / "first")
+    save_sweep(small, tmp_path / "first")
     again = sweep.run(load_experiment(tmp_path / "first" / "settings.toml"))
-    again.save(tmp_path / "second")
+    save_sweep(again, tmp_path / "second")
     for name in ("results.csv", "settings.toml"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()
 
@@ -290,7 +291,7 @@ def test_three_objects_span_a_grid_of_three(small):
 
 # --- what is written --------------------------------------------------------------------------------------------------
 def test_the_table_has_a_row_per_pair_with_gains_metrics_and_flags(tmp_path, small):
-    small.save(tmp_path / "run")
+    save_sweep(small, tmp_path / "run")
     with (tmp_path / "run" / "results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 9
@@ -302,7 +303,7 @@ def test_the_table_has_a_row_per_pair_with_gains_metrics_and_flags(tmp_path, sma
 
 
 def test_settings_hold_the_experiment_and_the_versions(tmp_path, small):
-    small.save(tmp_path / "run")
+    save_sweep(small, tmp_path / "run")
     text = (tmp_path / "run" / "settings.toml").read_text()
     assert set(tomllib.loads(text)["versions"]) == {
         "drive-env", "numpy", "numba", "llvmlite", "mujoco", "sources", "python", "processor",
@@ -324,16 +325,16 @@ def test_results_are_complete_or_absent(tmp_path):
 
 def test_a_folder_with_something_in_it_is_refused_and_an_empty_one_taken(tmp_path, small):
     (tmp_path / "empty").mkdir()
-    small.save(tmp_path / "empty")
+    save_sweep(small, tmp_path / "empty")
     before = (tmp_path / "empty" / "results.csv").read_bytes()
     with pytest.raises(FileExistsError, match="is not empty; choose another --out"):
-        small.save(tmp_path / "empty")
+        save_sweep(small, tmp_path / "empty")
     assert (tmp_path / "empty" / "results.csv").read_bytes() == before
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError, match="is a file"):
-        small.save(tmp_path / "file")
+        save_sweep(small, tmp_path / "file")
     with pytest.raises(NotADirectoryError, match="is a file, so that"):
-        small.save(tmp_path / "file" / "run")
+        save_sweep(small, tmp_path / "file" / "run")
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.speeds import per_increment
-from drive_env.master.errors import refused
+from drive_env.fieldbus.errors import refused
 from drive_env.motors import find_motor
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one, way

@@ -12,8 +12,8 @@ from scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.tidying import Tidying
+from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.tidying import Tidying
 
 CONSUMER, FIRST_TPDO = (0x1016, 1), (0x1800, 1)
 

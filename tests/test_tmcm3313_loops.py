@@ -13,7 +13,7 @@ from drive_env.bus.world import World
 from drive_env.cia402 import State, state_of
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.motors import MOTORS
 from drive_env.phase_current import holding_torque, run_and_standby
 from tuning.search.optimise import Settings, optimise

@@ -30,6 +30,7 @@ from tuning.commands.cli import app
 from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve
 from tuning.runs.metrics import MoveRecording, figures, tracking
 from tuning.runs.sweep import _close_loop, run
+from tuning.runs.sweep_files import save_sweep
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
@@ -217,7 +218,7 @@ def test_gains_of_the_closed_loop_are_told_apart_where_the_motor_is_overloaded(t
     assert result.best(1)[0]["202Bh:00"] == 10000
     assert np.all(result.columns["following [full steps]"] > 2.0), "in open loop the steps would be lost"
     assert np.all(result.columns["rms_current [A]"] < MOTOR.rated_current)
-    folder = result.save(tmp_path / "closed")
+    folder = save_sweep(result, tmp_path / "closed")
     again = run(load_experiment(folder / "settings.toml"), num_threads=1)
     assert np.array_equal(again.score, result.score)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives
-from drive_env.master.quantities import parse
+from drive_env.dictionary.quantities import parse
 
 POSITION, SPEED, CURRENT, STATUS = "Position actual value", "Velocity actual value", "Torque actual value", "Statusword"
 

@@ -14,11 +14,11 @@ from test_parity import WorldBus
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.suite import TERMS
 from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, WEIGHTS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
-from drive_env.gains import Gains, bandwidths_from_gains
 from mechanics.loads import LOADS as ALL_LOADS
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys

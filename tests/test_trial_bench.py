@@ -10,9 +10,9 @@ import pytest
 
 from drive_env import cia402
 from drive_env.devices import find_device
+from drive_env.drives.limits import Limits
 from drive_env.motors import find_motor
 from drive_env.safety.errors import SafetyError
-from drive_env.safety.limits import Limits
 from drive_env.trials.gain_trial import Trial
 from drive_env.trials.method import method_of
 from drive_env.trials.score import Terms

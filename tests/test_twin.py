@@ -11,8 +11,8 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.gains import Gains, rule_gains
 from drive_env.dictionary.units import RPM
-from drive_env.gains import Gains, rule_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
@@ -27,7 +27,8 @@ from tuning.auto.twin import (
     known_of,
     twin_parameters,
 )
-from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.estimate import Estimate, refused
+from tuning.identify.identified_axis import Identification
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 22.0, 2e-5, R=0.41, L=5.5e-4, velocity_filter=260.0)

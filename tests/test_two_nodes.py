@@ -17,7 +17,7 @@ from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
 from drive_env.commands.serve import _announce
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 
 LOAD, SAVE = 0x64616F6C, 0x65766173
 SAID = "two nodes answer as 1: switch all but one of them off, and give it another node-ID"

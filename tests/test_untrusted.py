@@ -30,11 +30,11 @@ from drive_env.commands import recorded_frames
 from drive_env.commands.cli import app as env_app
 from drive_env.dictionary.entries import read_eds
 from drive_env.envs.configuration import configured
-from drive_env.envs.randomisation import Distributions
 from drive_env.envs.tracking import TrackingConfig
 from drive_env.motors import find_motor
 from drive_env.node.store import Store
 from drive_env.pictures.demonstration import DemonstrationError, load_demonstration
+from drive_env.randomisation.random_machines import Distributions
 from drive_env.studio import runs_folder
 from drive_env.trials.replay import read_log
 from drive_env.whole_file import content_hash

@@ -22,12 +22,12 @@ from drive_env.devices import find_device
 from drive_env.devices.variants import merged
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
+from drive_env.drives.limits import Limits
 from drive_env.drives.speeds import per_increment
+from drive_env.fieldbus.errors import BusError
 from drive_env.firmware.record import set_lanes
-from drive_env.master.errors import BusError
 from drive_env.motors import find_motor
 from drive_env.safety.errors import SafetyError
-from drive_env.safety.limits import Limits
 from tuning.move_counter import POSITIONS, SPEEDS, MoveCounter
 from tuning.runs.experiment import load_experiment, resolve
 

@@ -11,7 +11,7 @@ from held_objects import HeldObjects
 
 from drive_env import Limits, cia402
 from drive_env.dictionary.roles import Role
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety import watch as module
 from drive_env.safety.axes import Axes
 from drive_env.safety.errors import SafetyError

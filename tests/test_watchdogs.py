@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from drive_env import Limits, SafetyError, cia402
-from drive_env.master.errors import BusError
-from drive_env.master.link import NoWatchdogError
+from drive_env.drives.limits import NO_LIMIT
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.link import NoWatchdogError
 from drive_env.safety import signals
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.watchdogs import Watchdogs
 
 OFF, READY, ENABLED = 0x0240, 0x0231, 0x0637  # statuswords: switch on disabled, ready to switch on, operation enabled

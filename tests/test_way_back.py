@@ -30,7 +30,7 @@ from typer.testing import CliRunner
 from agents.commands.cli import app as drive_agent
 from agents.tuner import tuning_run
 from drive_env import cia402, motion
-from drive_env.master.description import Description
+from drive_env.fieldbus.description import Description
 from tuning.auto import one_button as auto_module
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import SET_POINTS, Transaction, differences

@@ -18,8 +18,7 @@ from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, counts_per_ampere
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import Observer
+from drive_env.drives.interface import Drives, Observer
 from drive_env.drives.speeds import per_increment
 from drive_env.drives.trace import Trace
 from drive_env.trials.oscillation import OSCILLATION

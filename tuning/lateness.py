@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import Observer
-from drive_env.master.pace import Timing
+from drive_env.drives.interface import Drives, Observer
+from drive_env.fieldbus.link import Timing
 
 NONE = Timing(0, 0, 0.0)
 # From here on a check that turns the field says nothing: a part of it takes 24 ms, in which the field turns by a fifth.

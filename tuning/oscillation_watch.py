@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.interface import Drives, device_of
-from drive_env.drives.observed import Observer
+from drive_env.drives.interface import Drives, Observer, device_of
+from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.trace import Trace
-from drive_env.gains import write_gains
 from drive_env.trials.oscillation import OSCILLATION, strongest_frequency
 from drive_env.trials.positioning import WATCH
 from mechanics.arrays import Floats, Integers, Mask

@@ -22,11 +22,12 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_writable
 from drive_env.drives.interface import Drives, device_of
+from drive_env.fieldbus.description import Description, describe
+from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
-from drive_env.master.description import Description, describe
-from drive_env.master.errors import BusError
 from drive_env.master.identity import Identity, check_same_drive, load_identity, read_identity
 from drive_env.master.parameters import (
+    SAVE,
     Difference,
     check_at_rest,
     check_no_commands,
@@ -37,6 +38,7 @@ from drive_env.master.parameters import (
     restorable,
     write_all_or_none,
 )
+from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.envelope import SafetyError
 from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
 from mechanics.arrays import Mask
@@ -45,13 +47,11 @@ from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import Entry
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.drives.interface import BusSide, DescribedAxes
     from tuning.target import Target
 
 
 SWITCH_OFF = 1000  # cycles that switching the voltage off may take
-SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 STORE = (0x1010, 1)
 DEVICE_OBJECTS = 0x2000  # from here on: what lies below is how drives talk, which their master has in use
 # Set-points with which an axis turns as soon as it is enabled. A program that dies leaves them, and no parameter file
@@ -136,7 +136,8 @@ def take(target: Target) -> Snapshot:
 
 def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
     """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
-    identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
+    bus = drives.bus
+    identities = [] if bus is None else [read_identity(bus, node) for node in range(len(bus.nodes))]
     return Snapshot(
         device_of(drives).name, _read_axes(drives), address, identities=tuple(identities), left_out=_borrowed(drives)
     )
@@ -241,7 +242,7 @@ def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
 _BUS = {"interface": str, "channel": str, "nodes": int, "axes": int, "bitrate": int, "pace": str}
 
 
-def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, other_drive: bool = False) -> None:
+def check_same_drives(file: object, snapshot: Snapshot, drives: BusSide, *, other_drive: bool = False) -> None:
     """Raise OtherDriveError unless the nodes of a bus are those that a snapshot was taken of.
 
     Args:
@@ -252,7 +253,7 @@ def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, ot
     """
     # A file that does not say of which drives it is (`load_snapshot` wants its reader's word for that) fits any.
     for node, written in zip(range(len(drives.nodes)), snapshot.identities, strict=False):
-        check_same_drive(file, written, read_identity(drives.bus, node), other_drive=other_drive)
+        check_same_drive(file, written, read_identity(drives, node), other_drive=other_drive)
 
 
 def restore(
@@ -298,7 +299,7 @@ def _set_points(known: Description) -> list[Key]:
     return [(index, 0) for index in SET_POINTS if known.has(index) and known.dictionary.find(index).access != "wo"]
 
 
-def differences(drives: BusDrives, snapshot: Snapshot) -> list[tuple[int, Difference]]:
+def differences(drives: BusSide, snapshot: Snapshot) -> list[tuple[int, Difference]]:
     """Return what is not as a snapshot says, as (number of the axis, difference), read anew from drives of a bus.
 
     Set-points of speed and torque that would turn an axis once it is enabled are among them.
@@ -477,27 +478,11 @@ def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
     return {key: value for key, value in values.items() if key[0] >= DEVICE_OBJECTS}
 
 
-def _per_axis(drives: Drives) -> Any:
+def _per_axis(drives: Drives) -> DescribedAxes:
     """Return drives whose objects are reached axis by axis, as those of a bus are."""
-    return drives.bus or _EmulatedPerAxis(drives)
+    return drives.bus or SingleAxes(drives, describe(device_of(drives).name, None))
 
 
 def _places(drives: Drives) -> Sequence[int]:
     """Return where `_per_axis` finds the axes of drives: on a bus among all axes of its nodes."""
     return drives.axis_numbers if drives.bus is not None else range(drives.num_axes)
-
-
-class _EmulatedPerAxis:
-    """Emulated drives as far as `drive_env.master.parameters` needs those of a bus."""
-
-    def __init__(self, drives: Drives) -> None:
-        self._drives = drives
-        self.description: Description = describe(device_of(drives).name, None)
-
-    def read_axis(self, entry: Entry, axis: int) -> int:
-        return int(self._drives.read((entry.index, entry.sub))[axis])
-
-    def write_axis(self, entry: Entry, axis: int, value: int) -> None:
-        where = np.zeros(self._drives.num_axes, bool)
-        where[axis] = True
-        self._drives.write((entry.index, entry.sub), value, where=where)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import Observer
+from drive_env.drives.interface import Drives, Observer
 
 UNTOLD = "no emergency message with the cause was received"
 

@@ -21,8 +21,8 @@ from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import ObservedDrives, Observer
+from drive_env.drives.interface import Drives, Observer
+from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.speeds import per_increment
 from mechanics.arrays import Floats, Mask
 from tuning.lateness import Punctuality, late_first
@@ -31,7 +31,7 @@ from tuning.stop_causes import ToldCauses
 if TYPE_CHECKING:
     from drive_env import EmulatedDrives
     from drive_env.devices import Device
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.drives.interface import BusSide
     from drive_env.motors import Motor
     from mechanics.load import Load
     from tuning.runs.inputs import Input
@@ -229,7 +229,7 @@ def of_machines(
         ValueError: For a travel that does not hold 0, or an axis that the machines do not have.
     """
     from mechanics.shaft import one, way
-    from tuning.identify.linked_axes import are_linked
+    from tuning.linked_axes import are_linked
 
     alone = one(made.load)
     own = way(alone)
@@ -327,7 +327,7 @@ def on_bus(
     return target
 
 
-def of_nodes(drives: BusDrives, parts: Iterable[int]) -> Drives:
+def of_nodes(drives: BusSide, parts: Iterable[int]) -> Drives:
     """Return axes of every node of a bus by their numbers in it; raises as `chosen_parts` does."""
     count = drives.description.num_axes
     chosen = chosen_parts(parts, count, drives.description.name)
@@ -458,7 +458,7 @@ _ADDRESS = ("bitrate", "pace")
 
 def hold_to_travel(target: Target) -> None:
     """Have the envelope hold each axis to its own travel, by more than a move overshoots, and to its motor's speed."""
-    from drive_env.safety.limits import Limits
+    from drive_env.drives.limits import Limits
 
     drives = target.drives
     here, scale = drives.read(cia402.POSITION_ACTUAL), target.increments()

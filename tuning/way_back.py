@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
-from drive_env.master.errors import BusError
 from drive_env.master.open_drives import check_answers, open_drives
 from drive_env.master.parameters import Difference, list_differences
 from tuning.snapshot import Snapshot, differences, load_snapshot

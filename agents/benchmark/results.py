@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from agents.training.seeds import TEST
+from agents.seeds import TEST
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import content_hash
 from mechanics.untrusted import read_json

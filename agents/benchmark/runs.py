@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from agents.benchmark.results import BASELINE, RESULT, SUBMITTED, TRAINED, Row, RowError
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.evaluation_shards import Written
+from agents.evaluation.open_policy import is_baseline, names_a_file
 from agents.evaluation.scores import RETURN
 from agents.policies.baselines import baselines_of
-from agents.policies.open_policy import is_baseline, names_a_file
-from agents.training.seeds import TEST
-from agents.training.tasks import environment_name
+from agents.seeds import TEST
+from agents.tasks import environment_name
 from agents.training.training_run import AGENT, TABLE, TrainingRun
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import write_whole

@@ -30,7 +30,7 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
-from agents.training.seeds import EVALUATION
+from agents.seeds import EVALUATION
 from drive_env.commands.options import DeviceName, Yes, was_typed
 from drive_env.commands.tables import print_lines
 from drive_env.default_device import DEFAULT_DEVICE
@@ -38,8 +38,8 @@ from tuning.commands.options import ask_to_turn
 
 if TYPE_CHECKING:
     from agents.evaluation.evaluation import Evaluation, GivenDrives
+    from agents.evaluation.open_policy import LoadedPolicy
     from agents.policies.guard import GuardLimits
-    from agents.policies.open_policy import LoadedPolicy
 
 logger = logging.getLogger(__name__)
 
@@ -269,10 +269,10 @@ def opened_for(
     """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
     import tomllib
 
-    from agents.policies.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
-    from agents.training.tasks import environment_name
-    from drive_env.envs.randomisation import shipped as shipped_distributions
+    from agents.evaluation.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
+    from agents.tasks import environment_name
     from drive_env.envs.suite import TASKS
+    from drive_env.randomisation.random_machines import shipped as shipped_distributions
     from mechanics.untrusted import read_toml
     from tuning.runs.inputs import taken_options
 
@@ -360,7 +360,7 @@ def _on_emulator(run: _Run) -> Evaluation:
 def _as_on_a_bus(run: _Run) -> Evaluation:
     """Evaluate on an emulated machine that the environment does not see, as it does not see what is on a bus."""
     from agents.evaluation.evaluation import GivenDrives, as_on_a_bus
-    from agents.training.tasks import make_environments
+    from agents.tasks import make_environments
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
     lanes: Any = make_environments(run.environment, 1, run.configuration)
@@ -393,7 +393,7 @@ def _elsewhere(run: _Run, trust: bool, workers: int | None, cluster: str | None)
 def _on_bus(run: _Run, sensor: str | None, before: Path, **where: Any) -> Evaluation:
     from agents.evaluation.evaluation import GivenDrives
     from agents.evaluation.on_the_bus import lower_profile_velocity, target_for
-    from agents.policies.open_policy import find_object
+    from agents.evaluation.open_policy import find_object
     from tuning.snapshot import Transaction
     from tuning.way_back import way_back
 
@@ -525,7 +525,7 @@ def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
 
 def _tell_card(text: str, json: bool) -> None:
     """Print how an agent was trained and what it reaches."""
-    from agents.policies.open_policy import described_checkpoint, is_checkpoint, open_policy
+    from agents.evaluation.open_policy import described_checkpoint, is_checkpoint, open_policy
 
     loaded = described_checkpoint(text) if is_checkpoint(text) else open_policy(text)
     about = {"environment": loaded.environment, **loaded.card}

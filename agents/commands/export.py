@@ -22,10 +22,10 @@ def export(
     checkpoint is compared with Stable-Baselines3's own network, too, and its .npz is written beside the .onnx.
     """
     with errors_as_exit_codes():
+        from agents.evaluation.open_policy import open_policy
         from agents.policies.onnx_export import TOLERANCE, compare, trial_observations
         from agents.policies.onnx_export import export as write_onnx
         from agents.policies.onnx_policy import OnnxPolicy
-        from agents.policies.open_policy import open_policy
         from agents.policies.policy import measure_latency, policy_of
         from agents.shipped import shipped_names
 

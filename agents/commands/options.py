@@ -103,7 +103,7 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: exit code 1 for errors of drive, bus or limits, 2 for the user's mistake, 130 for Ctrl-C."""
     from agents.policies.policy import PolicyError
-    from drive_env.master.errors import BusError, RefusedError
+    from drive_env.fieldbus.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
     from tuning.runs.pools import PoolError
 

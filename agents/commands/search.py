@@ -48,9 +48,9 @@ def search(
     """
     with errors_as_exit_codes():
         from agents.commands.train import with_load
-        from agents.training.search import BEST, SearchTrial
-        from agents.training.search import search as run_search
-        from agents.training.tasks import environment_name, short_name
+        from agents.hyperparameter_search import BEST, SearchTrial
+        from agents.hyperparameter_search import search as run_search
+        from agents.tasks import environment_name, short_name
 
         for name, value in (("--trials", trials), ("--steps", steps)):
             if value is not None and value < 1:

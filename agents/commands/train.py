@@ -57,7 +57,7 @@ def train(
     resumed.
     """
     with errors_as_exit_codes():
-        from agents.training.tasks import short_name
+        from agents.tasks import short_name
         from agents.training.train import clear, run_to_resume
         from agents.training.train import train as run_training
         from agents.training.training_run import AGENT, CHECKPOINT, CURVE, TrainingRun

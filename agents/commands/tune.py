@@ -147,7 +147,7 @@ def _emulated_node(
     if seed is not None:
         import numpy as np
 
-        from drive_env.envs.randomisation import RandomMachines, laws_of
+        from drive_env.randomisation.random_machines import RandomMachines, laws_of
 
         laws = laws_of(load, drives.device, drives.machine.parameters)
         draws = [np.random.default_rng(seed if axis == 0 else (seed, axis)) for axis in range(count)]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.evaluation.scores import Episode
-from agents.policies.agent_file import plain
+from agents.plain import plain
 from agents.policies.guard import PATIENT, GuardedPolicy
 from drive_env.whole_file import write_arrays
 from mechanics.arrays import Mask, Singles

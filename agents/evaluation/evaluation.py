@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation.scores import Episode, Interval, figures, interval
-from agents.policies.agent_file import plain
+from agents.plain import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
-from agents.training.seeds import EVALUATION
-from agents.training.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
+from agents.seeds import EVALUATION
+from agents.tasks import configuration_of, environment_name, make_environments, row_of, without_machines
 from agents.tuner.tune_target import TRIAL_SECONDS
-from drive_env.drives.interface import Drives
-from drive_env.drives.observed import ObservedDrives, Observer
+from drive_env.drives.interface import Drives, Observer
+from drive_env.drives.observed import ObservedDrives
 from drive_env.envs import environment_of
-from drive_env.master.realtime_section import undisturbed
+from drive_env.realtime_section import undisturbed
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_json
 from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from agents.evaluation.evaluation import Evaluation, environments_for, evaluate, summary
+from agents.evaluation.open_policy import names_a_file, opened, source_of
 from agents.evaluation.scores import Episode
-from agents.policies.open_policy import names_a_file, opened, source_of
-from agents.training.tasks import configuration_of, environment_name, make_environments
+from agents.tasks import configuration_of, environment_name, make_environments
 from mechanics.untrusted import MOST_ARRAYS, read_bytes
 from tuning.runs.inputs import taken_options
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from agents.policies.agent_file import AgentFile
 from agents.policies.policy import policy_of
-from agents.training.seeds import VALIDATION
-from agents.training.tasks import environment_name, make_environments
-from drive_env.drives.interface import machine_of
+from agents.seeds import VALIDATION
+from agents.tasks import environment_name, make_environments
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import environment_of
 from drive_env.envs.tracking import Tracking
 from drive_env.loops.dynamics import Dynamics
@@ -178,7 +178,7 @@ class _Measured:
     def episode(self, repeat: int, axis: int | None) -> tuple[Complex, Complex]:
         """Return lines of the motors' torque, shape (lines, machines, axes), and of the push, (lines, 1)."""
         lanes, config, everyone = self._lanes, self._lanes.config, np.ones(self._lanes.num_envs, bool)
-        machine = machine_of(lanes.drives)
+        machine = emulated_of(lanes.drives).machine
         phases = np.random.default_rng((self._seed, repeat)).uniform(0.0, 2.0 * np.pi, len(self._bins))
         times = np.arange(config.steps) / config.rate
         push = self._amplitude * np.cos(2.0 * np.pi * np.outer(times, self.frequencies) + phases).sum(axis=1)

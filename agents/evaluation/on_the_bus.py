@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.policies.guard import GuardLimits
-from agents.training.tasks import OF_MACHINES, environment_name, make_environments
+from agents.tasks import OF_MACHINES, environment_name, make_environments
 from drive_env import cia402
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.roles import Role
+from drive_env.drives.limits import given
 from drive_env.envs import environment_of
-from drive_env.safety.limits import given
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
@@ -54,9 +54,9 @@ def target_for(
     Raises:
         BusError: If the bus cannot be opened or a node does not answer.
     """
+    from drive_env.drives.limits import Limits
     from drive_env.drives.speeds import per_increment
     from drive_env.master.open_drives import open_drives
-    from drive_env.safety.limits import Limits
     from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
 
     more: dict[str, Any] = {"device": device, "interface": interface, "channel": channel, "nodes": nodes}

@@ -53,7 +53,7 @@ def draw_machines(config: Any, count: int, seed: int) -> list[Machine]:
         ValueError: For a load that is not a name, or friction that is not served.
     """
     from drive_env.emulator.emulated_drives import EmulatedDrives
-    from drive_env.envs.randomisation import BESIDE, Distributions, RandomMachines, laws_of, shipped
+    from drive_env.randomisation.random_machines import BESIDE, Distributions, RandomMachines, laws_of, shipped
 
     if not isinstance(config.load, str) or config.friction != "stribeck":
         raise ValueError(

@@ -15,11 +15,12 @@ from agents.evaluation.evaluation import Evaluation, GivenDrives, as_on_a_bus, e
 from agents.evaluation.on_the_bus import drives_for
 from agents.evaluation.served import Served, draw_machines, emulated, in_lockstep, in_real_time
 from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
-from agents.training.tasks import environment_name, make_environments
+from agents.tasks import environment_name, make_environments
 from drive_env.bus.config import Machine
-from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.interface import Drives
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import environment_of
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from mechanics.arrays import Integers
 
@@ -137,7 +138,7 @@ def _over_the_bus(
 def _sensor(drives: Drives | None, joint: int | None) -> Callable[[], Any] | None:
     if joint is None or drives is None:
         return None
-    machine = machine_of(drives)
+    machine = emulated_of(drives).machine
     return lambda: machine.joint_positions[:, joint]
 
 

@@ -22,7 +22,7 @@ from agents.policies.experts import (
     SwingUp,
     TorqueCascade,
 )
-from agents.training.tasks import environment_name
+from agents.tasks import environment_name
 from mechanics.arrays import Singles
 
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from drive_env.master.realtime_section import SWITCH_INTERVAL
+from drive_env.realtime_section import SWITCH_INTERVAL
 
 
 class DeadlineError(TimeoutError):

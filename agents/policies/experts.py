@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from drive_env.devices import find_device
+from drive_env.devices.gains import Rule, rule_gains
 from drive_env.envs.gain_scheduling import base_inertia
-from drive_env.gains import Rule, rule_gains
 from drive_env.motors import find_motor
 from mechanics.arrays import Floats, Singles
 from mechanics.loads import find_load
@@ -188,8 +188,8 @@ class LeadAndFeedback(Expert):
 class PayloadSchedule(Expert):
     """Gains that are scheduled by the known payload (Astrom and Wittenmark, Adaptive Control, 1995, chapter 9).
 
-    They follow a rule as the baseline rule is (drive_env/gains.py), whose constants are those of least lag with soft
-    dynamics, found by trying, the same for every machine.
+    They follow a rule as the baseline rule is (drive_env/devices/gains.py), whose constants are those of least lag
+    with soft dynamics, found by trying, the same for every machine.
     """
 
     RULE = Rule(current_hz=1000.0, speed=0.226, integration=18.0, position=0.77)

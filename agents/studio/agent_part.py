@@ -14,17 +14,18 @@ from drive_env.studio.sentences import sentence
 if TYPE_CHECKING:
     from agents.tuner.tune_target import TrialShown
     from tuning.studio.tune_desk import TunerSession
-    from tuning.studio.tune_page import TunePanel
+    from tuning.studio.tuner_card import TunerCard
     from tuning.target import Target
 
 TRIALS_SHARE = (0.3, 0.78)  # of a run's progress: where its trials begin and end
 
 
-def build(panel: TunePanel) -> None:
+def build(card: TunerCard) -> None:
     """Make it into the card of tuners."""
     from agents.shipped import TUNER
     from agents.tuner.open_tuner import open_tuner
 
+    panel = card.panel
     ui.separator()
     ui.label(
         "A trained agent tries gains on the axes, trial by trial, and then goes through the same checks as auto. "
@@ -43,9 +44,7 @@ def build(panel: TunePanel) -> None:
                 return
             name = str(agent.value)
             store = not panel.desk.is_emulated
-            await panel.tuner.start(
-                f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device.name)
-            )
+            await card.start(f"agent {name}", "agent-tune", work_of(policy, name, store), columns_of(panel.device.name))
 
         ui.button("Run the agent", icon="smart_toy", on_click=start).props("unelevated no-caps data-test=run-agent")
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.policies.agent_file import plain
+from agents.plain import plain
+from agents.tasks import configuration_of
 from agents.training import checkpoint
 from agents.training.counted_environments import CountedEnvironments
 from agents.training.learning_curve import draw_learning_curve
-from agents.training.tasks import configuration_of
 from agents.training.training_run import (
     CHECKPOINT,
     CURVE,

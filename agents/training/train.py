@@ -21,13 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from agents.policies.agent_file import AgentFile, plain
+from agents.plain import plain
+from agents.policies.agent_file import AgentFile
+from agents.tasks import configuration_of, make_environments
 from agents.training import checkpoint
 from agents.training.algorithms import algorithm_class, need
 from agents.training.counted_environments import CountedEnvironments
 from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, schedule
 from agents.training.networks import bundle_of
-from agents.training.tasks import configuration_of, make_environments
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, Progress, Report, TrainingRun, segment_seed
 from tuning.runs.inputs import FOLDER as INPUTS
 from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in, taken_options, write_inputs

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.tasks import environment_name, row_of
 from agents.training.algorithms import ALGORITHMS
 from agents.training.counted_environments import CountedEnvironments
-from agents.training.tasks import environment_name, row_of
 
 CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
 EPISODES_PER_SEGMENT = 3  # of every environment, at least

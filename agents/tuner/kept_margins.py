@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drive_env.gains import cascade_columns
+from drive_env.devices.gains import cascade_columns
 from mechanics.arrays import Integers, Mask
 from tuning.auto.correction import LOWERED
 from tuning.auto.loop_margins import MEASURED

@@ -8,7 +8,7 @@ from agents.policies.policy import load_policy
 from agents.shipped import find_agent
 from agents.tuner.tune_target import gains_for
 from drive_env.devices import find_device
-from drive_env.gains import check_linear_model
+from drive_env.devices.gains import check_linear_model
 from drive_env.loops.dynamics import find_dynamics
 
 if TYPE_CHECKING:

@@ -108,8 +108,8 @@ def tune_target(
     from agents.policies.guard import GuardedPolicy, stopping
     from drive_env import motion
     from drive_env.drives.observed import ObservedDrives
-    from drive_env.gains import write_gains
-    from tuning.auto.fallback_gains import FallbackGains
+    from drive_env.drives.raw_gains import write_gains
+    from tuning.fallback_gains import FallbackGains
     from tuning.search.trial_bench import first_gains
 
     fallback = FallbackGains(target.num_axes, target.motor.rated_current, windows=PATIENCE)
@@ -147,8 +147,8 @@ def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], tri
         trained: The agent's configuration.
         trials: How many instead of its own number.
     """
+    from drive_env.drives.raw_gains import write_gains
     from drive_env.envs.gain_tuning import GainTuning
-    from drive_env.gains import write_gains
     from tuning.search.trial_bench import first_gains
 
     configuration = dict(trained) | ({} if trials is None else {"trials": trials})
@@ -240,8 +240,8 @@ def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ..
     Raises:
         ValueError: If the device lacks such a gain, or names no cascade, and there is no rule for it.
     """
+    from drive_env.devices.gains import per_chip
     from drive_env.envs.gain_tuning import GainTuningConfig
-    from drive_env.gains import per_chip
 
     trained = GainTuningConfig(**{name: configuration[name] for name in ("device", "gains") if name in configuration})
     theirs = find_device(trained.device).gains

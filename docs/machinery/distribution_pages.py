@@ -8,7 +8,7 @@ from typing import Any
 
 from tables import table
 
-from drive_env.envs.randomisation import SHIPPED, Law, shipped
+from drive_env.randomisation.random_machines import SHIPPED, Law, shipped
 
 PATH = "reference/environments/distributions.md"
 GENERAL = ("common", "bus")  # what every load's set includes

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from agents.evaluation.open_policy import open_policy
 from agents.policies.baselines import baseline
-from agents.policies.open_policy import open_policy
 from agents.shipped import TUNER
-from agents.training.tasks import short_name
+from agents.tasks import short_name
 from drive_env import EmulatedDrives, motion
+from drive_env.drives.raw_gains import write_gains
 from drive_env.envs import ENVIRONMENTS
 from drive_env.envs.suite import TASKS
-from drive_env.gains import write_gains
 from drive_env.pictures.demonstration import PictureFormat
 from drive_env.pictures.recording import CYCLE, Recorder
 from drive_env.pictures.render import Picture

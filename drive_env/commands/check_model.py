@@ -65,9 +65,9 @@ def check_model(
 
         recorded = read_log(log)
         # The compiler is imported from here on: a mistake above is told at once.
-        from drive_env.commands.parameters import load_parameters
         from drive_env.emulator.emulated_drives import EmulatedDrives
-        from drive_env.envs.randomisation import Distributions
+        from drive_env.master.parameter_files import load_parameters
+        from drive_env.randomisation.random_machines import Distributions
         from drive_env.trials.replay import compare as differences
         from drive_env.trials.replay import fit as fitted
         from drive_env.trials.replay import fittable, replay

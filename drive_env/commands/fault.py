@@ -13,7 +13,7 @@ from drive_env.commands.tables import print_lines
 if TYPE_CHECKING:
     from drive_env.faults.table import FaultRow
 
-CONTROL_PORT = 29637  # of faults/control.py, whose import takes long
+CONTROL_PORT = 29637  # of bus/fault_control.py, whose import takes long
 
 
 def fault(
@@ -47,7 +47,7 @@ def fault(
     They are served with --control; `drive-env fault encoder_stuck --at 2 --duration 0.1` prints the fault's number.
     docs/faults.md has the effect of each fault, the reaction of drive and master, and how to recover.
     """
-    from drive_env.faults.control import ControlError, ask
+    from drive_env.bus.fault_control import ControlError, ask
     from drive_env.faults.schedule import parse_order
     from drive_env.faults.table import checked_parameters, find_fault
 

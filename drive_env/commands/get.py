@@ -31,8 +31,8 @@ from drive_env.commands.options import (
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
+    from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.quantities import Scale
 
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
@@ -87,7 +87,7 @@ def set_object(
     an enabled axis stops by when its master dies (1016h, 100Ch, 100Dh, 1029h, 6007h) is not changed; if another program
     enables an axis meanwhile, the value of before is written back.
     """
-    from drive_env.master import quantities
+    from drive_env.dictionary import quantities
     from drive_env.master.can.error_control import is_of_a_watchdog
     from drive_env.master.parameters import command
 
@@ -240,8 +240,8 @@ def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None
     import numpy as np
 
     from drive_env.dictionary.aborts import ObjectAccessError
+    from drive_env.fieldbus.errors import BusError
     from drive_env.master.can.error_control import is_of_a_watchdog
-    from drive_env.master.errors import BusError
 
     key = entry.index, entry.sub
     where = None if isinstance(value, str) else np.isin(np.arange(drives.num_axes), axes)
@@ -271,7 +271,7 @@ def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:
 
 
 def _row(entry: Any, value: Any, scale: Scale) -> dict[str, Any]:
-    from drive_env.master import quantities
+    from drive_env.dictionary import quantities
 
     row = {"index": f"{entry.index:04X}", "sub": entry.sub, "name": entry.name, "raw": value}
     if not isinstance(value, str):
@@ -281,7 +281,7 @@ def _row(entry: Any, value: Any, scale: Scale) -> dict[str, Any]:
 
 
 def _text(value: Any, entry: Any, scale: Scale, raw: bool) -> str:
-    from drive_env.master import quantities
+    from drive_env.dictionary import quantities
 
     if isinstance(value, str):
         return str(value)

@@ -29,9 +29,9 @@ from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectDictionary
+    from drive_env.dictionary.quantities import Scale
+    from drive_env.fieldbus.description import Description
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.description import Description
-    from drive_env.master.quantities import Scale
 
 DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
 BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and besides the time that it should take
@@ -67,9 +67,9 @@ def jog(
     """
     with errors_as_exit_codes():
         from drive_env import motion
-        from drive_env.master import quantities
-        from drive_env.master.description import describe
-        from drive_env.safety.limits import Limits
+        from drive_env.dictionary import quantities
+        from drive_env.drives.limits import Limits
+        from drive_env.fieldbus.description import describe
 
         description = describe(bus.device, eds)
         known, axis = description.dictionary, bus.axis
@@ -191,8 +191,8 @@ def _asked_for(
     one: _OneAxis, known: ObjectDictionary, scale: Scale, speed: str, by: str | None, duration: float
 ) -> _Movement:
     """Return the movement that the arguments ask for, before the axis is enabled; ValueError for one that cannot be."""
+    from drive_env.dictionary import quantities
     from drive_env.dictionary.access import check_limits
-    from drive_env.master import quantities
 
     velocity = quantities.parse(speed, known.find(cia402.TARGET_VELOCITY), scale)
     if velocity == 0:
@@ -220,7 +220,7 @@ def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale:
 @contextlib.contextmanager
 def _what_stops(reasons: list[str]) -> Iterator[None]:
     """Note what ends a movement early, in words of this command; what the bus says is none of it."""
-    from drive_env.master.errors import BusError
+    from drive_env.fieldbus.errors import BusError
     from drive_env.safety.envelope import SafetyError
 
     try:
@@ -235,7 +235,7 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
 
 def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> str:
     """Return what a speed is, and how rpm are written where it was a bare number."""
-    from drive_env.master import quantities
+    from drive_env.dictionary import quantities
 
     text = quantities.show(velocity, entry, scale)
     if quantities.is_quantity(speed) or text.endswith(" rpm"):
@@ -277,7 +277,7 @@ def _tell_plan(
     json: bool,
 ) -> None:
     """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
-    from drive_env.master import quantities
+    from drive_env.dictionary import quantities
 
     status = one.read(cia402.STATUSWORD)
     if cia402.matches(status, cia402.FAULT_BIT):
@@ -341,7 +341,7 @@ def _go(motion: Any, one: _OneAxis, velocity: int, distance: int, is_recorded: b
 
 def _arrive(motion: Any, one: _OneAxis, velocity: int, timeout: float) -> None:
     """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
-    from drive_env.master.errors import BusError
+    from drive_env.fieldbus.errors import BusError
 
     waited, before = 0.0, one.read(cia402.POSITION_ACTUAL)
     while True:

@@ -121,9 +121,9 @@ def replay(
     with errors_as_exit_codes():
         from drive_env.commands.recorded_frames import read_frames
         from drive_env.commands.replayed_motors import ANSWER_TIMEOUT
+        from drive_env.fieldbus.description import check_timeout
         from drive_env.master.can.dry_run import show_frame
         from drive_env.master.can.port import Port, open_bus
-        from drive_env.master.description import check_timeout
 
         _check_format(file, FORMATS)
         if not file.is_file():

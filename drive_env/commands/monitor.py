@@ -26,8 +26,8 @@ from drive_env.commands.tables import Column, tables
 from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.quantities import Scale
 
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
@@ -158,7 +158,7 @@ def _draw(
     from rich.console import Group
     from rich.text import Text
 
-    from drive_env.master.quantities import show
+    from drive_env.dictionary.quantities import show
 
     columns = [Column("object", "text"), *(Column(axis_name(drives, axis), "text") for axis in axes)]
     rows = []

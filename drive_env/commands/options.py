@@ -21,9 +21,9 @@ from drive_env.programs import CLOSED, output_is_closed
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+    from drive_env.dictionary.quantities import Scale
+    from drive_env.fieldbus.description import Description
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.description import Description
-    from drive_env.master.quantities import Scale
 
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
 AXIS_CYCLE = 0.001  # s of a bus of 1 Mbit/s for each axis of a node: seven frames
@@ -235,7 +235,7 @@ def look_first(
     timeout: float | None = None,
 ) -> None:
     """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command."""
-    from drive_env.master.errors import NoAnswerError
+    from drive_env.fieldbus.errors import NoAnswerError
     from drive_env.master.open_drives import check_answers
 
     named = {"interface": interface, "channel": channel, "nodes": nodes, "bitrate": bitrate}
@@ -250,7 +250,7 @@ def look_first(
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
-    from drive_env.master.errors import BusError, RefusedError
+    from drive_env.fieldbus.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
 
     with ending_by(fail, refused=(RefusedError, SafetyError, BusError, TimeoutError)):
@@ -272,7 +272,7 @@ def ending_by(
         mistakes: Errors that end it with 2 besides a ValueError, an object that cannot be had and a file's.
     """
     from drive_env.dictionary.aborts import ObjectAccessError
-    from drive_env.master.errors import OpenError
+    from drive_env.fieldbus.errors import OpenError
 
     mistaken: tuple[type[Exception], ...] = (ObjectAccessError, ValueError, *mistakes)
     try:
@@ -365,9 +365,9 @@ def ask(question: str, yes: bool) -> None:
 
 def scales_of(drives: BusDrives) -> list[Scale]:
     """Return what the units of every axis follow, as far as the drive says it."""
-    from drive_env.master import quantities
+    from drive_env.dictionary import quantities
 
-    return quantities.scales_of(drives)
+    return quantities.scales_of(drives, drives.description.dictionary)
 
 
 def default_objects(known: ObjectDictionary, names: Iterable[str]) -> list[str]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import sys
-import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,12 +28,10 @@ from drive_env.commands.options import (
     told_if_interrupted,
 )
 from drive_env.commands.tables import Column, print_table, print_text
-from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.identity import Identity
-    from drive_env.master.quantities import Scale
 
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
 Store = Annotated[
@@ -48,7 +44,6 @@ OtherDrive = Annotated[
 Unchecked = Annotated[
     bool, typer.Option("--unchecked", help="Accept a file that was changed, or that has no check sum; read it first.")
 ]
-SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 
 @grouped
@@ -60,6 +55,7 @@ def backup(
     json: Json = False,
 ) -> None:
     """Read all parameters of a drive into a file, without commands and services."""
+    from drive_env.master.parameter_files import parameters_text
     from drive_env.master.parameters import read_parameters
     from drive_env.whole_file import sealed, write_whole
 
@@ -91,7 +87,8 @@ def diff(
     json: Json = False,
 ) -> None:
     """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
-    from drive_env.master.description import describe
+    from drive_env.fieldbus.description import describe
+    from drive_env.master.parameter_files import load_parameters
     from drive_env.master.parameters import Difference, compare
 
     with errors_as_exit_codes():
@@ -137,8 +134,9 @@ def restore(
     The file must be unchanged since `backup` wrote it, and belong to this drive. Bit rate and node-ID are not changed;
     commands and services are refused. The axis must be disabled.
     """
-    from drive_env.master.description import describe
+    from drive_env.fieldbus.description import describe
     from drive_env.master.identity import check_same_drive, read_identity
+    from drive_env.master.parameter_files import checked_origin, load_parameters
     from drive_env.master.parameters import check_no_commands
 
     with errors_as_exit_codes():
@@ -212,40 +210,40 @@ def _exchange(
         json: Print JSON.
         dry_run: Say what would be written, and write nothing.
     """
-    from drive_env.master.description import describe
-    from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
+    from drive_env.fieldbus.description import describe
+    from drive_env.master import parameters
 
     axis, node = bus.axis, bus.number
-    wanted = restorable(wanted, describe(bus.device, eds).hints)
+    wanted = parameters.restorable(wanted, describe(bus.device, eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
         bus.look_first(eds)
     with ExitStack() as written:
         with bus.connect(eds, safety=False) as drives:
             _check_axis(drives, axis)
             check(drives)
-            differences = compare(drives, wanted, axis)
+            differences = parameters.compare(drives, wanted, axis)
             scale = scales_of(drives)[axis]
             if not json:
                 _print(differences, "drive", name, scale, json)
             if dry_run:
-                check_at_rest(drives, wanted, axis)
+                parameters.check_at_rest(drives, wanted, axis)
                 _tell_plan(differences, scale, node, store=store, json=json)
                 return
             if differences:
                 ask(f"Write {len(differences)} parameters to node {node}?", yes)
-            changes = write_all_or_none(drives, wanted, axis)
+            changes = parameters.write_all_or_none(drives, wanted, axis)
             told = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
             written.enter_context(told_if_interrupted(f"{len(changes)} written to node {node}{told}"))
             if store:
-                drives.write((0x1010, 1), SAVE)
+                drives.write((0x1010, 1), parameters.SAVE)
         # What was just written is not believed to whom wrote it: another connection reads it anew.
         with bus.connect(eds, safety=False) as drives:
-            left = compare(drives, wanted, axis)
+            left = parameters.compare(drives, wanted, axis)
     if left:
         fail(
             f"node {node} does not have the values that were written, by a second reading: "
-            f"{list_differences(left)}; is another master writing to it? Look with `drive-env diff`, then restore "
-            "again",
+            f"{parameters.list_differences(left)}; is another master writing to it? Look with `drive-env diff`, "
+            "then restore again",
             REFUSED,
         )
     if json:
@@ -267,22 +265,9 @@ def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, 
     print(f"{len(differences)} parameters would be written to node {node}{kept} (dry run: nothing was written)")
 
 
-def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
-    """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
-    from drive_env.master.identity import load_identity
-    from drive_env.whole_file import check_seal
-
-    table = _read_toml(file)
-    check_seal(file, table, unchecked=unchecked)
-    identity = table.get("identity")
-    if not isinstance(identity, dict):
-        return None, None
-    axis = identity.get("axis")
-    return load_identity(identity), axis if type(axis) is int else None
-
-
 def _tell_of_changes(file: Path) -> None:
     """Say on stderr that a file is not as it was written: to compare with it, it need not be."""
+    from drive_env.master.parameter_files import checked_origin
     from drive_env.whole_file import FileChangedError
 
     try:
@@ -294,63 +279,6 @@ def _tell_of_changes(file: Path) -> None:
 def _check_axis(drives: BusDrives, axis: int) -> None:
     if not 0 <= axis < drives.num_axes:
         raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
-
-
-def parameters_text(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
-    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
-    from drive_env.master.identity import read_identity
-    from drive_env.whole_file import FORMAT
-
-    known = drives.description
-    lines = [
-        f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change, and restore refuses a "
-        "changed file.",
-        f"format = {FORMAT}",
-        f'read = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
-        "",
-        "[identity]",
-        *read_identity(drives).to_toml(),
-        f"axis = {axis}",
-    ]
-    lines += ["", "[parameters]  # index:sub-index, both hexadecimal"]
-    for (index, sub), value in values.items():
-        entry = known.dictionary.find((index, sub))
-        unit = f" [{entry.unit}]" if entry.unit else ""
-        lines.append(f'"{index:04X}:{sub:02X}" = {value}  # {entry.name}{unit}')
-    return "\n".join(lines) + "\n"
-
-
-def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
-    """Return the parameters of a file; ValueError for what is none."""
-    from drive_env.dictionary.access import check_in_range, check_writable
-
-    rows = _read_toml(path).get("parameters")
-    if not isinstance(rows, dict) or not rows:
-        raise ValueError(f"{path} has no table [parameters]; `drive-env backup` writes one")
-    import numpy as np
-
-    values = {}
-    for text, value in rows.items():
-        index, _, sub = text.partition(":")
-        try:
-            key = int(index, 16), int(sub or "0", 16)
-        except ValueError:
-            raise ValueError(f"{path}: {text!r} is not an index:sub-index; write it as 607D:01") from None
-        entry = dictionary.find(key)
-        check_writable(entry)
-        check_in_range(entry, np.asarray(value))
-        values[key] = int(value)
-    return values
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    """Return what a file holds; ValueError if it is no TOML."""
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
-    try:
-        return read_toml(path)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not TOML, or incomplete: {error}; take another copy") from error
 
 
 def _print(differences: Iterable[Any], found: str, wanted: str, scale: Scale, json: bool) -> None:
@@ -366,7 +294,7 @@ def _print(differences: Iterable[Any], found: str, wanted: str, scale: Scale, js
 
 
 def _row(difference: Any, scale: Scale) -> dict[str, Any]:
-    from drive_env.master.quantities import show
+    from drive_env.dictionary.quantities import show
 
     entry, wanted, found = difference
     return {

@@ -11,11 +11,11 @@ from drive_env import cia402
 from drive_env.canopen.frames import NMT, SDO_REQUEST
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.tidying import Tidying
 from drive_env.master.can.error_control import STAYS, Heartbeats
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError
-from drive_env.master.tidying import Tidying
 
 SILENCE = 0.5  # s after which a drive acts
 PERIOD = SILENCE / 3.0  # two heartbeats may be lost

@@ -17,11 +17,11 @@ from drive_env.canopen.frames import EMCY, ERROR_CONTROL, NMT, RPDO, SDO_REQUEST
 from drive_env.devices import device_names, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
+from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.link import ObjectClient
 from drive_env.master.can.network import MAX_NODE, PRE_OPERATIONAL
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.link import ObjectClient
 
 ANSWER_TIMEOUT = 0.5  # s
 MAX_AXES = 8  # of a node (CiA 301: eight profile areas)

@@ -130,8 +130,8 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 def _look(port: Any, node: int, state: str, answers: int, timeout: float) -> dict[str, Any]:
     from drive_env.devices import device_of
     from drive_env.dictionary.aborts import ObjectAccessError
+    from drive_env.fieldbus.errors import BusError, NoAnswerError
     from drive_env.master.can.sdo import TWICE, SdoClient
-    from drive_env.master.errors import BusError, NoAnswerError
 
     sdo = SdoClient(port, node)
     row: dict[str, Any] = {"node": node, "state": state}

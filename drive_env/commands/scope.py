@@ -28,8 +28,8 @@ from drive_env.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.quantities import Scale
 
 # Response and commands of the usual modes: what `drive-env check-model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
@@ -156,7 +156,7 @@ def _fires(trigger: Trigger, values: Any, scales: list[Scale]) -> Any:
 
     import numpy as np
 
-    from drive_env.master.quantities import parse
+    from drive_env.dictionary.quantities import parse
 
     relation = {
         "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
@@ -182,7 +182,7 @@ class _Samples:
 
     def record(self, seconds: float) -> dict[Any, Any]:
         """Return the next rows."""
-        from drive_env.master.errors import BusError
+        from drive_env.fieldbus.errors import BusError
 
         names = [(entry.index, entry.sub) for entry in self._entries]
         try:
@@ -196,7 +196,7 @@ class _Samples:
 
     def complete(self, rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
         """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus, and which."""
-        from drive_env.master.errors import BusError
+        from drive_env.fieldbus.errors import BusError
 
         pieces, broken, piece = [rows], None, round(PIECE / 0.001)
         try:
@@ -286,7 +286,7 @@ def draw(path: Path, entries: list[Any], labels: list[str], scales: list[Scale],
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from drive_env.master.quantities import SHOWN, UNITS, find_unit
+    from drive_env.dictionary.quantities import SHOWN, UNITS, find_unit
     from drive_env.whole_file import write_picture
 
     figure = Figure(figsize=(9.0, 1.2 + 1.9 * len(entries)), layout="constrained")

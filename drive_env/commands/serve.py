@@ -19,11 +19,11 @@ from drive_env.commands.options import REFUSED, USER_ERROR, fail
 # The compiler and MuJoCo take long to import: whoever asks for --help should not pay it.
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
+    from drive_env.bus.fault_control import Control
     from drive_env.bus.server import Server
     from drive_env.bus.transport import Transport
     from drive_env.ethercat.beside_can import BesideCan
     from drive_env.ethercat.ethercat_server import EtherCatServer
-    from drive_env.faults.control import Control
 
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
@@ -253,8 +253,8 @@ def _beside(server: Server, bus: Bus, real_time: bool) -> list[BesideCan]:
 
 def _faults(server: Server, orders: list[str], port: int | None) -> list[Control]:
     """Schedule faults, and return the control socket if one is asked for."""
-    from drive_env.faults.bus_faults import BusFaults
-    from drive_env.faults.control import Control
+    from drive_env.bus.bus_faults import BusFaults
+    from drive_env.bus.fault_control import Control
     from drive_env.faults.schedule import parse_order
 
     if not orders and port is None:

@@ -25,7 +25,7 @@ from drive_env.commands.scope import refuse_other_masters
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
 
 OF_EMULATED = ("load", "motor", "seed", "factory")
 LOOK = 0.02  # s between two looks whether the bus is open
@@ -62,7 +62,7 @@ def studio(
     """
     with errors_as_exit_codes():
         check_extra()
-        from drive_env.master.description import describe
+        from drive_env.fieldbus.description import describe
         from drive_env.studio import server
         from drive_env.studio.gate import checked_token, is_loopback, new_token
         from drive_env.studio.pages import studio_pages

@@ -94,7 +94,7 @@ def preset(device: Device, motor: Motor, table: Mapping[str, Any]) -> dict[str, 
 
 def _servo(device: Device, motor: Motor) -> dict[str, float]:
     """Return the quantities of a servo drive, rounded as people choose numbers."""
-    from drive_env.gains import gains_from_bandwidths
+    from drive_env.devices.gains import gains_from_bandwidths
 
     brushed = motor.kind == "dc"
     ramp = TORQUE * motor.rated_torque / (ROTORS * motor.inertia)  # rad/s^2
@@ -171,7 +171,7 @@ def standard_preset(device: Device, motor: Motor) -> dict[str, int]:
     Raises:
         ValueError: If a gain leaves the drive's range: the motor is none for this drive.
     """
-    from drive_env.gains import bandwidth_gains
+    from drive_env.devices.gains import bandwidth_gains
 
     dictionary = device.new_dictionary()
     found = _scale(device, dictionary, motor)

@@ -15,7 +15,7 @@ from mechanics.arrays import Floats, Integers, Mask
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
-    from drive_env.drives.interface import BasicDrives
+    from drive_env.dictionary.axis_objects import AxisObjects
 
 
 class Gain(NamedTuple):
@@ -69,8 +69,8 @@ RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of 
 class GainSet:
     """The gains of a device, in its order; raw integers have shape (..., count).
 
-    cascade: Structure of the loops that they are gains of, one of those of `drive_env/gains.py`, from which their
-    rule comes; "" for loops that nothing is known of.
+    cascade: Structure of the loops that they are gains of, one of those of `drive_env/devices/gains.py`, from which
+    their rule comes; "" for loops that nothing is known of.
     closed_loops: What a stepper's drive may close.
     """
 
@@ -236,11 +236,11 @@ class GainSet:
         """Return whether gains of shape (count,) leave one of the loops open: its P is 0."""
         return any(raw[k] == 0 for k in self.columns_of(*loops) if self.rows[k].part == "P")
 
-    def read(self, drives: BasicDrives) -> Integers:
+    def read(self, drives: AxisObjects) -> Integers:
         """Return the gains that drives have, shape (num_axes, len(set))."""
         return np.stack([drives.read(key) for key in self.keys], axis=-1)
 
-    def write(self, drives: BasicDrives, gains: Integers, where: Mask | None = None) -> None:
+    def write(self, drives: AxisObjects, gains: Integers, where: Mask | None = None) -> None:
         """Write gains of shape (num_axes, len(set))."""
         for key, column in zip(self.keys, gains.T, strict=True):
             drives.write(key, column, where=where)

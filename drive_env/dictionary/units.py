@@ -18,6 +18,7 @@ from mechanics.arrays import Floats
 from mechanics.near_names import did_you_mean
 
 TWO_PI = 2.0 * np.pi
+MILLIAMPERE = 1e-3  # [A]
 
 
 class Context(NamedTuple):

@@ -9,25 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.drives.arguments import checked_mask
-from drive_env.drives.interface import Drives
+from drive_env.drives.drives_proxy import DrivesProxy
+from drive_env.drives.interface import Drives, SafetyWatch
 from drive_env.drives.trace import Trace
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.devices import Device
-    from drive_env.dictionary.entries import ObjectName
+    from drive_env.dictionary.entries import Entry, ObjectName
     from drive_env.drives.emergency import EmergencyMessage
-    from drive_env.drives.observed import Observer
-    from drive_env.master.bus_drives import BusDrives
-    from drive_env.safety.envelope import Envelope
-    from drive_env.safety.limits import Limits
+    from drive_env.drives.limits import Limits
 
 _PER_AXIS_LIMITS = ("velocity", "current", "following_error")
 
@@ -53,7 +49,7 @@ def chosen_parts(axes: Iterable[int], count: int, name: str) -> tuple[int, ...]:
     return chosen
 
 
-class ChosenAxes:
+class ChosenAxes(DrivesProxy):
     """Chosen axes of drives, with the interface of drives.
 
     Args:
@@ -64,44 +60,36 @@ class ChosenAxes:
         ValueError: For an axis that they do not have.
     """
 
-    machine = None  # the emulated machine moves by all of its axes, and is the others', too
-
     def __init__(self, drives: Drives, axes: Sequence[int]) -> None:
-        self._drives = drives
+        super().__init__(drives)
         self._axes = np.array(chosen_parts(axes, drives.num_axes, "set of drives"), np.int64)
-        self.num_axes = len(self._axes)
-        self.axis_numbers = tuple(drives.axis_numbers[k] for k in self._axes)
+        self._numbers = tuple(drives.axis_numbers[k] for k in self._axes)
         self._others: dict[ObjectName, Integers] = {}  # what axes left out have of objects that are played
-        self._safety = None
+        self._safety: ChosenWatch | None = None
         if drives.safety is not None:
             left_out = set(range(drives.num_axes)) - set(self._axes.tolist())
             drives.safety.leave_alone(left_out)
-            self._safety = _ChosenOfEnvelope(drives.safety, self._axes, drives.num_axes)
+            self._safety = ChosenWatch(drives.safety, self._axes, drives.num_axes)
 
     @property
-    def device(self) -> Device | None:
-        """What the drives are."""
-        return self._drives.device
+    def num_axes(self) -> int:
+        """Number of chosen axes."""
+        return len(self._axes)
 
     @property
-    def bus(self) -> BusDrives | None:
-        """The drives of the bus with all axes of its nodes, of which these are `axis_numbers`."""
-        return self._drives.bus
+    def axis_numbers(self) -> Sequence[int]:
+        """What each chosen axis is called."""
+        return self._numbers
 
     @property
-    def safety(self) -> Envelope | None:
+    def machine(self) -> None:
+        """None: the emulated machine moves by all of its axes, and is the others', too."""
+        return None
+
+    @property
+    def safety(self) -> SafetyWatch | None:
         """What watches over drives that may be real; limits are those of the chosen axes."""
-        return cast("Envelope | None", self._safety)
-
-    @property
-    def time_waits(self) -> bool:
-        """Whether time stands still until it is asked to pass."""
-        return self._drives.time_waits
-
-    @property
-    def observers(self) -> tuple[Observer, ...]:
-        """Who looks at the drives, the innermost first."""
-        return self._drives.observers
+        return self._safety
 
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every chosen axis."""
@@ -123,10 +111,6 @@ class ChosenAxes:
         whole = np.full(self._drives.num_axes, given[0], given.dtype)  # what an axis left out has here is not written
         whole[self._axes] = given
         self._drives.write(name, whole, where=mask)
-
-    def advance(self, duration: float) -> None:
-        """Let time pass [s]."""
-        self._drives.advance(duration)
 
     def record(
         self,
@@ -157,33 +141,25 @@ class ChosenAxes:
         """Refuse: a node restarts with all of its axes."""
         raise ValueError("a node is reset with all its axes, and some are left out here; open it with all of them")
 
-    def close(self) -> None:
-        """Release what the drives hold."""
-        self._drives.close()
 
-    def __enter__(self) -> Self:
-        return self
+class ChosenWatch:
+    """The watch over drives, with limits of the chosen axes; axes left out have their drives' own.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._drives.__exit__(kind, error, traceback)
+    Args:
+        whole: The watch over all axes.
+        axes: The chosen ones.
+        count: How many there are.
+    """
 
-
-class _ChosenOfEnvelope:
-    """The envelope of drives, with limits of the chosen axes; axes left out have their drives' own."""
-
-    def __init__(self, envelope: Envelope, axes: Integers, count: int) -> None:
-        self._whole = envelope
+    def __init__(self, whole: SafetyWatch, axes: Integers, count: int) -> None:
+        self._whole = whole
         self._axes = axes.tolist()
         self._count = count
-        self._limits = self._chosen(envelope.limits)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._whole, name)
+        self._limits = self._chosen(whole.limits)
 
     @property
     def limits(self) -> Limits:
+        """What the program may do to the chosen axes."""
         return self._limits
 
     @limits.setter
@@ -192,9 +168,26 @@ class _ChosenOfEnvelope:
         self._limits = limits
 
     def change(self, limits: Limits) -> None:
+        """Take other limits of the chosen axes."""
         limits.check_axes(len(self._axes))
         self._whole.change(self._of_all(limits))
         self._limits = limits
+
+    def leave_alone(self, axes: Iterable[int]) -> None:
+        """Take note of axes that the program never moves, by their numbers among all."""
+        self._whole.leave_alone(axes)
+
+    def watched(self) -> list[Entry]:
+        """Return what is to be sampled at every SYNC, the most important first."""
+        return self._whole.watched()
+
+    def stop(self, reason: str) -> None:
+        """Bring what is live to rest and switch it off."""
+        self._whole.stop(reason)
+
+    def stop_at_once(self, reason: str) -> None:
+        """Have what is live quick-stopped, from any thread."""
+        self._whole.stop_at_once(reason)
 
     def _chosen(self, limits: Limits) -> Limits:
         """Return limits of all axes as those of the chosen ones."""

@@ -8,10 +8,10 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import MILLIAMPERE
 from drive_env.drives.interface import BasicDrives, Drives
 from mechanics.arrays import Floats, Integers
 
-MILLIAMPERE = 1e-3
 _OF_PEAK = "1/32767 M-Ipeak"
 _WHOLE = 32767.0
 

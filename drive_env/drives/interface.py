@@ -1,44 +1,169 @@
-"""The Drives interface: what callers may ask of drives, emulated, on a bus, or behind an observer."""
+"""The Drives interface: what callers may ask of drives, emulated, on a bus, or behind an observer.
+
+It owns the protocols that it names: whoever has a machine, a bus or a watch fits them, and stands above.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from numpy.typing import ArrayLike
 
-from mechanics.arrays import Integers, Mask
+from drive_env.dictionary.axis_objects import AxisObjects
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.dictionary.entries import ObjectName
+    from drive_env.dictionary.entries import Entry, ObjectName
     from drive_env.drives.emergency import EmergencyMessage
-    from drive_env.drives.observed import Observer
+    from drive_env.drives.limits import Limits
     from drive_env.drives.trace import Trace
-    from drive_env.emulator.machine import Machines
-    from drive_env.master.bus_drives import BusDrives
-    from drive_env.safety.envelope import Envelope
+    from drive_env.fieldbus.description import Description
+    from drive_env.fieldbus.link import Link, ObjectReader, Timing
+    from mechanics.load import Load
 
 
-class BasicDrives(Protocol):
-    """What it takes to move axes: objects that are read and written, and time that passes.
-
-    Integers are those of the wire, one for each axis, shape (num_axes,).
-    """
-
-    @property
-    def num_axes(self) -> int:
-        """Number of axes."""
-
-    def read(self, name: ObjectName) -> Integers:
-        """Return an object of every axis."""
-
-    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of every axis, or of some."""
+class BasicDrives(AxisObjects, Protocol):
+    """What it takes to move axes: objects that are read and written, and time that passes."""
 
     def advance(self, duration: float) -> None:
         """Let time pass [s], whole communication cycles."""
+
+
+class DescribedAxes(AxisObjects, Protocol):
+    """Axes of nodes, one at a time: what reads, compares and writes the parameters of a drive."""
+
+    @property
+    def description(self) -> Description:
+        """What is known of the device."""
+
+    @property
+    def nodes(self) -> tuple[int, ...]:
+        """The nodes' addresses."""
+
+    def read_axis(self, entry: Entry, axis: int) -> Any:
+        """Return an object of one axis: an integer, or a text."""
+
+    def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
+        """Write an object of one axis."""
+
+    def sdo(self, node: int) -> ObjectReader:
+        """Return what reads the objects of a node, by its position in `nodes`."""
+
+
+class SafetyWatch(Protocol):
+    """What watches over drives that may be real, as their user sees it."""
+
+    @property
+    def limits(self) -> Limits:
+        """What the program may do."""
+
+    @limits.setter
+    def limits(self, limits: Limits) -> None: ...
+
+    def change(self, limits: Limits) -> None:
+        """Take other limits; those of position are places of the rotors as 6064h shows them now."""
+
+    def leave_alone(self, axes: Iterable[int]) -> None:
+        """Take note of axes that the program never moves."""
+
+    def watched(self) -> list[Entry]:
+        """Return what is to be sampled at every SYNC, the most important first."""
+
+    def stop(self, reason: str) -> None:
+        """Bring what is live to rest and switch it off."""
+
+    def stop_at_once(self, reason: str) -> None:
+        """Have what is live quick-stopped, from any thread and whatever the program's thread is doing."""
+
+
+class MachineSide(Protocol):
+    """The emulated machines' side that no bus shows; one value per machine unless said otherwise."""
+
+    @property
+    def drives(self) -> Drives:
+        """The emulated drives, without the observers around them."""
+
+    @property
+    def load(self) -> Load:
+        """What each machine is a copy of."""
+
+    @property
+    def parameters(self) -> dict[str, Floats]:
+        """True parameters by name [SI]."""
+
+    @property
+    def diverged(self) -> Mask:
+        """Which machines left physics and are frozen."""
+
+    @property
+    def load_torque(self) -> Floats:
+        """External torque on the load [N*m; N on a belt]."""
+
+    @load_torque.setter
+    def load_torque(self, value: ArrayLike) -> None: ...
+
+    @property
+    def supply(self) -> Floats:
+        """Supply voltage of each axis [V], shape (num_axes,)."""
+
+    @supply.setter
+    def supply(self, value: ArrayLike) -> None: ...
+
+    def set(self, name: str, value: ArrayLike, where: Mask | None = None) -> None:
+        """Set a true parameter [SI]."""
+
+    def set_all(self, values: Mapping[str, ArrayLike], where: Mask | None = None) -> None:
+        """Set several true parameters [SI] at once."""
+
+    def pushed(self) -> AbstractContextManager[Callable[[ArrayLike], None]]:
+        """Give what puts a torque on each axis by itself [N*m], shape (num_axes,), until the block ends."""
+
+    def reset(self, where: Mask | None = None) -> None:
+        """Put machines to rest at zero and switch their drives on anew."""
+
+
+class Observer:
+    """An observer of drives; methods that it does not override do nothing.
+
+    Attributes:
+        objects: What it wants recorded, whenever time passes; with any, no time passes unseen.
+        hides_machine: Whether who uses these drives is to see no emulated machine behind them.
+    """
+
+    objects: Sequence[ObjectName] = ()
+    hides_machine = False
+
+    def patience(self) -> int | None:
+        """Return after how many cycles it wants to look, None for whenever a record is over."""
+        return None
+
+    def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
+        """Take note of what was written."""
+
+    def passes(self, duration: float) -> None:
+        """Take note that time is about to pass [s]."""
+
+    def passed(
+        self,
+        below: Drives,
+        duration: float,
+        trace: Trace,
+        asked: Sequence[ObjectName],
+        play: Mapping[ObjectName, ArrayLike] | None,
+    ) -> None:
+        """Look at what has passed.
+
+        Args:
+            below: The drives to act on.
+            duration: How long [s].
+            trace: What was recorded.
+            asked: The objects that the caller wanted.
+            play: What was played.
+        """
 
 
 class Drives(BasicDrives, Protocol):
@@ -56,15 +181,15 @@ class Drives(BasicDrives, Protocol):
         """What each axis is called: its number among all axes of the drives, of which these may be chosen ones."""
 
     @property
-    def machine(self) -> Machines | None:
+    def machine(self) -> MachineSide | None:
         """The emulated machines' side that no bus shows."""
 
     @property
-    def bus(self) -> BusDrives | None:
+    def bus(self) -> BusSide | None:
         """The drives of a bus: its nodes, frames and single axes; axis k of these is its axis `axis_numbers[k]`."""
 
     @property
-    def safety(self) -> Envelope | None:
+    def safety(self) -> SafetyWatch | None:
         """What watches over drives that may be real."""
 
     @property
@@ -100,20 +225,38 @@ class Drives(BasicDrives, Protocol):
     ) -> None: ...
 
 
+class BusSide(Drives, DescribedAxes, Protocol):
+    """The drives of a bus with all axes of its nodes."""
+
+    @property
+    def link(self) -> Link:
+        """The fieldbus."""
+
+    @property
+    def total_timing(self) -> Timing:
+        """How punctual all SYNCs were since the drives were opened."""
+
+    def read_of(self, name: ObjectName, axes: Sequence[int]) -> Integers:
+        """Return an object of some axes, in their order, as `read` does of all."""
+
+    def can_record(self, objects: Sequence[ObjectName]) -> bool:
+        """Return whether objects can be recorded together."""
+
+
 def axis_number(drives: BasicDrives, axis: int) -> int:
     """Return what an axis is called in messages and results."""
     numbers: Sequence[int] | None = getattr(drives, "axis_numbers", None)  # BasicDrives need not have them
     return axis if numbers is None else int(numbers[axis])
 
 
-def machine_of(drives: Drives) -> Machines:
+def machine_of(drives: Drives) -> MachineSide:
     """Return the emulated machines behind drives; ValueError for drives that have none."""
     if drives.machine is None:
         raise ValueError("these drives have no emulated machine; use EmulatedDrives")
     return drives.machine
 
 
-def bus_of(drives: Drives) -> BusDrives:
+def bus_of(drives: Drives) -> BusSide:
     """Return the drives of a bus; ValueError for emulated ones."""
     if drives.bus is None:
         raise ValueError("these drives are not on a bus; use CanDrives")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.master.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
+from drive_env.dictionary.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
 from drive_env.whole_file import write_table
 from mechanics.arrays import Floats, Integers
 

@@ -129,7 +129,7 @@ class EmulatedCyclicControl(CyclicControl):
 
     def run(self) -> None:
         """Let the cycles pass; of axes whose integers are out of range none of the group is run."""
-        if self._scale_changes != self._emulated._objects.scale_changes:
+        if self._scale_changes != self._emulated.inside.objects.scale_changes:
             self._prepare()
         if self._prepared is None:
             super().run()
@@ -137,16 +137,16 @@ class EmulatedCyclicControl(CyclicControl):
         self._refused[0] = 0
         self._emulated._run(self._cycles, self._call)
         if self._refused[0]:
-            self._emulated._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
+            self._emulated.inside.objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
 
     def _prepare(self) -> None:
         drives, hooks = self._emulated, self.hooks
         # What cannot be recorded or played at all is refused here.
         for name in self._objects:
-            drives._objects.recordable(drives._objects.entries.find(name))
-        drives._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
-        self._scale_changes = drives._objects.scale_changes
-        self._prepared: PreparedRecord | None = drives._objects.prepared_record(self._objects, self.play)
+            drives.inside.objects.recordable(drives.inside.objects.entries.find(name))
+        drives.inside.objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
+        self._scale_changes = drives.inside.objects.scale_changes
+        self._prepared: PreparedRecord | None = drives.inside.objects.prepared_record(self._objects, self.play)
         if self._prepared is None:
             return
         prepared, axes = self._prepared, drives.num_axes

@@ -1,64 +1,161 @@
-"""What is inside emulated drives: how tools, faults and tests look there, and change what they must."""
+"""What is inside emulated drives: how machines, faults, tools and tests look there, and change what they must."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.emulator.group import Group
+from drive_env.devices import Device
+from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
+from drive_env.drives.arguments import whole_cycles
+from drive_env.emulator.group import Group, rates_of
 from drive_env.emulator.live_dictionary import LiveDictionary
-from drive_env.faults.machine_faults import MachineFaults
-from mechanics.arrays import Floats
+from drive_env.emulator.machine_kinds import MACHINE_KINDS
+from drive_env.emulator.parameters import MachineParameter
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
+from drive_env.motors import Motor
+from drive_env.saved_state import Saved
+from mechanics.arrays import Floats, Integers, Mask
+from mechanics.load import Load
+from mechanics.model import copies_per_model
+from mechanics.packed import pack
 
-if TYPE_CHECKING:
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+SWITCHES = ("left", "right", "home")  # bits of 60FDh
+LINK_FIELD = "link_shared"  # of firmware whose axes 2k and 2k + 1 may have one DC link
+BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
 
 
-class Inside:
+class Inside(Saved):
     """The truth inside emulated drives, which no drive shows on a bus.
 
     Args:
-        drives: The drives.
+        device: What the drives are.
+        motor: What each of them turns.
+        load: What each machine is a copy of.
+        parameter_rows: What each parameter of a machine is, by name.
+        parameters: True parameters by name [SI], each of shape (num_machines,).
+        noise_seeds: State from which each axis' noise goes on, shape (num_axes,).
+
+    Attributes:
+        records: The drives' records, each of eight lanes, shape (blocks,); `get_lanes` and `set_lanes` read and write
+            one.
+        groups: The machines, in groups with a packed load each.
+        objects: The object dictionary of every axis.
+        cycle: Communication cycles since the beginning.
+        schedule: Parameters that are to change: (cycle, name, values, machines), the next one first.
+        reported: Which machines are known to have left physics, shape (num_machines,).
     """
 
-    def __init__(self, drives: EmulatedDrives) -> None:
-        self._drives = drives
+    STATE = ("objects", "parameters", "noise_seeds", "cycle", "schedule", "reported")
 
+    objects: LiveDictionary  # of drives that are commissioned
+
+    def __init__(
+        self,
+        device: Device,
+        motor: Motor,
+        load: Load,
+        parameter_rows: Mapping[str, MachineParameter],
+        parameters: dict[str, Floats],
+        noise_seeds: Floats,
+    ) -> None:
+        self.device, self.motor, self.load = device, motor, load
+        self.parameter_rows, self.parameters, self.noise_seeds = parameter_rows, parameters, noise_seeds
+        self.num_axes = len(noise_seeds)
+        self.num_machines = self.num_axes // load.num_axes
+        self.records: NDArray[np.void] = device.firmware.layout.new_records(self.num_axes)
+        self.groups: list[Group] = []
+        self.cycle = 0
+        self.schedule: list[tuple[int, str, Floats, Mask]] = []
+        self.reported: Mask = np.zeros(self.num_machines, bool)
+        self._kind = MACHINE_KINDS[device.firmware_name]
+
+    # --- construction ---------------------------------------------------------------------------------------------
+    def build_groups(self, physics_steps: int, integrator: str, friction: str) -> None:
+        """Make the machines, packed in groups; arguments as `EmulatedDrives` takes them."""
+        rates = rates_of(self.device, physics_steps)
+        per_group = copies_per_model(self.load, self.num_machines)
+        loads = pack(
+            self.load,
+            self._armature(),
+            self._bearings(),
+            {p.name: self.parameters[f"load.{p.name}"] for p in self.load.parameters},
+            rates.window / physics_steps,
+            copies=per_group,
+            integrator=integrator,
+            friction=friction,
+            # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
+            weigh_every=rates.windows * physics_steps,
+        )
+        first = 0
+        for load in loads:
+            machines = slice(first, first + load.copies)
+            block, blocks = first * self.load.num_axes // LANES, -(-load.copies * self.load.num_axes // LANES)
+            self.groups.append(Group(machines, load, self.records[block : block + blocks], rates, self.device.firmware))
+            first = machines.stop
+
+    def _set_constants(self, supply: float) -> None:
+        records, device = self.records, self.device
+        records["undervoltage"] = device.undervoltage
+        records["overvoltage"] = device.overvoltage
+        records["standstill"] = device.standstill
+        records["warning_temperature"] = device.warning_temperature
+        records["error_temperature"] = device.error_temperature
+        for switch in self.load.switches:
+            kind = SWITCHES.index(switch.kind)
+            axes = np.tile(np.arange(self.load.num_axes) == switch.axis, self.num_machines)
+            set_lanes(records, "switch_low", np.full(self.num_axes, switch.low), axes, kind)
+            set_lanes(records, "switch_high", np.full(self.num_axes, switch.high), axes, kind)
+            wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
+            set_lanes(records, "wired", wired | (1 << kind), axes)
+        records["supply_voltage"] = supply
+        records["mode_delay"] = device.quirks.mode_display_delay
+        records["mode_needs_halt"] = device.quirks.mode_change_needs_halt
+        records["absent_status_bits"] = device.quirks.absent_status_bits
+        records["set_point_buffer"] = device.quirks.set_point_buffer
+        records["pv_slows_down_by_6084h"] = device.quirks.pv_slows_down_by_6084h
+        records["pv_starts_and_stops"] = device.quirks.pv_starts_and_stops
+        self._kind.set_constants(records, device, self.motor)
+        if self._kind.connect is not None:
+            self._kind.connect(records, device, np.full(self.num_axes, self.load.num_axes % device.num_axes == 0))
+        self.set_noise(np.ones(self.num_axes, bool))
+
+    def apply_what_was_drawn(self, supply: float) -> None:
+        """Give the records what machines, motor and supply [V] are."""
+        self._set_constants(supply)
+        for name, values in self.parameters.items():
+            everywhere = np.ones(self.num_axes, bool)
+            per_axis = np.repeat(values, self.load.num_axes)
+            self._apply_to_records(name, per_axis, everywhere)
+        self.refresh_inertia()
+        set_lanes(self.records, "brake_torque", np.full(self.num_axes, BRAKE_TORQUE * self.motor.rated_torque))
+
+    def commission(self, numbers: Integers, *, is_commissioned: bool) -> None:
+        """Give the drives their dictionaries, with the motor's preset if they are commissioned, and start them."""
+        preset: dict[ObjectName, int] = {}
+        if is_commissioned:
+            if Role.LIMIT_SWITCHES in self.device.roles:
+                preset[Role.LIMIT_SWITCHES] = 0 if self.load.has_switches else 3
+            for name, raw in self.device.preset(self.motor).items():
+                preset[name] = raw
+        self.objects = LiveDictionary(self.device, self.records, self.num_axes, preset)
+        serial = self.device.canopen.objects.get("serial_number")
+        if serial is not None:
+            self.objects.engrave(serial, np.repeat(numbers + 1, self.load.num_axes))
+        self.objects.restart(np.ones(self.num_axes, bool))
+
+    # --- what the machines are --------------------------------------------------------------------------------------
     @property
-    def records(self) -> NDArray[np.void]:
-        """The drives' records, each of eight lanes, shape (blocks,); `get_lanes` and `set_lanes` read and write one."""
-        return self._drives._records
-
-    @property
-    def groups(self) -> list[Group]:
-        """The machines, in groups with a packed load each."""
-        return self._drives._groups
-
-    @property
-    def objects(self) -> LiveDictionary:
-        """The object dictionary of every axis."""
-        return self._drives._objects
-
-    @property
-    def faults(self) -> MachineFaults:
-        """Faults of the machines."""
-        return self._drives._faults
-
-    @property
-    def noise_seeds(self) -> Floats:
-        """State from which each axis' noise goes on, shape (num_axes,)."""
-        return self._drives._noise_seeds
-
-    @property
-    def cycle(self) -> int:
-        """Communication cycles since the beginning."""
-        return self._drives._now
-
-    @cycle.setter
-    def cycle(self, number: int) -> None:
-        self._drives._now = number
+    def links(self) -> Integers:
+        """Which DC link each axis has, shape (num_axes,): the number of the first axis that has it."""
+        axes = np.arange(self.num_axes)
+        if not self.device.firmware.layout.has(LINK_FIELD):
+            return axes
+        shared = np.asarray(get_lanes(self.records, LINK_FIELD, self.num_axes), float)
+        return np.where(shared > 0.5, axes - axes % 2, axes)
 
     def cycles(self, duration: float) -> int:
         """Return how many communication cycles a time [s] has.
@@ -66,7 +163,7 @@ class Inside:
         Raises:
             ValueError: If it is no time, or no whole number of them.
         """
-        return self._drives._cycles(duration)
+        return whole_cycles(duration, self.device.cycle)
 
     def connect_axes(self, first: int, number: int) -> None:
         """Let machines of one axis each have in common what axes of one drive share, as a DC link: as on a node.
@@ -78,11 +175,79 @@ class Inside:
         Raises:
             ValueError: If they share a DC link, and their machines have different supplies.
         """
-        drives = self._drives
-        if drives._kind.connect is not None and drives.load.num_axes == 1:
-            axes = np.arange(drives.num_axes)
-            drives._kind.connect(drives._records, drives.device, (axes >= first) & (axes < first + number))
+        if self._kind.connect is not None and self.load.num_axes == 1:
+            axes = np.arange(self.num_axes)
+            self._kind.connect(self.records, self.device, (axes >= first) & (axes < first + number))
+
+    def set_noise(self, axes: Mask) -> None:
+        """Let the noise of axes begin anew, where their firmware has any."""
+        if self._kind.noise:
+            set_lanes(self.records, self._kind.noise, self.noise_seeds, axes)
+
+    def _apply_to_records(self, name: str, values: Floats, axes: Mask) -> bool:
+        """Write a motor or stage parameter into the records; return False for one that is the mechanics'."""
+        if (write := self._kind.writes.get(name)) is None:
+            return False
+        write(self.records, self.device, self.motor, values, axes)
+        return True
+
+    def _armature(self) -> Floats:
+        return np.repeat(self.parameters["motor.inertia"][:, None], self.load.num_axes, 1)
+
+    def _bearings(self) -> Floats:
+        """Return the motors' friction; their breakaway is that of sliding, so Stribeck's speed does not matter."""
+        coulomb, viscous = self.parameters["motor.coulomb"], self.parameters["motor.viscous"]
+        one = np.stack([coulomb, coulomb, np.ones_like(coulomb), viscous], -1)
+        return np.repeat(one[:, None, :], self.load.num_axes, 1)
+
+    def apply_parameter(self, name: str, values: Floats, machines: Mask) -> None:
+        """Bring a true parameter into records and mechanics; a refused one changes nothing."""
+        axes_per_machine = self.load.num_axes
+        axes = np.repeat(machines, axes_per_machine)
+        if self._apply_to_records(name, np.repeat(values, axes_per_machine), axes):
+            return
+        before, self.parameters[name] = self.parameters[name], values
+        try:
+            self._apply_to_loads(name, machines)
+        except ValueError:
+            self.parameters[name] = before
+            self._apply_to_loads(name, machines)
+            raise
+        self.refresh_inertia()
+
+    def apply_parameters(self, values: Mapping[str, Floats], machines: Mask) -> None:
+        """Bring several true parameters into records and mechanics, and remember them; a refusal leaves a mixture."""
+        axes_per_machine = self.load.num_axes
+        axes = np.repeat(machines, axes_per_machine)
+        self.parameters |= values
+        mechanical = [
+            name
+            for name, value in values.items()
+            if not self._apply_to_records(name, np.repeat(value, axes_per_machine), axes)
+        ]
+        if not mechanical:
+            return
+        loads = [name.removeprefix("load.") for name in mechanical if name.startswith("load.")]
+        armature, bearings = self._armature(), self._bearings()
+        for group in self.groups:
+            group.load.set_all(
+                {name: self.parameters[f"load.{name}"][group.machines] for name in loads},
+                machines[group.machines],
+                armature[group.machines],
+                bearings[group.machines],
+            )
+        self.refresh_inertia()
+
+    def _apply_to_loads(self, name: str, machines: Mask) -> None:
+        values, armature, bearings = self.parameters[name], self._armature(), self._bearings()
+        for group in self.groups:
+            if name.startswith("load."):
+                group.load.set(name.removeprefix("load."), values[group.machines], machines[group.machines])
+            else:
+                group.load.set_motor(armature[group.machines], bearings[group.machines])
 
     def refresh_inertia(self) -> None:
         """Tell the rotors what they turn, after a load was changed."""
-        self._drives._refresh_inertia()
+        axes = self.load.num_axes
+        inertia = np.concatenate([group.load.plant.mass[:axes].T.reshape(-1) for group in self.groups])
+        set_lanes(self.records, "J_rotor", inertia)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.interface import Drives
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.emulator.group import call_of, channels
 from drive_env.emulator.live_dictionary import NOTHING
 from drive_env.firmware.record import get_lanes, set_lanes
@@ -67,47 +68,47 @@ def trace_loops(
     """
     if drives.machine is None:
         raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
-    emulated = drives.machine.drives  # whatever looks at them does not see this time pass
+    emulated = emulated_of(drives)  # whatever looks at them does not see this time pass
     fields = emulated.device.firmware.layout.dtype.names or ()
     known = [name for name in SIGNALS if name in fields]
     for name in signals:
         if name not in known:
             raise ValueError(f"no signal is named {name!r}; there are {', '.join(known)}")
-    cycles = emulated._cycles(duration)
-    values, played = emulated._objects.plan_play(play or {}, cycles)
+    cycles = emulated.inside.cycles(duration)
+    values, played = emulated.inside.objects.plan_play(play or {}, cycles)
     sampled = channels(emulated.device.firmware.layout, [(name, 0) for name in signals])
     windows = round(emulated.device.velocity_rate / emulated.device.supervision_rate)
     periods = round(emulated.device.supervision_rate / emulated.device.communication_rate)
     samples = np.empty((cycles, periods, windows, len(signals), emulated.num_axes))
-    live = get_lanes(emulated._records, "live", emulated.num_axes).astype(np.int32)
-    rates = {id(group.machinery.rates): group.machinery.rates for group in emulated._groups}.values()
+    live = get_lanes(emulated.inside.records, "live", emulated.num_axes).astype(np.int32)
+    rates = {id(group.machinery.rates): group.machinery.rates for group in emulated.inside.groups}.values()
     period = 1.0 / emulated.device.supervision_rate
     nothing = np.empty((windows, 0, emulated.num_axes))
-    begin, diverged = emulated._now, False
+    begin, diverged = emulated.inside.cycle, False
     try:
         # Each window as if it were a cycle.
         for one in rates:
             one.replace(windows=1, periods=1)
         for k in range(cycles):
-            while emulated._schedule and emulated._schedule[0][0] <= begin + k:
-                _, name, row, where = emulated._schedule.pop(0)
+            while emulated.inside.schedule and emulated.inside.schedule[0][0] <= begin + k:
+                _, name, row, where = emulated.inside.schedule.pop(0)
                 emulated.machine.set(name, row, where)
             for p in range(periods):
                 first = (np.ascontiguousarray(values[k : k + 1]), played) if p == 0 else (nothing, NOTHING)
                 call = call_of(*first, samples[k, p, :1], sampled, 1)
                 diverged |= emulated._run_groups(call, 0, 1, True, True)
                 # A lane that is not alive is computed as ever, and left out of what happens once a period.
-                set_lanes(emulated._records, "live", np.zeros(emulated.num_axes, np.int32))
+                set_lanes(emulated.inside.records, "live", np.zeros(emulated.num_axes, np.int32))
                 for one in rates:
                     one.replace(period=0.0)
                 others = call_of(nothing, NOTHING, samples[k, p, 1:], sampled, 1)
                 diverged |= emulated._run_groups(others, 0, windows - 1, True, True)
-                set_lanes(emulated._records, "live", live)
+                set_lanes(emulated.inside.records, "live", live)
                 for one in rates:
                     one.replace(period=period)
-            emulated._now = begin + k + 1
+            emulated.inside.cycle = begin + k + 1
     finally:
-        set_lanes(emulated._records, "live", live)
+        set_lanes(emulated.inside.records, "live", live)
         for one in rates:
             one.replace(windows=windows, periods=periods, period=period)
     if diverged:

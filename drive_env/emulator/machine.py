@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask
+from drive_env.emulator.machine_faults import InjectedFault, MachineFaults
 from drive_env.emulator.parameters import check_known, check_one_supply, check_parameter
 from drive_env.emulator.record_snapshot import RecordSnapshot
-from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
@@ -24,13 +24,14 @@ from drive_env.firmware.record import get_lanes, set_lanes
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.drives.interface import Drives
+    from drive_env.emulator.inside import Inside
     from drive_env.emulator.parameters import MachineParameter
+    from mechanics.load import Load
 
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors
-LINK_FIELD = "link_shared"  # of firmware whose axes 2k and 2k + 1 may have one DC link
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
 _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
@@ -46,42 +47,49 @@ def checked_supply(value: ArrayLike, num_axes: int) -> Floats:
 
 
 class Machines:
-    """The emulated machines behind drives: one value per machine, shape (num_machines,), unless said otherwise."""
+    """The emulated machines behind drives: one value per machine, shape (num_machines,), unless said otherwise.
 
-    def __init__(self, drives: EmulatedDrives) -> None:
-        self._drives = drives
+    Attributes:
+        drives: The drives that turn these machines.
+        inside: What is inside them.
+    """
+
+    def __init__(self, drives: Drives, inside: Inside, faults: MachineFaults) -> None:
+        self.drives = drives
+        self.inside = inside
+        self._faults = faults
         self._rest: RecordSnapshot | None = None  # state of a machine at rest
         self._lamps: list[tuple[slice, Callable[[], tuple[str, str]]]] = []  # of nodes: their axes, what they show
 
     @property
-    def drives(self) -> EmulatedDrives:
-        """The drives that turn these machines."""
-        return self._drives
+    def load(self) -> Load:
+        """What each machine is a copy of."""
+        return self.inside.load
 
     @property
     def parameters(self) -> dict[str, Floats]:
         """True parameters by name [SI], each of shape (num_machines,)."""
-        return {name: values.copy() for name, values in self._drives._parameters.items()}
+        return {name: values.copy() for name, values in self.inside.parameters.items()}
 
     @property
     def parameter_rows(self) -> Mapping[str, MachineParameter]:
         """What each parameter is by name: unit, default, and the range in which random machines have it."""
-        return self._drives._parameter_rows
+        return self.inside.parameter_rows
 
     @property
     def diverged(self) -> Mask:
         """Which machines left physics and are frozen, shape (num_machines,)."""
-        return np.concatenate([group.load.plant.diverged != 0 for group in self._drives._groups])
+        return np.concatenate([group.load.plant.diverged != 0 for group in self.inside.groups])
 
     @property
     def load_torque(self) -> Floats:
         """External torque on the load [N*m; N on a belt], shape (num_machines,); set one value or one per machine."""
-        return np.concatenate([group.load.plant.load_torque for group in self._drives._groups])
+        return np.concatenate([group.load.plant.load_torque for group in self.inside.groups])
 
     @load_torque.setter
     def load_torque(self, value: ArrayLike) -> None:
         values = self._per_machine(value, "load torque")
-        for group in self._drives._groups:
+        for group in self.inside.groups:
             group.load.plant.load_torque[:] = values[group.machines]
 
     @contextmanager
@@ -93,13 +101,13 @@ class Machines:
         """
         from mechanics.shaft import way
 
-        groups = self._drives._groups
+        groups = self.inside.groups
         before = [(group.load.plant.disturbance.copy(), group.load.plant.load_torque.copy()) for group in groups]
         turning = way(groups[0].load).joints
         onto = np.linalg.pinv(turning)  # forces at the joints of a torque at each rotor
 
         def push(torque: ArrayLike) -> None:
-            each = np.broadcast_to(np.asarray(torque, float), (self._drives.num_axes,)).reshape(-1, len(turning))
+            each = np.broadcast_to(np.asarray(torque, float), (self.inside.num_axes,)).reshape(-1, len(turning))
             for group, (motion, calm) in zip(groups, before, strict=True):
                 group.load.plant.disturbance[:] = motion * calm + onto @ each[group.machines].T
                 group.load.plant.load_torque[:] = 1.0
@@ -130,22 +138,22 @@ class Machines:
         Raises:
             ValueError: For a table that is none; nothing is changed then.
         """
-        drives = self._drives
+        inside = self.inside
         if of not in ("time", "position"):
             raise ValueError(f"a load profile is of time or of position, not of {of!r}")
         points = np.zeros(0) if at is None else np.asarray(at, float)
         values = np.zeros(0) if torque is None else np.asarray(torque, float)
         if points.ndim != 1 or np.any(np.diff(points) <= 0.0) or not np.all(np.isfinite(points)):
             raise ValueError("a load profile needs one finite, increasing row of times or positions")
-        if values.shape not in (points.shape, (drives.num_machines, *points.shape)) or not np.all(np.isfinite(values)):
+        if values.shape not in (points.shape, (inside.num_machines, *points.shape)) or not np.all(np.isfinite(values)):
             raise ValueError(
                 f"a load profile of {len(points)} points needs finite torques of shape ({len(points)},) or "
-                f"({drives.num_machines}, {len(points)}), not {values.shape}"
+                f"({inside.num_machines}, {len(points)}), not {values.shape}"
             )
         if period is not None and (not len(points) or not period >= points[-1] - points[0] or not period > 0.0):
             raise ValueError(f"the period of a load profile must be above 0 and span its points, not {period:g}")
-        rows = np.broadcast_to(values, (drives.num_machines, len(points)))
-        for group in drives._groups:
+        rows = np.broadcast_to(values, (inside.num_machines, len(points)))
+        for group in inside.groups:
             group.load.set_profile(points, rows[group.machines], of_position=of == "position", period=period or 0.0)
 
     def schedule(self, name: str, times: ArrayLike, values: ArrayLike, where: Mask | None = None) -> None:
@@ -160,20 +168,20 @@ class Machines:
         Raises:
             ValueError: As in `set`, at once, and for times that are past or no whole cycles.
         """
-        drives = self._drives
-        check_known(name, drives._parameters)
+        inside = self.inside
+        check_known(name, inside.parameters)
         mask, rows = self._mask(where), np.asarray(values, float)
-        cycles = [drives._cycles(float(time)) for time in np.atleast_1d(np.asarray(times, float))]
-        if rows.shape not in ((len(cycles),), (len(cycles), drives.num_machines)):
+        cycles = [inside.cycles(float(time)) for time in np.atleast_1d(np.asarray(times, float))]
+        if rows.shape not in ((len(cycles),), (len(cycles), inside.num_machines)):
             raise ValueError(
                 f"a schedule of {len(cycles)} times needs values of shape ({len(cycles)},) or "
-                f"({len(cycles)}, {drives.num_machines}), not {rows.shape}"
+                f"({len(cycles)}, {inside.num_machines}), not {rows.shape}"
             )
         check_parameter(name, rows)
         if name.startswith("load."):
-            drives._groups[0].load.values.check(name.removeprefix("load."), rows)
-        drives._schedule += [(drives._now + cycle, name, row, mask) for cycle, row in zip(cycles, rows, strict=True)]
-        drives._schedule.sort(key=lambda change: change[0])
+            inside.groups[0].load.values.check(name.removeprefix("load."), rows)
+        inside.schedule += [(inside.cycle + cycle, name, row, mask) for cycle, row in zip(cycles, rows, strict=True)]
+        inside.schedule.sort(key=lambda change: change[0])
 
     @property
     def brake(self) -> NDArray[np.str_]:
@@ -187,13 +195,13 @@ class Machines:
 
     @brake.setter
     def brake(self, value: ArrayLike) -> None:
-        drives = self._drives
-        chosen = np.broadcast_to(np.asarray(value), (drives.num_axes,))
-        known = _BRAKES if Role.BRAKE_RELEASE_CURRENT in drives.device.roles else _BRAKES[:-1]
+        inside = self.inside
+        chosen = np.broadcast_to(np.asarray(value), (inside.num_axes,))
+        known = _BRAKES if Role.BRAKE_RELEASE_CURRENT in inside.device.roles else _BRAKES[:-1]
         for state in chosen:
             if state not in known:
-                raise ValueError(f"a brake of {drives.device.name} is {', '.join(known)}, not {str(state)!r}")
-        set_lanes(drives._records, "brake_mode", np.array([_BRAKES.index(state) for state in chosen], float))
+                raise ValueError(f"a brake of {inside.device.name} is {', '.join(known)}, not {str(state)!r}")
+        set_lanes(inside.records, "brake_mode", np.array([_BRAKES.index(state) for state in chosen], float))
 
     @property
     def brake_output(self) -> Floats:
@@ -212,7 +220,7 @@ class Machines:
     @property
     def joint_positions(self) -> Floats:
         """Positions of the load's joints, in the order of its MJCF [rad or m], shape (num_machines, joints)."""
-        return np.concatenate([group.load.joint_positions() for group in self._drives._groups])
+        return np.concatenate([group.load.joint_positions() for group in self.inside.groups])
 
     def place(self, joint: int, angles: ArrayLike, where: Mask | None = None) -> None:
         """Put a joint that no drive turns to another position, at rest.
@@ -223,7 +231,7 @@ class Machines:
             where: Machines.
         """
         mask, chosen = self._mask(where), self._per_machine(angles, "angles")
-        for group in self._drives._groups:
+        for group in self.inside.groups:
             group.load.place(joint, chosen[group.machines], mask[group.machines])
 
     @property
@@ -236,19 +244,16 @@ class Machines:
 
     @supply.setter
     def supply(self, value: ArrayLike) -> None:
-        drives = self._drives
-        volts = checked_supply(value, drives.num_axes)
+        inside = self.inside
+        volts = checked_supply(value, inside.num_axes)
         check_one_supply(volts, self.links)
-        with drives._faults.suspended():
-            set_lanes(drives._records, "supply_voltage", volts)
+        with self._faults.suspended():
+            set_lanes(inside.records, "supply_voltage", volts)
 
     @property
     def links(self) -> Integers:
         """Which DC link each axis has, shape (num_axes,): the number of the first axis that has it."""
-        drives, axes = self._drives, np.arange(self._drives.num_axes)
-        if not drives.device.firmware.layout.has(LINK_FIELD):
-            return axes
-        return np.where(self._axis_field(LINK_FIELD) > 0.5, axes - axes % 2, axes)
+        return self.inside.links
 
     @property
     def rotor_angle(self) -> Floats:
@@ -277,16 +282,16 @@ class Machines:
 
     @enable_input.setter
     def enable_input(self, value: ArrayLike) -> None:
-        drives = self._drives
-        closed = np.broadcast_to(np.asarray(value, bool), (drives.num_axes,))
-        with drives._faults.suspended():
-            set_lanes(drives._records, "enable_input", closed.astype(np.int32))
+        inside = self.inside
+        closed = np.broadcast_to(np.asarray(value, bool), (inside.num_axes,))
+        with self._faults.suspended():
+            set_lanes(inside.records, "enable_input", closed.astype(np.int32))
 
     @property
     def outputs(self) -> Integers:
         """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,)."""
-        read = self._drives.read
-        pins = (1 << self._drives.device.num_outputs) - 1
+        read = self.drives.read
+        pins = (1 << self.inside.device.num_outputs) - 1
         return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & pins
 
     @property
@@ -295,34 +300,34 @@ class Machines:
 
         A node with several axes shows those of its first one.
         """
-        return self._drives.read(Role.DIGITAL_INPUTS) >> INPUTS_SHIFT
+        return self.drives.read(Role.DIGITAL_INPUTS) >> INPUTS_SHIFT
 
     @digital_inputs.setter
     def digital_inputs(self, value: ArrayLike) -> None:
-        values = np.broadcast_to(np.asarray(value), (self._drives.num_axes,))
+        values = np.broadcast_to(np.asarray(value), (self.inside.num_axes,))
         if values.dtype.kind not in "iu" or np.any((values < 0) | (values > 0xFF)):
             raise ValueError(f"digital inputs are whole numbers of 0 to 255, a bit for each, not {value!r}")
-        drives = self._drives
-        records = drives.inside.objects.records
-        if drives.device.firmware.layout.has(INPUTS_FIELD):  # the firmware adds its switches
+        inside = self.inside
+        records = inside.objects.records
+        if inside.device.firmware.layout.has(INPUTS_FIELD):  # the firmware adds its switches
             set_lanes(records, INPUTS_FIELD, values)
         else:
-            drives._objects.impose(Role.DIGITAL_INPUTS, values.astype(np.int64) << INPUTS_SHIFT)
+            inside.objects.impose(Role.DIGITAL_INPUTS, values.astype(np.int64) << INPUTS_SHIFT)
 
     @property
     def analog_inputs(self) -> Integers:
         """Readings of the analog inputs, 0...4095, shape (inputs, num_axes); set them likewise."""
-        return np.stack([self._drives.read(key) for key in self._analog_inputs()])
+        return np.stack([self.drives.read(key) for key in self._analog_inputs()])
 
     @analog_inputs.setter
     def analog_inputs(self, value: ArrayLike) -> None:
         keys = self._analog_inputs()
-        values = np.broadcast_to(np.asarray(value), (len(keys), self._drives.num_axes))
+        values = np.broadcast_to(np.asarray(value), (len(keys), self.inside.num_axes))
         for key, raw in zip(keys, values, strict=True):
-            self._drives._objects.impose(key, raw)
+            self.inside.objects.impose(key, raw)
 
     def _analog_inputs(self) -> list[tuple[int, int]]:
-        entries = self._drives._objects.entries
+        entries = self.inside.objects.entries
         first = entries.find(Role.ANALOG_INPUTS)
         return [(entry.index, entry.sub) for entry in entries if entry.index == first.index and entry.sub >= first.sub]
 
@@ -333,11 +338,11 @@ class Machines:
         Setting it is what such a program does beside a master: none of its frames is seen on the bus. The numbers are
         the object's; ObjectAccessError for another one, and for a drive that has no such mode.
         """
-        return self._drives.read(Role.MODE_GATE)
+        return self.drives.read(Role.MODE_GATE)
 
     @drive_mode.setter
     def drive_mode(self, value: ArrayLike) -> None:
-        self._drives.write(Role.MODE_GATE, value)
+        self.drives.write(Role.MODE_GATE, value)
 
     @property
     def error_bits(self) -> Integers:
@@ -352,18 +357,18 @@ class Machines:
     @error_bits.setter
     def error_bits(self, value: ArrayLike) -> None:
         self._check_has_errors()
-        device = self._drives.device
+        device = self.inside.device
         known = 0
         for cause in device.firmware.causes:
             known |= cause.status_flag
-        values = np.broadcast_to(np.asarray(value), (self._drives.num_axes,))
+        values = np.broadcast_to(np.asarray(value), (self.inside.num_axes,))
         if values.dtype.kind not in "iu" or np.any(values & ~known):
             bits = ", ".join(str(bit) for bit in range(32) if known >> bit & 1)
             raise ValueError(f"error bits of {device.name} are whole numbers of bits {bits}, not {value!r}")
-        set_lanes(self._drives._records, ERRORS_FIELD, values)
+        set_lanes(self.inside.records, ERRORS_FIELD, values)
 
     def _check_has_errors(self) -> None:
-        device = self._drives.device
+        device = self.inside.device
         if not device.firmware.layout.has(ERRORS_FIELD):
             raise ValueError(f"errors of {device.name} have no numbers; make them by what causes them")
 
@@ -374,7 +379,7 @@ class Machines:
         "off", "on", "blinking", "single flash" or "double flash" (CiA 303-3; their times are in canopen/leds.py).
         Drives on no bus show what they do after power-on: pre-operational, without an error.
         """
-        shown = np.array([AFTER_POWER_ON] * self._drives.num_axes).T
+        shown = np.array([AFTER_POWER_ON] * self.inside.num_axes).T
         for axes, lamps in self._lamps:
             shown = shown.astype(object)
             shown[0, axes], shown[1, axes] = lamps()
@@ -393,8 +398,8 @@ class Machines:
     def set_temperatures(self, winding: ArrayLike, stage: ArrayLike) -> None:
         """Set winding and stage temperature [degC], as if the axis had worked before."""
         for name, value in (("T_winding", winding), ("T_stage", stage)):
-            values = np.broadcast_to(np.asarray(value, float), (self._drives.num_axes,))
-            set_lanes(self._drives._records, name, values)
+            values = np.broadcast_to(np.asarray(value, float), (self.inside.num_axes,))
+            set_lanes(self.inside.records, name, values)
 
     def set(self, name: str, value: ArrayLike, where: Mask | None = None) -> None:
         """Set a true parameter [SI] of the machines where the mask is true; bad input changes nothing.
@@ -402,14 +407,14 @@ class Machines:
         Raises:
             ValueError: If there is no such parameter, the value is not finite, or no machine can have it.
         """
-        drives = self._drives
-        check_known(name, drives._parameters)
+        inside = self.inside
+        check_known(name, inside.parameters)
         mask = self._mask(where)
         check_parameter(name, self._per_machine(value, name)[mask])
-        values = np.where(mask, self._per_machine(value, name), drives._parameters[name])
-        with drives._faults.suspended():
-            drives._apply_parameter(name, values, mask)
-        drives._parameters[name] = values
+        values = np.where(mask, self._per_machine(value, name), inside.parameters[name])
+        with self._faults.suspended():
+            inside.apply_parameter(name, values, mask)
+        inside.parameters[name] = values
 
     def set_all(self, values: Mapping[str, ArrayLike], where: Mask | None = None) -> None:
         """Set several true parameters [SI] at once; bad input changes nothing.
@@ -424,19 +429,19 @@ class Machines:
         Raises:
             ValueError: As in `set`.
         """
-        drives = self._drives
+        inside = self.inside
         mask = self._mask(where)
         new: dict[str, Floats] = {}
         for name, value in values.items():
-            check_known(name, drives._parameters)
+            check_known(name, inside.parameters)
             check_parameter(name, self._per_machine(value, name)[mask])
-            new[name] = np.where(mask, self._per_machine(value, name), drives._parameters[name])
-        before = {name: drives._parameters[name] for name in new}
-        with drives._faults.suspended():
+            new[name] = np.where(mask, self._per_machine(value, name), inside.parameters[name])
+        before = {name: inside.parameters[name] for name in new}
+        with self._faults.suspended():
             try:
-                drives._apply_parameters(new, mask)
+                inside.apply_parameters(new, mask)
             except ValueError:
-                drives._apply_parameters(before, mask)
+                inside.apply_parameters(before, mask)
                 raise
 
     def fault(
@@ -473,11 +478,11 @@ class Machines:
             ValueError: For a fault, parameter, time or condition that is none, or one that this load cannot have.
         """
         order = Order(name, at, when, duration, axis=axis, parameters=parameters)
-        return self._drives._faults.add(order, self._mask(where))
+        return self._faults.add(order, self._mask(where))
 
     def faults(self) -> list[InjectedFault]:
         """Return the faults that are still to come or are there; one that has ended everywhere is forgotten."""
-        return self._drives._faults.listing()
+        return self._faults.listing()
 
     @property
     def possible_faults(self) -> list[str]:
@@ -485,7 +490,7 @@ class Machines:
         found = []
         for name in FAULTS:
             try:
-                self._drives._faults.check(Order(name))
+                self._faults.check(Order(name))
             except ValueError:
                 continue
             found.append(name)
@@ -493,7 +498,7 @@ class Machines:
 
     def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
         """End a fault or call it off, None all of them; ValueError if there is none of that number."""
-        self._drives._faults.clear(number, self._mask(where))
+        self._faults.clear(number, self._mask(where))
 
     def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:
         """Give machines another noise from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
@@ -501,51 +506,51 @@ class Machines:
         chosen = np.asarray(seeds, float)
         if chosen.shape != mask.shape or np.any((chosen < 1.0) | (chosen >= 2.0**32)):
             raise ValueError(f"noise takes {len(mask)} seeds of 1...{2**32 - 1}, one per machine")
-        axes = self._drives.num_axes // self._drives.num_machines
+        axes = self.inside.num_axes // self.inside.num_machines
         # As when machines are drawn: every axis has a noise of its own.
         apart = np.repeat(chosen, axes) + np.tile(np.arange(axes), len(mask))
         every = np.repeat(mask, axes)
-        self._drives._noise_seeds[every] = (np.mod(apart, 2.0**32 - 1.0) + 1.0)[every]
+        self.inside.noise_seeds[every] = (np.mod(apart, 2.0**32 - 1.0) + 1.0)[every]
 
     def reset(self, where: Mask | None = None) -> None:
         """Put machines to rest at zero and switch their drives on anew; a diverged machine lives again, faults end."""
         mask = self._mask(where)
-        drives = self._drives
-        if drives._faults.some:
-            drives._faults.clear(None, mask)
-        for group in drives._groups:
+        inside = self.inside
+        if self._faults.some:
+            self._faults.clear(None, mask)
+        for group in inside.groups:
             group.load.reset(mask[group.machines])
-        axes = np.repeat(mask, drives.num_axes // drives.num_machines)
+        axes = np.repeat(mask, inside.num_axes // inside.num_machines)
         if self._rest is None:
-            layout = drives.device.firmware.layout
+            layout = inside.device.firmware.layout
             parts = [(field, part) for field in layout.state for part in range(field.depth)]
             initial = np.array([[field.initial] for field, _ in parts])
-            self._rest = RecordSnapshot(layout, drives._records, [(field.name, part) for field, part in parts], initial)
+            self._rest = RecordSnapshot(layout, inside.records, [(field.name, part) for field, part in parts], initial)
         self._rest.restore(axes)
-        drives._set_noise(axes)
+        inside.set_noise(axes)
         for live, nominal in (("R_s", "R_nominal"), ("psi_m", "psi_nominal")):
-            set_lanes(drives._records, live, get_lanes(drives._records, nominal, drives.num_axes), axes)
-        drives._reported[mask] = False
-        drives._objects.restart(axes)
+            set_lanes(inside.records, live, get_lanes(inside.records, nominal, inside.num_axes), axes)
+        inside.reported[mask] = False
+        inside.objects.restart(axes)
 
     def power_cycle(self, where: Mask | None = None) -> None:
         """Switch the supply of the drives off and on: stored values return, counters and positions start at zero."""
-        drives = self._drives
-        drives._objects.restart(np.repeat(self._mask(where), drives.num_axes // drives.num_machines))
+        inside = self.inside
+        inside.objects.restart(np.repeat(self._mask(where), inside.num_axes // inside.num_machines))
 
     def _axis_field(self, name: str) -> Floats:
-        return get_lanes(self._drives._records, name, self._drives.num_axes).astype(float)
+        return get_lanes(self.inside.records, name, self.inside.num_axes).astype(float)
 
     def _mask(self, where: Mask | None) -> Mask:
-        return checked_mask(where, self._drives.num_machines)
+        return checked_mask(where, self.inside.num_machines)
 
     def _per_machine(self, value: ArrayLike, name: str) -> Floats:
         values = np.asarray(value, float)
-        if values.shape not in ((), (self._drives.num_machines,)):
+        if values.shape not in ((), (self.inside.num_machines,)):
             raise ValueError(
-                f"{name} takes one value or one for each of {self._drives.num_machines} machines, not shape "
+                f"{name} takes one value or one for each of {self.inside.num_machines} machines, not shape "
                 f"{values.shape}"
             )
         if np.any(np.isnan(values)):
             raise ValueError(f"{name} must be a number, not nan")
-        return np.broadcast_to(values, (self._drives.num_machines,)).copy()
+        return np.broadcast_to(values, (self.inside.num_machines,)).copy()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.devices import Device
+from drive_env.devices.gains import VELOCITY_FILTER_DAMPING
 from drive_env.emulator.machine_numbers import machine_numbers
 from drive_env.firmware.common.encoder import encoder_count
 from drive_env.firmware.record import get_lanes, set_lanes
@@ -19,9 +20,6 @@ from mechanics.near_names import did_you_mean
 
 Records = NDArray[np.void]
 Write = Callable[[Records, Device, Motor, Floats, Mask], None]
-
-VELOCITY_FILTER_DAMPING = 0.7
-
 
 # How a motor's cable is wired, each 0 or 1: what 2080h:01, 2070h:01 and 2070h:02 must say for the motor to turn.
 WIRING = ("motor.encoder_direction", "motor.hall_polarity", "motor.hall_direction")

@@ -14,28 +14,24 @@ from gymnasium.vector import AutoresetMode
 
 from drive_env import cia402
 from drive_env.devices import find_device
+from drive_env.devices.gains import BASELINE_RULE, rule_gains, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import NO_PAYLOAD, PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.online_margins import OnlineMargins
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
-from drive_env.gains import (
-    BASELINE_RULE,
-    read_gains,
-    rule_gains,
-    small_time_constants,
-    write_gains,
-)
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
+from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from mechanics.arrays import Floats, Integers, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
@@ -417,7 +413,7 @@ class GainScheduling(VectorEnvironment):
         if laws is None:
             load, known = self.config.load, self.drives.device
             laws = laws_of(load, known, machine.parameters) if known and load in shipped() else {"parameters": {}}
-        self._machines = RandomMachines(machine.drives, Distributions.load(laws))
+        self._machines = RandomMachines(emulated_of(self.drives), Distributions.load(laws))
         changes = max(1, round(self.config.duration / self.config.payload_every))
         self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)
 

@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.raw_gains import read_gains
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs.configuration import configured
 from drive_env.envs.gain_observation import (
     RATIO_MAX,
@@ -27,11 +29,10 @@ from drive_env.envs.gain_observation import (
     true_entries,
 )
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
-from drive_env.gains import read_gains
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.motors import Motor, find_motor
+from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost
 from drive_env.trials.load_detection import is_load_detection
 from drive_env.trials.method import check_tried, method_of, new_score
@@ -262,7 +263,7 @@ class GainTuning(VectorEnvironment):
         if laws is None:
             known = machine_of(self.drives).parameters
             laws = laws_of(c.load, self._device, known) if c.load in shipped() else {"parameters": {}}
-        self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
+        self._machines = RandomMachines(emulated_of(self.drives), Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
         if not is_load_detection(self._device, c.chosen):  # else J by measured terms is all there is
             self._score = new_score(
@@ -415,7 +416,7 @@ class GainTuning(VectorEnvironment):
         """
         drives, axes, pictures = self.drives, np.repeat(mask, self._axes), self._pictures
         if self._machines is not None:
-            machine, values = machine_of(drives), self._machines.values
+            machine, values = emulated_of(drives).machine, self._machines.values
             machine.seed_noise(self._noise + self._trial, mask)
             self._trial[mask] += 1.0
             machine.reset(mask)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from drive_env.emulator.emulated_drives import emulated_of
 from mechanics.arrays import Floats, Image, Mask
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Pictures:
     def __init__(self, drives: Drives, mode: str, period: float = 0.001) -> None:
         if drives.machine is None:
             raise ValueError("pictures need emulated machines; leave render_mode out on a bus")
-        self._drives = drives.machine.drives
+        self._drives = emulated_of(drives)
         self._period = period
         self._recorders: dict[int, Recorder] = {}
         self._picture: Picture | None = None

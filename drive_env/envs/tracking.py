@@ -17,18 +17,19 @@ from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import counts_per_ampere
-from drive_env.drives.interface import Drives, device_of, machine_of
+from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.randomisation import Distributions, RandomMachines, laws_of, shipped
 from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
 from drive_env.envs.vector_environment import Info, Observation, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.motors import Motor, find_motor
+from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from mechanics.arrays import Floats, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
@@ -351,7 +352,7 @@ class Tracking(VectorEnvironment):
         if machine is not None:
             if isinstance(distributions, str) and distributions in shipped():
                 distributions = laws_of(distributions, device_of(self.drives), machine.parameters)
-            return RandomMachines(machine.drives, Distributions.load(distributions or {"parameters": {}}))
+            return RandomMachines(emulated_of(self.drives), Distributions.load(distributions or {"parameters": {}}))
         if distributions is not None:
             raise ValueError("distributions are of emulated machines; leave them out on a bus")
         if self._is_stepper and (self.drives.read(cia402.SENSOR_SELECTION) == ENCODER_OFF).any():
@@ -496,7 +497,7 @@ class Tracking(VectorEnvironment):
             angles = np.zeros(self.num_envs)
             for lane in np.flatnonzero(mask):
                 angles[lane] = self.rngs[lane].uniform(low, high)
-            machine_of(self.drives).place(joint, angles, mask)
+            emulated_of(self.drives).machine.place(joint, angles, mask)
 
     def _act(self, action: Any) -> bool:
         """Make a step; return whether any drive went into fault or a pole fell."""

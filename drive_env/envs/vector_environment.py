@@ -22,7 +22,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.envs.randomisation import Curriculum, Distributions
+from drive_env.emulator.emulated_drives import EmulatedDrives, emulated_of
+from drive_env.randomisation.random_machines import Curriculum, Distributions
 from drive_env.saved_state import Saved, State, check_alike
 from mechanics.arrays import Floats, Mask, Texts
 
@@ -213,13 +214,12 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         if (pictures := self._pictures) is not None:
             pictures.begin(np.ones(self.num_envs, bool))
 
-    def _emulated_drives(self) -> Any:
-        machine = self.drives.machine
-        if machine is None:
+    def _emulated_drives(self) -> EmulatedDrives:
+        if self.drives.machine is None:
             raise ValueError(
                 "only emulated drives have a state that can be saved and restored; real machines cannot be put back"
             )
-        return machine.drives
+        return emulated_of(self.drives)
 
     def _description(self) -> State:
         """Return what must be equal in two vectors of environments so that one can restore the state of the other."""

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from drive_env.bus.lateness import Lateness
 from drive_env.ethercat.ways import EtherCatWay, UdpSocket
 from drive_env.ethercat.world import EtherCatWorld
-from drive_env.master.realtime_section import undisturbed
+from drive_env.realtime_section import undisturbed
 
 LONGEST_WAIT = 0.05  # s until a request to stop is seen
 MOST_BEHIND = 0.25  # s; a host that slept longer does not catch up, the time is skipped

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drive_env.gains import RawGains, cascade_columns, gain_factors
+from drive_env.devices.gains import RawGains, cascade_columns, gain_factors
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, held, response, window
 from drive_env.loops.sampled import mean_velocity as mean_velocity_of
 from mechanics.arrays import Complex, Floats

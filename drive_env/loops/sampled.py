@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drive_env.gains import cascade_columns, gain_factors
+from drive_env.devices.gains import cascade_columns, gain_factors
 from mechanics.arrays import Complex, Floats, Integers
 
 if TYPE_CHECKING:

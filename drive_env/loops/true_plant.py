@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.sampled import RIGID, LinearMachines, Windings, linear_machines
 from mechanics.arrays import Floats
@@ -28,7 +29,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
     """
     if drives.machine is None:
         raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
-    emulated = drives.machine.drives  # without the observers around them
+    emulated = emulated_of(drives)  # without the observers around them
     if emulated.load.num_axes != 1:
         raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
     true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
@@ -85,7 +86,7 @@ def true_machines(drives: Drives) -> LinearMachines:
     """
     if drives.machine is None:
         raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
-    emulated = drives.machine.drives
+    emulated = emulated_of(drives)
     axes, motor = emulated.load.num_axes, emulated.motor
     true = {
         name: np.asarray(values, float).reshape(-1, axes)
@@ -110,10 +111,8 @@ def elastic_lags(drives: Drives) -> Floats:
     the lag is the energy of that over that of the motion. On one spring it is the square root of the load's share of
     the inertia, over the angular frequency of the anti-resonance.
     """
-    machine = drives.machine
-    assert machine is not None, "of emulated machines"
     parts = []
-    for group in machine.drives.inside.groups:
+    for group in emulated_of(drives).inside.groups:
         M, _, K, rotors = linear_load(group.load)
         one = np.linalg.pinv(rotors)  # each rotor turned by 1, (joints, axes)
         free = np.linalg.svd(rotors)[2][len(rotors) :].T  # how joints may move while all rotors stand

@@ -25,20 +25,21 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.quantities import Scale, follows_scale, integers, is_quantity, scales_of
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.limits import Limits
 from drive_env.drives.trace import Trace
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.link import Link, ObjectClient, Timing
 from drive_env.held_signals import held_signals
 from drive_env.master.cycle_runner import CycleRunner
-from drive_env.master.description import Description
-from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.link import Link, ObjectClient
-from drive_env.master.pace import Pace, Timing
-from drive_env.master.quantities import follows_scale, integers, is_quantity, scales_of
+from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 from drive_env.safety.envelope import Envelope
-from drive_env.safety.limits import Limits
+from drive_env.safety.watched_drives import CycleWatch
 from mechanics.arrays import Integers, Mask
 
 logger = logging.getLogger(__name__)
@@ -136,7 +137,7 @@ class BusDrives:
                 self.write_axis(entry, int(axis), value)
             return
         if is_quantity(value):
-            scales = scales_of(self) if follows_scale(entry.unit) else [None] * self.num_axes
+            scales = self._scales() if follows_scale(entry.unit) else [None] * self.num_axes
             value = integers(str(value), entry, scales, axes)
         raw = checked_values(entry, value, self.num_axes)
         if self.safety is not None:
@@ -209,7 +210,7 @@ class BusDrives:
             key = (entry.index, entry.sub)
             values[key] = np.tile(self.read_entry(entry), (rows, 1)) if self.is_dry else found[key][::every]
         times = np.arange(rows, dtype=np.float64) * (every * self._description.cycle)
-        return Trace(times, values, self._description.dictionary, lambda: scales_of(self))
+        return Trace(times, values, self._description.dictionary, self._scales)
 
     def can_record(self, objects: Sequence[ObjectName]) -> bool:
         """Return whether objects can be recorded together; what would be mapped for it is not."""
@@ -340,17 +341,17 @@ class BusDrives:
         """Take note that a node is not operational any more: the next command starts it."""
         self._started = False
 
-    def prepare_watch(self, envelope: Envelope) -> None:
+    def prepare_watch(self, watch: CycleWatch) -> None:
         """Have mapped what an envelope watches."""
-        self._cycle_runner.prepare(envelope)
+        self._cycle_runner.prepare(watch)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
         """Return what comes with every SYNC."""
         return self._cycle_runner.mapped()
 
-    def poll(self, envelope: Envelope) -> bool | None:
+    def poll(self, watch: CycleWatch) -> bool | None:
         """Look at the drives by a SYNC of one's own, as `CycleRunner.poll`."""
-        return self._cycle_runner.poll(envelope)
+        return self._cycle_runner.poll(watch)
 
     @property
     def is_dry(self) -> bool:
@@ -394,6 +395,10 @@ class BusDrives:
             self._catch_up()
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _scales(self) -> list[Scale]:
+        """Return what the units of every axis follow, as far as the drive says it; it is asked."""
+        return scales_of(self, self._description.dictionary)
+
     def _place_of(self, entry: Entry, axis: int) -> tuple[int, int, int, str]:
         """Return the node of an axis by its position, and index, sub-index and label of an object there."""
         node, part = divmod(axis, self._description.num_axes)

@@ -10,6 +10,8 @@ import can
 
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.limits import Limits
+from drive_env.fieldbus.description import check_timeout, describe
 from drive_env.master.bus_drives import BusDrives, checked_limits
 from drive_env.master.can.bus_time import BIT_RATE, BusTime
 from drive_env.master.can.can_link import CanLink
@@ -17,9 +19,7 @@ from drive_env.master.can.dry_run import DryPort
 from drive_env.master.can.network import check_nodes
 from drive_env.master.can.port import Port, open_bus
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.description import check_timeout, describe
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, cycles_per_sync
-from drive_env.safety.limits import Limits
 
 TWIN_TIME = 0.005  # s by which a second node with the same node-ID may answer later: they are of one kind
 

@@ -7,10 +7,10 @@ from functools import partial
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.description import Description
-from drive_env.master.errors import BusError
-from drive_env.master.link import NoWatchdogError, ObjectClient
-from drive_env.master.tidying import Tidying
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.link import NoWatchdogError, ObjectClient
+from drive_env.fieldbus.tidying import Tidying
 
 # 6007h, what an axis does when its connection is lost (CiA 402): nothing, or the quick stop.
 _ABORT_CONNECTION, _NO_ACTION, _QUICK_STOP = (cia402.ABORT_CONNECTION_OPTION, 0), b"\0\0", b"\3\0"

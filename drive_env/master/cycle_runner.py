@@ -16,15 +16,15 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.link import Link, Outputs, Samples
 from drive_env.master.asked_rows import CAN_BE_ASKED, AskedRows
-from drive_env.master.description import Description
-from drive_env.master.link import Link, Outputs, Samples
 from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 from mechanics.arrays import Integers
 
 if TYPE_CHECKING:
-    from drive_env.safety.envelope import Envelope
+    from drive_env.safety.watched_drives import CycleWatch
 
 logger = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ class CycleRunner:
         self._running = threading.RLock()  # one user of SYNC at a time: the program, or its supervisor
         self._nothing = RecordCall((), ())
 
-    def pass_time(self, cycles: int, envelope: Envelope | None) -> None:
+    def pass_time(self, cycles: int, envelope: CycleWatch | None) -> None:
         """Let cycles pass by the clock: where this computer was late, SYNCs are left out."""
         with self._running:
             samples = None
@@ -106,7 +106,7 @@ class CycleRunner:
             self._run(cycles, None, samples, envelope, skip_missed=True)
             self._pace.end(self._link.receive)
 
-    def prepare(self, envelope: Envelope) -> None:
+    def prepare(self, envelope: CycleWatch) -> None:
         """Have mapped what the envelope watches, as far as it fits."""
         with self._running:
             self._map(self._nothing, envelope)
@@ -115,7 +115,7 @@ class CycleRunner:
         """Return what comes with every SYNC."""
         return self._process.sampled_entries()
 
-    def poll(self, envelope: Envelope) -> bool | None:
+    def poll(self, envelope: CycleWatch) -> bool | None:
         """Send a SYNC of the supervisor's own and look at what comes back.
 
         Returns whether all of it came; None where the program's own cycles are under way, or nothing is mapped.
@@ -192,7 +192,7 @@ class CycleRunner:
         return played
 
     def record(
-        self, call: RecordCall, played: Mapping[Entry, Integers], cycles: int, envelope: Envelope | None
+        self, call: RecordCall, played: Mapping[Entry, Integers], cycles: int, envelope: CycleWatch | None
     ) -> dict[Key, Integers]:
         """Let cycles pass and return what was sampled, each object of shape (cycles, num_axes)."""
         if envelope is not None:
@@ -218,7 +218,7 @@ class CycleRunner:
         return found
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _map(self, call: RecordCall, envelope: Envelope | None) -> None:
+    def _map(self, call: RecordCall, envelope: CycleWatch | None) -> None:
         """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
         watched = NOTHING if envelope is None else envelope.watched()
         played = tuple(dict.fromkeys(call.played))
@@ -260,7 +260,7 @@ class CycleRunner:
         cycles: int,
         outputs: Outputs | None,
         samples: Samples | None,
-        envelope: Envelope | None,
+        envelope: CycleWatch | None,
         *,
         skip_missed: bool = False,
         epoch: int | None = _NOW,

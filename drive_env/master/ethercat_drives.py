@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.limits import Limits
+from drive_env.fieldbus.description import check_timeout, describe
+from drive_env.fieldbus.errors import OpenError
 from drive_env.master.bus_drives import BusDrives, checked_limits
-from drive_env.master.description import check_timeout, describe
-from drive_env.master.errors import OpenError
 from drive_env.master.ethercat.ethercat_link import EtherCatLink
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, cycles_per_sync
-from drive_env.safety.limits import Limits
 
 if TYPE_CHECKING:
     from drive_env.master.ethercat.frame_master import FrameMaster

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from drive_env.dictionary.aborts import ObjectAccessError
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.drives.interface import DescribedAxes
 
 
 _TEXTS = ("device", "name", "hardware", "software")
@@ -48,7 +48,7 @@ class Identity(NamedTuple):
         return [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in rows.items()]
 
 
-def read_identity(drives: BusDrives, node: int = 0) -> Identity:
+def read_identity(drives: DescribedAxes, node: int = 0) -> Identity:
     """Return what a node says of itself.
 
     Args:

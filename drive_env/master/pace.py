@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from drive_env.drives.arguments import whole_cycles
+from drive_env.fieldbus.link import Timing
 
 MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
 CATCH_UP = 0.02  # of a cycle, by which a SYNC is moved to suit the drives' clocks
 LONGEST_CYCLE = 0.1  # s: slower, nobody watches
 Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
-
-
-class Timing(NamedTuple):
-    """How punctual the SYNCs of a run were: their number, those more than a cycle late, the worst lateness [s]."""
-
-    cycles: int
-    late: int
-    worst: float
 
 
 def _take_in(receive: Receive) -> None:

@@ -14,13 +14,15 @@ from drive_env.canopen.frames import INVALID
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
-from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
     from drive_env.devices import MasterHints
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.drives.interface import DescribedAxes
 
+
+SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 # What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
 COMMANDS = {
@@ -89,7 +91,7 @@ def restorable(values: Mapping[Key, int], hints: MasterHints) -> dict[Key, int]:
     return {key: value for key, value in values.items() if key[0] not in hints.addresses}
 
 
-def parameters(drives: BusDrives) -> list[Entry]:
+def parameters(drives: DescribedAxes) -> list[Entry]:
     """Return the entries that are parameters of a drive."""
     known = drives.description
     further = known.of_further_axes()  # an EDS may list them all: their commands are those of the first axis
@@ -105,7 +107,7 @@ def parameters(drives: BusDrives) -> list[Entry]:
     ]
 
 
-def read_parameters(drives: BusDrives, axis: int = 0) -> dict[Key, int]:
+def read_parameters(drives: DescribedAxes, axis: int = 0) -> dict[Key, int]:
     """Return all parameters of an axis that the drive has; what it refuses to show is left out."""
     found = {}
     for entry in parameters(drives):
@@ -114,7 +116,7 @@ def read_parameters(drives: BusDrives, axis: int = 0) -> dict[Key, int]:
     return found
 
 
-def compare(drives: BusDrives, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
+def compare(drives: DescribedAxes, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
     """Return where an axis differs from wanted values."""
     differences = []
     for key, value in wanted.items():
@@ -128,7 +130,7 @@ def compare(drives: BusDrives, wanted: Mapping[Key, int], axis: int = 0) -> list
     return differences
 
 
-def write_all_or_none(drives: BusDrives, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
+def write_all_or_none(drives: DescribedAxes, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
     """Write what differs, read everything back, and take it all back if anything fails; return what was changed.
 
     Raises:
@@ -155,13 +157,13 @@ def write_all_or_none(drives: BusDrives, wanted: Mapping[Key, int], axis: int = 
     return changes
 
 
-def check_at_rest(drives: BusDrives, wanted: Iterable[Key], axis: int = 0) -> None:
+def check_at_rest(drives: DescribedAxes, wanted: Iterable[Key], axis: int = 0) -> None:
     """Raise NotRestoredError if a drive may turn an axis that these parameters touch."""
     if any(_is_live(drives, other) for other in _affected(drives, wanted, axis)):
         raise NotRestoredError("the axis is enabled, and parameters are not exchanged under way; disable it first")
 
 
-def _affected(drives: BusDrives, wanted: Iterable[Key], axis: int) -> Iterable[int]:
+def _affected(drives: DescribedAxes, wanted: Iterable[Key], axis: int) -> Iterable[int]:
     """Return the axes that a change touches: how a node talks is of all its axes."""
     count = drives.description.num_axes
     if all(index >= _DEVICE_OBJECTS and cia402.of_first_axis(index) == index for index, _ in wanted):
@@ -169,11 +171,11 @@ def _affected(drives: BusDrives, wanted: Iterable[Key], axis: int) -> Iterable[i
     return range(axis - axis % count, axis - axis % count + count)
 
 
-def _is_live(drives: BusDrives, axis: int) -> bool:
+def _is_live(drives: DescribedAxes, axis: int) -> bool:
     return bool(cia402.is_live(int(drives.read_axis(drives.description.dictionary.find(cia402.STATUSWORD), axis))))
 
 
-def _roll_back(drives: BusDrives, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:
+def _roll_back(drives: DescribedAxes, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:
     why = "interrupted" if isinstance(cause, KeyboardInterrupt) else str(cause)
     try:
         with held_signals():  # a second Ctrl-C would leave a mixture
@@ -194,7 +196,7 @@ def _roll_back(drives: BusDrives, before: Mapping[Key, int], axis: int, cause: B
     raise NotRestoredError(f"{why}; everything was taken back, the drive is as it was") from cause
 
 
-def _pdos_of(drives: BusDrives, changes: list[Difference]) -> list[Key]:
+def _pdos_of(drives: DescribedAxes, changes: list[Difference]) -> list[Key]:
     """Return all that belongs to the PDOs that change: they are switched off for it, and emptied."""
     bases = {_pdo_of(change.entry.index) for change in changes} - {None}
     images = {_assignment_of(change.entry.index) for change in changes} - {None}
@@ -205,12 +207,12 @@ def _pdos_of(drives: BusDrives, changes: list[Difference]) -> list[Key]:
     ]
 
 
-def read_these(drives: BusDrives, keys: Iterable[Key], axis: int) -> dict[Key, int]:
+def read_these(drives: DescribedAxes, keys: Iterable[Key], axis: int) -> dict[Key, int]:
     """Return objects of an axis as they are now."""
     return {key: int(drives.read_axis(drives.description.dictionary.find(key), axis)) for key in keys}
 
 
-def _write(drives: BusDrives, changes: Mapping[Key, int], before: Mapping[Key, int], axis: int) -> None:
+def _write(drives: DescribedAxes, changes: Mapping[Key, int], before: Mapping[Key, int], axis: int) -> None:
     for key, value in _in_order(changes, before):
         drives.write_axis(drives.description.dictionary.find(key), axis, value)
 

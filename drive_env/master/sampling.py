@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drive_env.master.link import Link, Outputs, Samples
+from drive_env.fieldbus.link import Link, Outputs, Samples
 from drive_env.master.pace import Pace
 
 

@@ -20,6 +20,7 @@ from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.emulator.inside import Inside
     from drive_env.pictures.recording import Recorder, Recording
 
 
@@ -220,17 +221,17 @@ def _load_torque(row: Demonstration, drives: EmulatedDrives) -> float:
         return row.load_torque
     if row.mode == "cst":
         return 0.0  # nothing would hold against it
-    return -LOAD_SHARE * rated_load_torque(drives)
+    return -LOAD_SHARE * rated_load_torque(drives.inside)
 
 
-def rated_load_torque(drives: EmulatedDrives) -> float:
+def rated_load_torque(inside: Inside) -> float:
     """Return the torque on the load [N*m; N on what moves in a line] that takes the rated torque of a motor."""
     from mechanics.shaft import way
 
-    packed = drives.inside.groups[0].load
+    packed = inside.groups[0].load
     # The disturbance's speed per speed of each rotor; the axis that feels it most.
     lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0])
-    return drives.motor.rated_torque / float(lever.max())
+    return inside.motor.rated_torque / float(lever.max())
 
 
 # --- the TOML ---------------------------------------------------------------------------------------------------------

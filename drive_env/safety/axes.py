@@ -18,7 +18,7 @@ from drive_env.safety.rotor import RotorAngle, wrapped
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 
 BASELINE = 0.008  # s at least between two positions that tell a speed
@@ -61,7 +61,7 @@ class Axes:
         is_counted: Whether 606Ch counts what 6064h counts, per second.
     """
 
-    def __init__(self, drives: BusDrives) -> None:
+    def __init__(self, drives: WatchedDrives) -> None:
         self._drives = drives
         known = drives.description
         self.is_counted = known.has(VELOCITY) and known.dictionary.find(VELOCITY).unit == COUNTED

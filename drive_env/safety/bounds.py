@@ -10,18 +10,18 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
+from drive_env.devices.gains import PI, gain_factors
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context, find_unit, split_unit
-from drive_env.gains import PI, gain_factors
-from drive_env.master.errors import RefusedError
-from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
+from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
+from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.objects import CURRENT, VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 
 POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW = (
@@ -108,7 +108,7 @@ class RotorLimits:
     following: Floats
 
 
-def rotor_limits(limits: Limits, drives: BusDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
+def rotor_limits(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
     """Return what the user's limits are of the rotors now.
 
     Args:
@@ -129,12 +129,12 @@ def rotor_limits(limits: Limits, drives: BusDrives, rotor: RotorAngle, here: Int
     )
 
 
-def _speed_unit(drives: BusDrives) -> str:
+def _speed_unit(drives: WatchedDrives) -> str:
     known = drives.description
     return known.dictionary.find(VELOCITY).unit if known.has(VELOCITY) else ""
 
 
-def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
+def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
     """Return the limits of every axis; those that the user left open are read from the drives.
 
     Args:
@@ -197,7 +197,7 @@ def motion_gains(device: Device | None) -> dict[tuple[str, str], Key]:
     return {(row.loop, row.part): row.key for row in device.gains.rows if row.loop in ("velocity", "position")}
 
 
-def _loops(drives: BusDrives, rotor: RotorAngle) -> tuple[Floats, Floats]:
+def _loops(drives: WatchedDrives, rotor: RotorAngle) -> tuple[Floats, Floats]:
     """Return by how much a demand is ahead, of the speed [s], and the way that a count of current holds [inc]."""
     device, none = drives.device, np.zeros(drives.num_axes)
     keys = motion_gains(device)
@@ -217,7 +217,7 @@ def _reciprocal(value: Floats) -> Floats:
     return np.asarray(np.where(value > 0.0, 1.0 / np.where(value > 0.0, value, 1.0), 0.0), float)
 
 
-def _ampere(drives: BusDrives) -> Floats:
+def _ampere(drives: WatchedDrives) -> Floats:
     """Return how many amperes a count of 6077h is; 0 where its unit tells none."""
     known, device = drives.description, drives.device
     if device is None or CURRENT not in device.bindings or not known.has(CURRENT):
@@ -232,7 +232,7 @@ def _ampere(drives: BusDrives) -> Floats:
 REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filter may show of a rotor at rest
 
 
-def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
+def _own_range(drives: WatchedDrives) -> tuple[Integers, Integers]:
     """Return 607Dh, corrected by the home offset (CiA 402); what is no range is none."""
     low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
     # The ends of the type, which are the factory's, are no limits; neither is an empty range.
@@ -244,7 +244,7 @@ def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
     )
 
 
-def read_own(drives: BusDrives, key: Key, absent: int) -> Integers:
+def read_own(drives: WatchedDrives, key: Key, absent: int) -> Integers:
     """Return an object of every axis, or what stands for it where the drive does not have it, whatever its EDS says."""
     if drives.description.has(key):
         with contextlib.suppress(RefusedError):
@@ -258,7 +258,7 @@ def _at_scale(user: Floats, now: Floats) -> Floats:
     return np.where(np.isfinite(now), np.maximum(np.floor(now + 1e-6), 1.0), user)
 
 
-def _magnitude(drives: BusDrives, user: Floats, key: Key | None) -> Integers:
+def _magnitude(drives: WatchedDrives, user: Floats, key: Key | None) -> Integers:
     """Return the user's limit, or the drive's if it has one; 0 and the end of the type switch the drive's off."""
     if np.isnan(user).any() and key is not None:
         found = read_own(drives, key, NO_LIMIT)
@@ -286,13 +286,13 @@ def increments_per_count(unit: str, rotor: RotorAngle) -> Floats:
     return np.where(scale > 1.0, number * scale / 60.0, np.nan) if base in BY_MINUTE else np.full(len(scale), np.nan)
 
 
-def _slowing(drives: BusDrives, rotor: RotorAngle) -> Floats:
+def _slowing(drives: WatchedDrives, rotor: RotorAngle) -> Floats:
     """Return 6084h, where that is 0 6083h [inc/s^2]."""
     down = _rate(drives, DECELERATION, rotor)
     return np.where(down > 0.0, down, _rate(drives, ACCELERATION, rotor))
 
 
-def _rate(drives: BusDrives, key: Key, rotor: RotorAngle) -> Floats:
+def _rate(drives: WatchedDrives, key: Key, rotor: RotorAngle) -> Floats:
     """Return a deceleration [inc/s^2]; 0 where the drive has none, or counts it in units that we do not know."""
     known = drives.description
     if not known.has(key):

@@ -13,10 +13,10 @@ from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
+from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
 from drive_env.safety.errors import SafetyError
-from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
 from drive_env.safety.objects import (
     CONTROLWORD,
@@ -48,7 +48,7 @@ from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 
 # Objects whose magnitude is a command, and which limit holds it.
@@ -80,7 +80,7 @@ class Commands:
         modes: Returns the mode of operation of every axis.
     """
 
-    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
+    def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._current_limit = drives.description.role(Role.CURRENT_LIMIT)

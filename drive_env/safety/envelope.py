@@ -28,6 +28,7 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
+from drive_env.drives.limits import Limits
 from drive_env.safety import signals
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
@@ -44,7 +45,6 @@ from drive_env.safety.commands import Commands
 from drive_env.safety.errors import SafetyError as SafetyError
 from drive_env.safety.errors import logged
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import Limits
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.objects import (
     CONTROLWORD,
@@ -61,7 +61,7 @@ from drive_env.safety.watchdogs import Watchdogs
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class Envelope:
         ValueError: For limits that do not fit the number of axes.
     """
 
-    def __init__(self, limits: Limits, drives: BusDrives) -> None:
+    def __init__(self, limits: Limits, drives: WatchedDrives) -> None:
         limits.check_axes(drives.num_axes)
         self._drives = drives
         self._known = drives.description.dictionary
@@ -120,7 +120,7 @@ class Envelope:
         """What samples are asked for in: it grows with every controlword."""
         return self._axes.epoch
 
-    # --- what BusDrives calls -------------------------------------------------------------------------------------
+    # --- what drives on a bus call --------------------------------------------------------------------------------
     def change(self, limits: Limits) -> None:
         """Take other limits; those of position are places of the rotors as 6064h shows them now."""
         limits.check_axes(self._drives.num_axes)

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterator
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 
 logger = logging.getLogger(__name__)
 

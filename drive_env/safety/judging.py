@@ -10,9 +10,9 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce, bound_text
 from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, PP, STATUSWORD, VELOCITY
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings

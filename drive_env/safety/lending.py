@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.master.errors import BusError
-from drive_env.master.tidying import Tidying
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.tidying import Tidying
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class Lending:
         left_alone: Axes that nobody moves here: they keep what they have.
     """
 
-    def __init__(self, drives: BusDrives) -> None:
+    def __init__(self, drives: WatchedDrives) -> None:
         self.left_alone: frozenset[int] = frozenset()
         self._drives = drives
         self._loans: dict[tuple[Key, int], Loan] = {}

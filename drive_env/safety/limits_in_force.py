@@ -9,7 +9,8 @@ import numpy as np
 
 from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
-from drive_env.master.errors import RefusedError
+from drive_env.drives.limits import NO_LIMIT, Limits
+from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
     FOLLOWING_WINDOW,
@@ -24,13 +25,12 @@ from drive_env.safety.bounds import (
     rotor_limits,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT, Limits
 from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
 from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 
 STOP_WITHIN = 1.0  # s from the highest speed allowed by the quick stop's ramp; what ramps slower may turn no faster
@@ -55,7 +55,7 @@ class LimitsInForce:
         latest: The limits as they were read last; None since something changed that they depend on.
     """
 
-    def __init__(self, user: Limits, drives: BusDrives, axes: Axes, lending: Lending) -> None:
+    def __init__(self, user: Limits, drives: WatchedDrives, axes: Axes, lending: Lending) -> None:
         self.user = user
         self.latest: Bounds | None = None
         self._generation = 0

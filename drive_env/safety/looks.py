@@ -10,15 +10,15 @@ import numpy as np
 
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 
 UNSAMPLED = 0.010  # s between two looks at what no PDO carries
@@ -26,7 +26,7 @@ ASK, ASK_AGAIN = 0.015, 0.010  # s for an answer to a look, where time passes, a
 SILENT = 0.05  # s for which one that did not answer is not asked again: it must not hold up the others
 
 
-def answer_time(drives: BusDrives, usual: float = ASK) -> float:
+def answer_time(drives: WatchedDrives, usual: float = ASK) -> float:
     """Return how long to wait for an answer to a look [s]: where time waits, nothing runs on meanwhile."""
     return drives.description.answer_timeout if drives.time_waits else usual
 
@@ -43,7 +43,7 @@ class Looks:
 
     def __init__(
         self,
-        drives: BusDrives,
+        drives: WatchedDrives,
         axes: Axes,
         limits: LimitsInForce,
         observe: Callable[[Mapping[Key, Integers], int, Mask], None],

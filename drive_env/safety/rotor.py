@@ -9,12 +9,12 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
-from drive_env.master.description import Description
-from drive_env.master.errors import RefusedError
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.errors import RefusedError
 from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 
 HOME_OFFSET = (cia402.HOME_OFFSET, 0)
@@ -77,7 +77,7 @@ def _own_ratio(description: Description) -> PositionScale | None:
     return ratio if ratio is not None and all(description.has(key) for key in ratio.keys) else None
 
 
-def read_ratio(drives: BusDrives) -> Floats:
+def read_ratio(drives: WatchedDrives) -> Floats:
     """Return the rpm of a velocity unit of every axis; 1 of drives that have no such unit."""
     ratio = _own_ratio(drives.description)
     if ratio is None:
@@ -98,7 +98,7 @@ def _position_objects(description: Description) -> tuple[Key, ...]:
     )
 
 
-def read_scale(drives: BusDrives) -> Floats:
+def read_scale(drives: WatchedDrives) -> Floats:
     """Return the increments of a revolution of every axis; nan where the drive does not say."""
     keys = _position_objects(drives.description)
     known = drives.description.dictionary

@@ -21,9 +21,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from drive_env.cia402 import Key
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN
 from drive_env.safety.objects import CSP, CSV, CURRENT, HM, IP, PP, TORQUE_MODES
 from mechanics.arrays import Floats, Integers, Mask

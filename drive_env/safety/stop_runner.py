@@ -13,11 +13,11 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
+from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import increments_per_count, read_own
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.looks import answer_time
 from drive_env.safety.objects import (
@@ -36,7 +36,7 @@ from drive_env.safety.stopping import GRACE, REPEAT, SHARE, AxisStop, Phase, Sam
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class StopRunner:
     """
 
     def __init__(
-        self, drives: BusDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
+        self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
     ) -> None:
         self.current: Stop | None = None
         self._drives = drives

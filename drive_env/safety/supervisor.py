@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
-from drive_env.master.errors import BusError
+from drive_env.fieldbus.errors import BusError
 from drive_env.safety.axes import Axes
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.judging import Judging
@@ -29,7 +29,7 @@ from drive_env.safety.watchdogs import Watchdogs
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class Watch:
 
     def __init__(
         self,
-        drives: BusDrives,
+        drives: WatchedDrives,
         axes: Axes,
         limits: LimitsInForce,
         stops: StopRunner,

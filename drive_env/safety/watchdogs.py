@@ -10,18 +10,18 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.master.errors import BusError
-from drive_env.master.link import NoWatchdogError
+from drive_env.drives.limits import NO_LIMIT
+from drive_env.fieldbus.errors import BusError
+from drive_env.fieldbus.link import NoWatchdogError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CONTROLWORD, STATUSWORD
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
+    from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class Watchdogs:
         lending: What the drives have for a while, and get back before their watchdogs are given up.
     """
 
-    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
+    def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._axes = axes

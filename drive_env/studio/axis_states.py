@@ -11,17 +11,16 @@ from drive_env import cia402
 from drive_env.cia402 import Key, State
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.quantities import SHOWN, UNITS, Scale, find_unit, scales_of
 from drive_env.dictionary.roles import Role
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.drives.limit_at_rest import SAYS, LimitAtRest
-from drive_env.master.quantities import SHOWN, UNITS, Scale, find_unit
 from drive_env.studio.fault_texts import FaultText, fault_text
 from drive_env.studio.recorder import ScopeRecorder
-from drive_env.studio.scales import axis_scales
 
 if TYPE_CHECKING:
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
 
 SLOW = 0.5  # s between two readings of what changes slowly
 QUICK = 0.08  # s between two pictures of what is sampled
@@ -124,7 +123,7 @@ class AxisStates:
 
     def __init__(self, drives: Drives, description: Description) -> None:
         self._known = description
-        self.scales: list[Scale] = axis_scales(drives, description)
+        self.scales: list[Scale] = scales_of(drives, description.dictionary)
         self.sampled: tuple[Key, ...] = tuple((index, 0) for index in SAMPLED if description.has((index, 0)))
         self._slow_at = self._quick_at = -1e9
         self._slow_entries = [entry for entry in description.dictionary if _is_slow(entry, description)]
@@ -253,7 +252,9 @@ def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
     """Return what an emulated machine tells besides the drive, nothing of a real one."""
     if drives.machine is None:
         return ()
-    winding, stage = drives.machine.temperatures
+    from drive_env.emulator.emulated_drives import emulated_of
+
+    winding, stage = emulated_of(drives).machine.temperatures
     return (
         ShownQuantity("Winding temperature (emulated)", round(float(winding[axis]), 1), "°C"),
         ShownQuantity("Stage temperature (emulated)", round(float(stage[axis]), 1), "°C"),

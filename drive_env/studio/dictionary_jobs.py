@@ -13,14 +13,16 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.commands.parameters import SAVE, checked_origin, load_parameters, parameters_text
+from drive_env.dictionary import quantities
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits, check_writable
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.quantities import Scale
 from drive_env.drives.interface import Drives
-from drive_env.master import quantities
 from drive_env.master.identity import check_same_drive, read_identity
+from drive_env.master.parameter_files import checked_origin, load_parameters, parameters_text
 from drive_env.master.parameters import (
+    SAVE,
     Difference,
     check_no_commands,
     compare,
@@ -28,12 +30,11 @@ from drive_env.master.parameters import (
     read_parameters,
     write_all_or_none,
 )
-from drive_env.master.quantities import Scale
-from drive_env.studio.single_axes import SingleAxes
+from drive_env.master.single_axes import SingleAxes
 from drive_env.whole_file import sealed
 
 if TYPE_CHECKING:
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
 
 # Targets by which an axis turns without an end.
 ON_AND_ON = (
@@ -143,7 +144,7 @@ def store(axis: int) -> Callable[[Drives], None]:
 
 def snapshot(known: Description, axis: int) -> Callable[[Drives], dict[Key, int]]:
     """Return the job that reads all parameters of an axis."""
-    return lambda drives: read_parameters(SingleAxes(drives, known).as_bus(), axis)
+    return lambda drives: read_parameters(SingleAxes(drives, known), axis)
 
 
 def factory(known: Description) -> dict[Key, int]:
@@ -163,14 +164,14 @@ class _DescriptionAlone:
 
 def differences(known: Description, wanted: Mapping[Key, int], axis: int) -> Callable[[Drives], list[Difference]]:
     """Return the job that compares an axis with values."""
-    return lambda drives: compare(SingleAxes(drives, known).as_bus(), wanted, axis)
+    return lambda drives: compare(SingleAxes(drives, known), wanted, axis)
 
 
 def backup(known: Description, axis: int) -> Callable[[Drives], str]:
     """Return the job that makes a backup file of an axis, as `drive-env backup` does."""
 
     def job(drives: Drives) -> str:
-        axes = SingleAxes(drives, known).as_bus()
+        axes = SingleAxes(drives, known)
         return sealed(parameters_text(axes, axis, read_parameters(axes, axis)))
 
     return job
@@ -202,10 +203,10 @@ def restore(
             wanted = load_parameters(path, known.dictionary)
             written, axis_then = checked_origin(path, unchecked=unchecked)
         check_no_commands(wanted, name, known.hints)
-        check_same_drive(name, written, read_identity(axes.as_bus()), other_drive=other_drive)
+        check_same_drive(name, written, read_identity(axes), other_drive=other_drive)
         if axis_then not in (None, axis) and not other_drive:
             raise ValueError(f"{name} was read from axis {axis_then}, and this is axis {axis}; nothing was written")
-        return write_all_or_none(axes.as_bus(), wanted, axis)
+        return write_all_or_none(axes, wanted, axis)
 
     return job
 

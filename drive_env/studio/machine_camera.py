@@ -94,7 +94,7 @@ class MachineCamera:
         from drive_env.pictures.render import reachable_poses
         from drive_env.pictures.scene import Scene
 
-        load = self._session.glimpse(lambda machine: machine.drives.load)
+        load = self._session.glimpse(lambda machine: machine.load)
         assert load is not None, "there was a machine to draw"
         try:
             self._scene = Scene(load.mjcf, WIDTH, HEIGHT, reachable_poses(load), quick=True)

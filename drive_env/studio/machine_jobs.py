@@ -40,8 +40,10 @@ def begin_fault(name: str, duration: float | None, when: str, given: Mapping[str
     """Return the job that lets something fail, and returns the fault's number."""
 
     def job(drives: Drives) -> int:
+        from drive_env.emulator.emulated_drives import emulated_of
+
         numbers: Any = dict(given)
-        return machine_of(drives).fault(name, duration=duration, when=when, **numbers)
+        return emulated_of(drives).machine.fault(name, duration=duration, when=when, **numbers)
 
     return job
 
@@ -50,7 +52,9 @@ def end_fault(number: int | None) -> Callable[[Drives], None]:
     """Return the job that ends a fault, None all of them; one that is over already is no error."""
 
     def job(drives: Drives) -> None:
-        machine = machine_of(drives)
+        from drive_env.emulator.emulated_drives import emulated_of
+
+        machine = emulated_of(drives).machine
         if number is None or any(fault.number == number for fault in machine.faults()):
             machine.clear_fault(number)
 

@@ -83,11 +83,10 @@ def know(machine: Machines) -> KnownMachine:
     """Return what is read of a machine once."""
     from drive_env.pictures.demonstration import rated_load_torque
 
-    made = machine.drives
-    meanings = {f"load.{one.name}": one.meaning for one in made.load.parameters}
+    meanings = {f"load.{one.name}": one.meaning for one in machine.load.parameters}
     return KnownMachine(
-        dict(machine.parameter_rows), meanings, machine.possible_faults, made.load.disturbance_unit,
-        rated_load_torque(made), float(machine.supply[0]),
+        dict(machine.parameter_rows), meanings, machine.possible_faults, machine.load.disturbance_unit,
+        rated_load_torque(machine.inside), float(machine.supply[0]),
     )  # fmt: skip
 
 

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
+from drive_env.dictionary import quantities
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives
 from drive_env.drives.lent_object import lent
-from drive_env.master import quantities
 from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
     from drive_env.studio.session import Session
 
 MotionJob = Callable[[Drives], None]

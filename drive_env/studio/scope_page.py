@@ -14,9 +14,9 @@ from nicegui import run, ui
 from nicegui.events import GenericEventArguments
 
 from drive_env import cia402
+from drive_env.dictionary import quantities
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
-from drive_env.master import quantities
 from drive_env.studio.page import StudioPage
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
 from drive_env.studio.scope_trigger import EDGES, ScopeTrigger

@@ -14,7 +14,7 @@ import numpy as np
 
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
-from drive_env.master.quantities import SHOWN, UNITS, Scale, find_unit
+from drive_env.dictionary.quantities import SHOWN, UNITS, Scale, find_unit
 from drive_env.studio.decimation import min_max, stride_of
 from drive_env.studio.recorder import GAP, RingSamples, ScopeRecorder
 from drive_env.studio.scope_trigger import ScopeTrigger, first_fired

@@ -18,7 +18,7 @@ _REMEDIES = (
 def sentence(error: BaseException) -> str:
     """Return an error as a sentence; one that is a mistake of this program is logged with its traceback."""
     from drive_env.dictionary.aborts import ObjectAccessError
-    from drive_env.master.errors import BusError
+    from drive_env.fieldbus.errors import BusError
     from drive_env.safety.errors import SafetyError
     from drive_env.studio.errors import JobEndedError
 

@@ -23,11 +23,12 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.quantities import Scale
 from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.master.parameters import parameters
-from drive_env.master.quantities import Scale
+from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
@@ -35,12 +36,11 @@ from drive_env.studio.presence import Presence
 from drive_env.studio.recorder import ScopeRecorder
 from drive_env.studio.sentences import sentence
 from drive_env.studio.shared_drives import PIECE, SharedDrives
-from drive_env.studio.single_axes import SingleAxes
 from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
 
 logger = logging.getLogger(__name__)
 
@@ -261,8 +261,10 @@ class Session:
         shared = self._drives
         if shared is None or shared.machine is None or not shared.lock.acquire(timeout=patience):
             return None
+        from drive_env.emulator.emulated_drives import emulated_of
+
         try:
-            return function(shared.machine)
+            return function(emulated_of(shared).machine)
         finally:
             shared.lock.release()
 
@@ -354,7 +356,7 @@ class Session:
         assert self._drives is not None
         drives = self._drives
         self.stored = {axis: {} for axis in range(self.num_axes)}
-        for entry in parameters(SingleAxes(drives, self.description).as_bus()):
+        for entry in parameters(SingleAxes(drives, self.description)):
             key = (entry.index, entry.sub)
             with contextlib.suppress(ObjectAccessError):
                 for axis, value in enumerate(drives.read(key).tolist()):

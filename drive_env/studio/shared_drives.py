@@ -10,8 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,6 +20,7 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import object_names, whole_cycles
+from drive_env.drives.drives_proxy import DrivesProxy
 from drive_env.drives.interface import Drives
 from drive_env.drives.trace import Trace
 from drive_env.safety.errors import SafetyError
@@ -29,13 +29,8 @@ from drive_env.studio.recorder import ScopeRecorder
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.devices import Device
     from drive_env.dictionary.entries import ObjectName
     from drive_env.drives.emergency import EmergencyMessage
-    from drive_env.drives.observed import Observer
-    from drive_env.emulator.machine import Machines
-    from drive_env.master.bus_drives import BusDrives
-    from drive_env.safety.envelope import Envelope
 
 PIECE = 0.02  # s of emulated time between two looks at whether to go on
 BUS_PIECE = 0.1  # s of a recording on a bus, where nothing is played
@@ -67,7 +62,7 @@ def _operates(value: ArrayLike) -> bool:
     return bool(np.any((words & 0x0F == cia402.ENABLE_OPERATION) & (words & cia402.HALT == 0)))
 
 
-class SharedDrives:
+class SharedDrives(DrivesProxy):
     """Drives whose calls end when their job is stopped.
 
     Args:
@@ -96,10 +91,10 @@ class SharedDrives:
         moves: Callable[[], bool],
         stopped: Callable[[], str],
     ) -> None:
+        super().__init__(drives)
         self.lock = threading.RLock()
         self.paced = True
         self.moved: Mask = np.zeros(drives.num_axes, bool)
-        self._drives = drives
         self._recorder = recorder
         self._look = look
         self._hear = hear
@@ -112,46 +107,6 @@ class SharedDrives:
         self._start = time.monotonic()
 
     # --- the interface --------------------------------------------------------------------------------------------
-    @property
-    def num_axes(self) -> int:
-        """Number of axes."""
-        return self._drives.num_axes
-
-    @property
-    def device(self) -> Device | None:
-        """What the drives are."""
-        return self._drives.device
-
-    @property
-    def machine(self) -> Machines | None:
-        """The emulated machines' side."""
-        return self._drives.machine
-
-    @property
-    def bus(self) -> BusDrives | None:
-        """The same drives as those of a bus: for descriptions; its calls are not recorded, and cannot be stopped."""
-        return self._drives.bus
-
-    @property
-    def safety(self) -> Envelope | None:
-        """What watches over drives that may be real."""
-        return self._drives.safety
-
-    @property
-    def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called."""
-        return self._drives.axis_numbers
-
-    @property
-    def time_waits(self) -> bool:
-        """Whether time stands still until it is asked to pass."""
-        return self._drives.time_waits
-
-    @property
-    def observers(self) -> tuple[Observer, ...]:
-        """Who looks at these drives."""
-        return self._drives.observers
-
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis."""
         self._look()
@@ -218,13 +173,8 @@ class SharedDrives:
     def close(self) -> None:
         """Do nothing: the session closes its drives."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *_: object) -> None:
+        """Do nothing, as `close` does."""
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _calling(self, call: Callable[[], T]) -> T:

@@ -20,7 +20,7 @@ from drive_env.devices.gain_set import ClosedLoop
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
-from drive_env.gains import read_gains, write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified, Trials

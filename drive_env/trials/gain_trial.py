@@ -17,8 +17,8 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import write_gains
 from drive_env.motors import Motor
 from drive_env.saved_state import Saved
 from drive_env.trials.demand import computed, is_recorded

@@ -21,8 +21,8 @@ from drive_env.devices import Device
 from drive_env.devices.gain_set import LOAD_DETECTION
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, axis_number, device_of
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import holding_torque, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.devices.gain_set import LOAD_DETECTION, PID_ALONE
-from drive_env.gains import (
+from drive_env.devices.gains import (
     BASELINE_RULE,
     bandwidth_gains,
     rule_gains,

@@ -42,10 +42,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.devices.gains import has_linear_model, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import WIRING
-from drive_env.gains import has_linear_model, small_time_constants, write_gains
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
 from drive_env.loops.true_plant import elastic_lags, true_machines

@@ -13,7 +13,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.certificate.certificate import TAKEN, Correction

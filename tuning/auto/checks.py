@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from drive_env.devices import Device
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.target import Target
 
 SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import cascade_columns
+from drive_env.devices.gains import cascade_columns
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost

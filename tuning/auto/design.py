@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from drive_env.devices.gains import Part, cascade_columns, integers_per_si, small_time_constants
 from drive_env.dictionary.roles import Role
-from drive_env.gains import Part, cascade_columns, integers_per_si, small_time_constants
 from drive_env.trials.score import robust_cost
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.loop_margins import measured_axis

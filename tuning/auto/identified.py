@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import bandwidth_gains, rule_gains
+from drive_env.devices.gains import bandwidth_gains, rule_gains
+from drive_env.fieldbus.errors import BusError
 from drive_env.loops.linear_model import Plant
-from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
 from mechanics.arrays import Integers, Mask
 from tuning.auto.checks import identified_plant, unsafe_gains
 from tuning.auto.stages import Basis, IdentifiedAxes
-from tuning.identify.estimate import TITLES
+from tuning.identify.identified_axis import TITLES
 from tuning.identify.working_state import cautious_bandwidth
 from tuning.target import Target
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
 
 Identify = Callable[[Target, Mask], "list[Identification]"]  # of the axes where the mask is true
 

@@ -50,7 +50,7 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     if not axes.any():
         return {}
     machine = machine_of(drives)
-    packed = one(machine.drives.load)
+    packed = one(machine.load)
     # On the load, where it disturbs: the axis with the longest lever feels the share.
     lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
     off = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)

@@ -11,17 +11,17 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
+from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
-from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from mechanics.arrays import Integers, Mask
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis
+from tuning.auto.model_bounds import at_least_by_model, why_unbounded
 from tuning.auto.proving import STEP_SIZE
 from tuning.auto.trying import BY_TRIAL, watch_following
 from tuning.response.measured_loop import GOOD_MISFIT, merged
-from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from drive_env.loops.sampled import OuterLoops
     from drive_env.motors import Motor
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.target import Target
 
 # Of the mass matrix over the axes' own inertia: a share that measures as much without being there, and the least own
@@ -195,7 +195,7 @@ def corner(device: Device, plant: Plant) -> float:
 
     An emulated drive has no delay besides its own; low frequencies hardly distinguish the two lags.
     """
-    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING
+    from drive_env.devices.gains import VELOCITY_FILTER_DAMPING
 
     lag = VELOCITY_FILTER_DAMPING / math.pi
     more = plant.delay - 1.0 / device.velocity_rate

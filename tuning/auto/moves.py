@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from mechanics.arrays import Mask
 from tuning.auto.bench import LOOK_BACK_TIME

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import check_linear_model
+from drive_env.devices.gains import check_linear_model
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
+from drive_env.devices.gains import small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
+from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.trace import Trace
-from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trials, measured_cost, softness
@@ -40,7 +41,7 @@ from drive_env.trials.positioning import (
 )
 from drive_env.trials.score import TRIP, Terms, cost
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.fallback_gains import FallbackGains
+from tuning.fallback_gains import FallbackGains
 from tuning.link_energy import bearable_speed, trial_reach
 from tuning.oscillation_watch import SOFTER
 from tuning.stop_causes import UNTOLD, stop_causes

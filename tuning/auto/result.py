@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tuning.auto.proving import Shown
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.certificate.certificate import Correction, StepResponse
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from drive_env import cia402, motion
 from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from mechanics.arrays import Integers, Mask
 from tuning.identify.wiring import changes, corrected, findings
 from tuning.identify.working_state import BOTH_ENDS

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.certificate.certificate import StepResponse
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.bench import TRIAL_TIME
 from tuning.auto.proving import ProvingGround

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.gains import integers_per_si
+from drive_env.devices.gains import integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
 # quarter of a second that the robust cost looks at.

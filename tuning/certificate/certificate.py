@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drive_env.devices.gain_set import Gain
     from drive_env.loops.margins import Margins
     from drive_env.motors import Motor
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import AtLeast
     from tuning.target import Target
 
@@ -286,7 +286,7 @@ def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, f
 
     For an I gain the integration time T_i is given.
     """
-    from drive_env.gains import PI, gains_in_si
+    from drive_env.devices.gains import PI, gains_in_si
 
     if device.gains.cascade != PI:
         return {}

@@ -10,6 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from tuning.response.bode import PHASES, draw_margins, within_a_turn
+
 if TYPE_CHECKING:
     from tuning.certificate.certificate import FrequencyResponse, StepResponse
 
@@ -17,7 +19,6 @@ TRUSTED = 0.95  # coherence; what lies below is shown as doubtful, not as truth
 BEFORE, AFTER, DOUBTFUL = "#d55e00", "#0072b2", "#b8b8b8"
 DPI = 110
 MARGINS = ("phase margin at [Hz]", "phase margin [deg]", "gain margin at [Hz]", "gain margin [dB]")
-PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, which leads, does not wrap
 
 
 def step_picture(steps: Sequence[StepResponse]) -> Figure:
@@ -76,20 +77,6 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
     for axes in (magnitude, phase, coherence):
         axes.grid(True, which="both", alpha=0.25)
     return figure
-
-
-def within_a_turn(phase: np.ndarray) -> np.ndarray:
-    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180 degrees."""
-    return np.asarray((phase - PHASES[0]) % 360.0 + PHASES[0])
-
-
-def draw_margins(
-    magnitude: Axes, phase: Axes, phase_hz: float, phase_deg: float, gain_hz: float, gain_db: float, color: str
-) -> None:
-    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it was measured."""
-    for axes, at, line, size in ((phase, phase_hz, -180.0, phase_deg), (magnitude, gain_hz, 0.0, -gain_db)):
-        if np.isfinite(at) and np.isfinite(size):
-            axes.plot([at, at], [line, line + size], color=color, linewidth=2.2, marker="_", solid_capstyle="butt")
 
 
 def _curve(axes: Axes, f: np.ndarray, y: np.ndarray, trusted: np.ndarray, color: str, label: str) -> None:

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from drive_env.devices import find_device
 from tuning.certificate.certificate import CROSSOVERS, CertificateError
 from tuning.certificate.certificate_pictures import bode_picture, step_picture
-from tuning.identify.estimate import TITLES, interval
+from tuning.estimate import interval
+from tuning.identify.identified_axis import TITLES
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet

@@ -52,7 +52,7 @@ def auto(
     state before, certificate.json and report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
-        from tuning.auto.run_to_files import BEFORE, auto_to_files, commission_to_files
+        from tuning.auto_to_files import BEFORE, auto_to_files, commission_to_files
         from tuning.runs import provenance
         from tuning.way_back import way_back
 
@@ -124,7 +124,7 @@ def _not_kept(target: Target) -> str:
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
-    from drive_env.gains import cascade_columns
+    from drive_env.devices.gains import cascade_columns
 
     if json:
         names = target.device.gains.names

@@ -25,11 +25,12 @@ from tuning.commands.options import (
     tell_before,
     unchanged,
 )
-from tuning.identify.estimate import TITLES, interval
+from tuning.estimate import interval
+from tuning.identify.identified_axis import TITLES
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
 K_T_NOTE = (
     "Inertia, friction and load are measured as current: an inertia is the measured\nJ/K_t times the data sheet's K_t."
 )

@@ -143,7 +143,7 @@ def optimise(
         if resume:
             _check_unfinished(folder, journal)
         provenance.check_folder(folder)
-        from drive_env.gains import has_linear_model
+        from drive_env.devices.gains import has_linear_model
         from drive_env.trials.method import check_tried
 
         device = find_device(drive.device)

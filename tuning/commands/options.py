@@ -190,7 +190,7 @@ class DriveOptions:
     def check_linear_model(self) -> None:
         """Raise ValueError for a drive whose loops are not those of the linear model, before anybody is asked."""
         from drive_env.devices import find_device
-        from drive_env.gains import check_linear_model
+        from drive_env.devices.gains import check_linear_model
 
         check_linear_model(find_device(self.device))
 
@@ -367,7 +367,7 @@ def asked_dynamics(dynamics: str | None, device: str, inertia_range: str | None 
             stepper.
     """
     from drive_env.devices import find_device
-    from drive_env.gains import has_linear_model
+    from drive_env.devices.gains import has_linear_model
     from drive_env.loops.dynamics import DEFAULT, find_dynamics
 
     found = find_dynamics(DEFAULT if dynamics is None else dynamics, inertia_range)
@@ -418,7 +418,7 @@ def tell_before(file: Path | None) -> None:
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: exit code 1 for errors of drive or bus, 2 for the user's mistake, 130 for Ctrl-C."""
-    from drive_env.master.errors import BusError, RefusedError
+    from drive_env.fieldbus.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
     from tuning.runs.pools import PoolError
 

@@ -25,7 +25,7 @@ from tuning.commands.options import (
     tell_before,
     unchanged,
 )
-from tuning.identify.estimate import TITLES
+from tuning.identify.identified_axis import TITLES
 
 if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
-    from tuning.rules.side_by_side import AxisRules
+    from tuning.compare.side_by_side import AxisRules
     from tuning.snapshot import Transaction
     from tuning.target import Target
 
@@ -70,8 +70,8 @@ def rules(
     parameters before are saved to --snapshot first and restored at the end, except what --apply writes.
     """
     with errors_as_exit_codes():
+        from tuning.compare.side_by_side import AxisRules, identified_plants, proposals, swung_proposals
         from tuning.rules.rules_by_name import RULES
-        from tuning.rules.side_by_side import AxisRules, identified_plants, proposals, swung_proposals
         from tuning.runs.provenance import run_folder
         from tuning.snapshot import check_place
 
@@ -121,7 +121,7 @@ def rules(
 def _as_json(target: Target, axis: AxisRules, dynamics: Dynamics) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from tuning.rules.side_by_side import outer_margins, slacks
+    from tuning.compare.side_by_side import outer_margins, slacks
 
     plant, rows = axis.plant, axis.rows
     if isinstance(plant, str):
@@ -147,7 +147,7 @@ def _as_json(target: Target, axis: AxisRules, dynamics: Dynamics) -> dict[str, A
 
 
 def _print(target: Target, shown: AxisRules, dynamics: Dynamics, axis: int | None) -> None:
-    from tuning.rules.side_by_side import outer_margins, slacks
+    from tuning.compare.side_by_side import outer_margins, slacks
 
     head, plant, rows = "" if axis is None else f"axis {axis}: ", shown.plant, shown.rows
     if isinstance(plant, str):
@@ -204,7 +204,7 @@ def _apply(
     """Write a rule's gains if the user agrees, inside the transaction that is under way, or one of its own."""
     import numpy as np
 
-    from drive_env.gains import write_gains
+    from drive_env.drives.raw_gains import write_gains
     from tuning.rules.rules_by_name import propose
     from tuning.snapshot import Transaction
 

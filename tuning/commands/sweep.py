@@ -104,6 +104,7 @@ def _sweep(
     from tuning.runs import provenance, unfinished
     from tuning.runs.experiment import load_experiment
     from tuning.runs.pools import open_pool
+    from tuning.runs.sweep_files import save_sweep
 
     console = Console()
     provenance.check_folder(folder)
@@ -121,7 +122,7 @@ def _sweep(
                 _note(console, line)
             elsewhere = workers is not None or cluster is not None
             result = _run_with_progress(experiment, console, pool if elsewhere else None, log, folder)
-    result.save(folder)
+    save_sweep(result, folder)
     unfinished.discard(folder)
     _print_result(result, folder)
 

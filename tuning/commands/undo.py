@@ -48,7 +48,7 @@ def undo(
     to these drives. The axes must be disabled. Each axis is written completely or not at all, and read back.
     """
     with errors_as_exit_codes():
-        from drive_env.master.errors import BusError
+        from drive_env.fieldbus.errors import BusError
         from tuning.snapshot import load_snapshot
         from tuning.way_back import what_is_changed
 

@@ -33,7 +33,7 @@ from tuning.search.trial_bench import read_gains
 from tuning.target import Target
 
 if TYPE_CHECKING:
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.runs.pools import Pool
 
 Progress = Callable[[str, float], None]

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drive_env.gains import has_linear_model, integers_per_si
+from drive_env.devices.gains import has_linear_model, integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.whole_file import write_table
 from mechanics.arrays import Floats, Integers, Mask

@@ -22,12 +22,12 @@ import numpy as np
 from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.envs.randomisation import laws_of, shipped
 from drive_env.motors import find_motor
+from drive_env.randomisation.random_machines import laws_of, shipped
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
 from mechanics.untrusted import read_toml
-from tuning.identify.linked_axes import are_linked
+from tuning.linked_axes import are_linked
 from tuning.runs.inputs import files_of, is_path, is_shipped, taken
 from tuning.target import Target
 from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of

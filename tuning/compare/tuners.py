@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import DEFAULT
 from mechanics.arrays import Integers
 from tuning.outcome import Outcome, Tuner
@@ -25,7 +25,7 @@ from tuning.target import Target, timed
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
     from tuning.rules.proposal import Proposal
 
 ENTRY_POINTS = "drive_env.tuners"

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices.gains import has_linear_model, rule_gains
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
-from drive_env.gains import has_linear_model, rule_gains
 from drive_env.loops.dynamics import DEFAULT, Dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines

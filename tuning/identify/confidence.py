@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from scipy import stats
 
-from tuning.identify.estimate import Estimate
+from tuning.estimate import Estimate
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

@@ -22,7 +22,7 @@ from drive_env.drives.currents import to_counts
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Mask
-from tuning.identify.estimate import Estimate, refused
+from tuning.estimate import Estimate, refused
 from tuning.identify.wiring import Halls, judge_halls
 from tuning.identify.working_state import BY_FIELD, Working, enable, read_role, still_enabled, switch_off
 from tuning.oscillation_watch import shaken

@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
+from drive_env.devices.gains import bandwidth_gains, check_linear_model
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.identify.dead_time import dead_time_resistance
+from tuning.estimate import Estimate, refused
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
-from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
+from tuning.identify.identified_axis import NAMES, Identification, Progress
 from tuning.identify.inertia import Mechanics, identify_mechanics
 from tuning.identify.standstill import standstill_resistances
 from tuning.identify.winding import Winding, identify_winding, pulse, to_torque_mode
@@ -39,6 +40,7 @@ from tuning.identify.working_state import (
 )
 from tuning.lateness import is_distorted, late_first, told_lateness
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken, watch_of
+from tuning.response.dead_time import dead_time_resistance
 from tuning.response.frequency_response import Signal, measure
 from tuning.stop_causes import stop_causes
 from tuning.target import Target, timed

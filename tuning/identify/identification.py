@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mechanics.arrays import Mask
-from tuning.identify.estimate import Identification, Progress
 from tuning.identify.experiments import Experiments
+from tuning.identify.identified_axis import Identification, Progress
 
 if TYPE_CHECKING:
     from tuning.target import Target

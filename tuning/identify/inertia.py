@@ -20,15 +20,16 @@ from typing import NamedTuple
 import numpy as np
 
 from drive_env import cia402
+from drive_env.devices.gains import as_chip
 from drive_env.dictionary.units import RPM
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import as_chip, write_gains
 from drive_env.motors import Motor
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
+from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
-from tuning.identify.estimate import Estimate, refused
 from tuning.identify.momentum_balance import BalanceRows, Motion, Solved, balance_rows, motion, solve, step
 from tuning.identify.transmission_loss import find_losses, friction_of_whole_ways
 from tuning.identify.working_state import GUESS, Working, cautious_gains, go_back, still_enabled

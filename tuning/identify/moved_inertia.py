@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.drives.interface import machine_of
+from drive_env.emulator.emulated_drives import emulated_of
 from mechanics.arrays import Floats
 from mechanics.shaft import way
 
@@ -37,6 +38,6 @@ def true_inertia(target: Target) -> Floats:
 
     The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
     """
-    moved = np.concatenate([moved_inertia(group.load) for group in machine_of(target.drives).drives.inside.groups])
+    moved = np.concatenate([moved_inertia(group.load) for group in emulated_of(target.drives).inside.groups])
     share = machine_of(target.drives).parameters["motor.psi_m"] / target.motor.psi_m
     return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))

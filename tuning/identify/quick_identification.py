@@ -17,14 +17,15 @@ import numpy as np
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
 from drive_env.trials.method import method_of
 from drive_env.trials.positioning import longer_way
 from mechanics.arrays import Floats, Mask
+from tuning.estimate import Estimate, refused
 from tuning.identify.encoder_check import PULSED
-from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
+from tuning.identify.identified_axis import NAMES, Identification, Progress
 from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
 from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, read_role, switch_off
 from tuning.link_energy import trial_reach

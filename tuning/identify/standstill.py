@@ -17,12 +17,12 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats
+from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
-from tuning.identify.dead_time import dead_time
 from tuning.identify.encoder_check import able, stay_inside
-from tuning.identify.estimate import Estimate, refused
 from tuning.identify.winding import SUPPLY_IDLE, WIDEST
 from tuning.identify.working_state import BY_FIELD, Working, enable, still_enabled, switch_off
+from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
 
 LEVELS = (0.9, 0.7, 0.5)  # over what may be asked for

@@ -20,15 +20,15 @@ from typing import NamedTuple
 import numpy as np
 
 from drive_env import cia402, motion
+from drive_env.devices.gains import cascade_columns, per_chip
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
-from drive_env.gains import cascade_columns, per_chip
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
+from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
-from tuning.identify.dead_time import dead_time
-from tuning.identify.estimate import Estimate, refused
 from tuning.identify.working_state import Working, still_enabled
+from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
 

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
+from drive_env.devices.gains import bandwidth_gains
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import Drives, axis_number
+from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import bandwidth_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask

@@ -13,10 +13,12 @@ from mechanics.arrays import Complex, Floats
 from tuning.response.measured_loop import COHERENT, MeasuredLoop
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 MEASURED, TRACED, MODEL, GREY = "#0b5cad", "#c2560c", "#222222", "#b5b5b5"
+PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, which leads, does not wrap
 _FINE = 600
 _TICKS = (1, 2, 5, 10, 20, 50, 100, 200, 400, 1000)  # Hz
 
@@ -67,9 +69,21 @@ def _model(response: MeasuredLoop, axis: int, plant: Plant | None) -> tuple[Floa
     return f, loop(response.device, plant, response.gains[axis], f)
 
 
-def _draw_bode(magnitude: Any, phase: Any, response: MeasuredLoop, axis: int, plant: Plant | None) -> None:
-    from tuning.certificate.certificate_pictures import PHASES, draw_margins
+def within_a_turn(phase: np.ndarray) -> np.ndarray:
+    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180 degrees."""
+    return np.asarray((phase - PHASES[0]) % 360.0 + PHASES[0])
 
+
+def draw_margins(
+    magnitude: Axes, phase: Axes, phase_hz: float, phase_deg: float, gain_hz: float, gain_db: float, color: str
+) -> None:
+    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it was measured."""
+    for axes, at, line, size in ((phase, phase_hz, -180.0, phase_deg), (magnitude, gain_hz, 0.0, -gain_db)):
+        if np.isfinite(at) and np.isfinite(size):
+            axes.plot([at, at], [line, line + size], color=color, linewidth=2.2, marker="_", solid_capstyle="butt")
+
+
+def _draw_bode(magnitude: Any, phase: Any, response: MeasuredLoop, axis: int, plant: Plant | None) -> None:
     f, L = response.f, response.open_loop[:, axis]
     good = response.trusted[:, axis]
     seen = np.isfinite(L)
@@ -162,8 +176,6 @@ def _text(value: float, form: str) -> str:
 
 def _turns(L: Complex) -> Floats:
     """Return the phase in degrees, as it is shown."""
-    from tuning.certificate.certificate_pictures import within_a_turn
-
     return within_a_turn(np.degrees(np.angle(L)))
 
 

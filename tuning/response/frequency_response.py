@@ -15,18 +15,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
+from drive_env.devices.gains import check_linear_model
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
-from drive_env.gains import check_linear_model, read_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Complex, Floats, Integers, Mask
-from tuning.identify.dead_time import dead_time_resistance
 from tuning.lateness import told_lateness
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import OscillationError, shaken, watch_of
+from tuning.response.dead_time import dead_time_resistance
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.response.excitation_run import MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.response.held_samples import split, unhold

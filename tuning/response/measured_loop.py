@@ -16,7 +16,7 @@ from mechanics.arrays import Complex, Floats, Integers, Mask
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
-    from tuning.identify.estimate import Estimate
+    from tuning.estimate import Estimate
     from tuning.response.plant_fit import PlantFit
 
 

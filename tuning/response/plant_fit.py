@@ -23,7 +23,7 @@ from tuning.response.held_samples import seen_by_bus
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.identify.estimate import Estimate
+    from tuning.estimate import Estimate
 
 
 LINEAR = 0.01  # share by which the linear model may be off at a line for reasons that repeat: friction, cogging
@@ -252,7 +252,7 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
 
 def _doubted(fit: PlantFit, reason: str) -> PlantFit:
     """Return a fit without its pair."""
-    from tuning.identify.estimate import refused
+    from tuning.estimate import refused
 
     return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in PAIR})
 
@@ -425,7 +425,7 @@ def _cost(loop: _Loop, model: _Model) -> float:
 
 # --- intervals --------------------------------------------------------------------------------------------------------
 def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float) -> PlantFit:
-    from tuning.identify.estimate import Estimate, refused
+    from tuning.estimate import Estimate, refused
 
     (plant, second, loss), residuals, jacobian = solution
     freedom = max(len(residuals) - jacobian.shape[1], 1)
@@ -474,7 +474,7 @@ def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float
 
 def _checked(name: str, estimate: Estimate) -> Estimate:
     """Return an estimate, or its refusal if its interval says nothing."""
-    from tuning.identify.estimate import refused
+    from tuning.estimate import refused
 
     if not estimate.is_known or (estimate.high - estimate.low) / 2.0 <= WIDEST[name] * abs(estimate.value):
         return estimate
@@ -485,6 +485,6 @@ def _checked(name: str, estimate: Estimate) -> Estimate:
 
 
 def _refusal(plant: Plant, reason: str) -> PlantFit:
-    from tuning.identify.estimate import refused
+    from tuning.estimate import refused
 
     return PlantFit(plant, {name: refused(_UNITS[name], reason) for name in NAMES}, math.nan, reason)

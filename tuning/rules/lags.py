@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING, velocity_filter
+from drive_env.devices.gains import VELOCITY_FILTER_DAMPING
+from drive_env.emulator.parameters import velocity_filter
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

@@ -20,7 +20,7 @@ from tuning.rules.proposal import Proposal, Rule, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.gains import Part
+    from drive_env.devices.gains import Part
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from drive_env.gains import Part, check_linear_model, integers_per_si
+from drive_env.devices.gains import Part, check_linear_model, integers_per_si
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from drive_env.gains import check_linear_model
+from drive_env.devices.gains import check_linear_model
 from tuning.rules.cascade import cascade_rule
 from tuning.rules.internal_model import imc_rule, simc_rule
 from tuning.rules.margin_targets import TARGETS, margin_rule

@@ -16,11 +16,11 @@ import numpy as np
 from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.devices.gain_set import LOAD_ANGLE, PID_ON_RAMP, ClosedLoop
+from drive_env.devices.gains import gain_factors
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
 from drive_env.drives.speeds import per_increment_of
-from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.arrays import Integers
 from mechanics.loads import find_load

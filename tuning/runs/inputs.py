@@ -266,7 +266,7 @@ def _check(what: str, name: str | Path) -> None:
 
         find_device(str(name))
     elif what == "distributions":
-        from drive_env.envs.randomisation import Distributions
+        from drive_env.randomisation.random_machines import Distributions
 
         Distributions.load(name)
 

@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, pairwise
-from pathlib import Path
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -26,14 +25,12 @@ from drive_env.drives.trace import Trace
 from drive_env.phase_current import run_and_standby
 from drive_env.trials.open_loop import ENCODER, LOST, NO_WINDOW, TOOTH
 from drive_env.trials.positioning import wrapped
-from drive_env.whole_file import write_picture, write_table, write_whole
 from mechanics.arrays import Floats, Integers, Mask
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
-from tuning.runs import metrics, provenance
+from tuning.runs import metrics
 from tuning.runs.experiment import Experiment, Resolved, label, resolve
 from tuning.runs.experiment import load_experiment as load_experiment
-from tuning.runs.inputs import write_inputs
 from tuning.runs.metrics import MoveRecording
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
@@ -43,7 +40,6 @@ PIECE = 0.02  # s of simulation between two reports of progress
 CLOSING_TIME = 0.6  # s, in which the encoder of a standing rotor is aligned
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
 MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
-ROWS = 65_536  # of results.csv, that are written at a time
 SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
 
 Progress = Callable[[str, float], None]
@@ -103,35 +99,6 @@ class SweepResult:
                                        for g in grids):  # fmt: skip
                 found.append(swept)
         return found
-
-    def save(self, folder: str | Path) -> Path:
-        """Write results.csv, heatmap.png, best_response.png, settings.toml and inputs/ into a new folder and return it.
-
-        The files are complete or absent: they are written beside the folder and moved.
-
-        Raises:
-            FileExistsError: If the folder holds something already.
-            OSError: If it cannot be written.
-        """
-        from tuning.runs import plots
-
-        with provenance.new_folder(folder) as partial:
-            self._write_csv(partial / "results.csv")
-            for name, figure in (("heatmap", plots.heat_map(self)), ("best_response", plots.best_response(self))):
-                write_picture(partial / f"{name}.png", figure, figure.dpi)
-            write_inputs(partial, self.experiment.inputs())
-            write_whole(partial / "settings.toml", provenance.HEADER + self.experiment.to_toml(provenance.versions()))
-        return Path(folder)
-
-    def _write_csv(self, path: Path) -> None:
-        # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
-        columns = [column.astype(int) if column.dtype == bool else column for column in self.columns.values()]
-        rows = (
-            row
-            for first in range(0, len(self.order), ROWS)  # as Python's numbers, a table of a million rows has 600 MB
-            for row in zip(*(column[first : first + ROWS].tolist() for column in columns), strict=True)
-        )
-        write_table(path, chain([list(self.columns)], rows), lineterminator="\n")
 
 
 class Shard(NamedTuple):

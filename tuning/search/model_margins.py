@@ -9,7 +9,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.drives.interface import axis_number
-from drive_env.gains import read_gains
+from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import wrapped

@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drive_env import cia402
-from drive_env.gains import RAW_MAX, check_linear_model, write_gains
+from drive_env.devices.gains import RAW_MAX, check_linear_model
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.trials.method import check_tried
 from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from mechanics.arrays import Integers, Mask
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.search.trial_bench import TrialBench, Tried, read_gains

@@ -10,7 +10,7 @@ import numpy as np
 
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.trials.load_reading import LOWER
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.search.optimise import Optimised, Settings, optimise

@@ -18,8 +18,8 @@ import numpy as np
 from drive_env import cia402, motion
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.load_reading import LOWER, STALL_ANGLE, has_coolstep, lacks_load_detection
 from drive_env.trials.open_loop import encoder_age

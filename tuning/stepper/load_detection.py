@@ -20,8 +20,8 @@ import numpy as np
 from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import run_and_standby
 from drive_env.trials.load_reading import (

@@ -13,7 +13,7 @@ from drive_env.drives.interface import machine_of
 from drive_env.phase_current import LOAD_SHARE, holding_torque
 from drive_env.trials.working_moves import SETTLE, Steady, WorkingMoves
 from mechanics.arrays import Floats, Mask
-from tuning.identify.linked_axes import are_independent
+from tuning.linked_axes import are_independent
 from tuning.stop_causes import told_causes
 from tuning.target import Target
 
@@ -45,7 +45,7 @@ def can_load(target: Target) -> bool:
     from mechanics.shaft import one
 
     machine = target.drives.machine
-    return machine is not None and are_independent(one(machine.drives.load))
+    return machine is not None and are_independent(one(machine.load))
 
 
 def why_not_loaded(target: Target) -> str:
@@ -120,6 +120,5 @@ def _lever(target: Target) -> Floats:
     """Return how a torque on the load turns the rotor of its axis."""
     from mechanics.shaft import one, way
 
-    drives = machine_of(target.drives).drives
-    packed = one(drives.load)
+    packed = one(machine_of(target.drives).load)
     return np.full(target.num_axes, float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()))

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.gains import as_chip, gains_in_si, per_chip
+from drive_env.devices.gains import as_chip, gains_in_si, per_chip
 from tuning.certificate.certificate import SI_UNITS
 from tuning.studio import tune_jobs
+from tuning.studio.tune_panel import TunePanel, card
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.devices.gain_set import Gain
-    from tuning.studio.tune_page import TunePanel
 
 STOPS = 400  # of a slider, from the least to the greatest integer in equal ratios
 
@@ -54,10 +55,12 @@ class GainCard:
 
     Args:
         panel: The page.
+        slid: Called when a slider has moved.
     """
 
-    def __init__(self, panel: TunePanel) -> None:
+    def __init__(self, panel: TunePanel, slid: Callable[[], None]) -> None:
         self._panel = panel
+        self._slid = slid
         self._device = panel.device
         self._shown: tuple[int, ...] = ()
         self._is_setting = False
@@ -67,8 +70,7 @@ class GainCard:
 
     def build(self) -> None:
         """Make it."""
-        panel = self._panel
-        with panel.card("Gains", "gains"):
+        with card("Gains", "gains"):
             with ui.element("div").classes("studio-gains"):
                 for column, gain in enumerate(self._device.gains.rows):
                     self._row(column, gain)
@@ -108,7 +110,7 @@ class GainCard:
         number.set_value(self.wanted[column])
         self._is_setting = False
         self._units(tuple(self.wanted))
-        self._panel.gains_slide()
+        self._slid()
 
     async def _apply(self, column: int, value: float | None) -> None:
         if self._is_setting or value is None or not self._shown:

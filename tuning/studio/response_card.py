@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from nicegui import ui
 
-from drive_env.gains import check_linear_model
+from drive_env.devices.gains import check_linear_model
 from drive_env.loops.margins import Margins, margins
 from drive_env.studio import charts
 from tuning.studio import tune_jobs
+from tuning.studio.tune_panel import TunePanel, card
 
 if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
-    from tuning.studio.tune_page import TunePanel
 
 ROWS = (  # of the table: title, unit, field, digits
     ("Phase margin", "°", "phase_deg", 1),
@@ -87,7 +87,7 @@ class ResponseCard:
     def build(self) -> None:
         """Make it."""
         panel = self._panel
-        with panel.card("Frequency response", "response"):
+        with card("Frequency response", "response"):
             try:
                 check_linear_model(panel.device)
             except ValueError as error:

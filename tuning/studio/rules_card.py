@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.gains import check_linear_model
-from tuning.identify.estimate import TITLES, interval
+from drive_env.devices.gains import check_linear_model
+from tuning.estimate import interval
+from tuning.identify.identified_axis import TITLES
 from tuning.rules.rules_by_name import MEANINGS
 from tuning.studio import tune_jobs
+from tuning.studio.tune_panel import TunePanel, card
 
 if TYPE_CHECKING:
-    from tuning.identify.estimate import Identification
-    from tuning.rules.side_by_side import AxisRules
-    from tuning.studio.tune_page import TunePanel
+    from tuning.compare.side_by_side import AxisRules
+    from tuning.identify.identified_axis import Identification
 
 LONG = 14  # letters from which a cell is a text rather than a figure
 
@@ -47,7 +48,7 @@ class RulesCard:
     def build(self) -> None:
         """Make it."""
         panel = self._panel
-        with panel.card("Identification and rules", "rules"):
+        with card("Identification and rules", "rules"):
             try:
                 check_linear_model(panel.device)
             except ValueError as error:
@@ -81,7 +82,7 @@ class RulesCard:
             self._show_rules(desk.rules[axis])
 
     def _show_rules(self, rules: AxisRules) -> None:
-        from tuning.rules.side_by_side import outer_margins
+        from tuning.compare.side_by_side import outer_margins
 
         plant = rules.plant
         if isinstance(plant, str):

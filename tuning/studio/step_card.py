@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nicegui import ui
 
 from drive_env.studio import charts
 from tuning.studio import tune_jobs
 from tuning.studio.tune_desk import LAST, StepRecording
-
-if TYPE_CHECKING:
-    from tuning.studio.tune_page import TunePanel
+from tuning.studio.tune_panel import TunePanel, card
 
 KINDS = {"velocity": ("csv", "Velocity step"), "position": ("pp", "Move")}
 
@@ -48,7 +46,7 @@ class StepCard:
         state = panel.visitor.state
         modes = () if state is None else state.modes
         kinds = {kind: title for kind, (mode, title) in KINDS.items() if mode in modes}
-        with panel.card(f"Step response, over the last {LAST}", "step"):
+        with card(f"Step response, over the last {LAST}", "step"):
             if not kinds:
                 ui.label("This drive has neither csv nor pp, in which steps are recorded.").classes("studio-hint")
                 return

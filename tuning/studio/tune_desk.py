@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drive_env.drives.interface import Drives, device_of
+from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.studio.runs_folder import RUNS
 from mechanics.arrays import Floats, Integers
 from tuning.runs.provenance import run_folder
@@ -21,9 +22,9 @@ from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machine
 
 if TYPE_CHECKING:
     from drive_env.studio.session import Session
-    from tuning.identify.estimate import Identification
+    from tuning.compare.side_by_side import AxisRules
+    from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import MeasuredLoop
-    from tuning.rules.side_by_side import AxisRules
 
 
 LAST = 5  # step responses under the present one
@@ -215,7 +216,7 @@ class TuneDesk:
         entries, machine = self.entries, drives.machine
         ways = parse_travels(entries.travel) if entries.travel.strip() else None
         if machine is not None:
-            yield of_machines(drives, machine.drives, supply=entries.supply, travel=ways)
+            yield of_machines(drives, emulated_of(drives), supply=entries.supply, travel=ways)
             return
         from drive_env.motors import find_motor
 

@@ -11,7 +11,7 @@ import numpy as np
 from drive_env import cia402
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives, device_of
-from drive_env.gains import read_gains, write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.dynamics import DEFAULT
 from drive_env.studio.motion_jobs import disable, only, select_mode
 from drive_env.studio.scope_view import channel_of
@@ -279,9 +279,9 @@ def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
     def job(drives: Drives) -> None:
         from drive_env.loops.linear_model import Plant
         from drive_env.safety.envelope import swinging_allowed
+        from tuning.compare.side_by_side import AxisRules, proposals
         from tuning.identify.identification import identify
         from tuning.rules.rules_by_name import RULES
-        from tuning.rules.side_by_side import AxisRules, proposals
 
         rest(drives)
         with desk.target(drives) as target, swinging_allowed(drives):
@@ -392,7 +392,7 @@ def auto(store: bool, dynamics: str = DEFAULT) -> Callable[[Target, TunerSession
     """Return auto's work: that of `drive-tune auto`, its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
-        from tuning.auto.run_to_files import auto_to_files, commission_to_files
+        from tuning.auto_to_files import auto_to_files, commission_to_files
 
         if target.device.gains.is_open_loop:
             return commission_to_files(target, run.folder, progress, keep=store)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any
 
-import numpy as np
 from nicegui import ui
 
-from drive_env.motors import MOTORS, find_motor
+from drive_env.motors import MOTORS
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
@@ -18,7 +16,7 @@ from tuning.studio.gain_card import GainCard
 from tuning.studio.response_card import ResponseCard
 from tuning.studio.rules_card import RulesCard
 from tuning.studio.step_card import StepCard
-from tuning.studio.tune_desk import TuneDesk, desk_of
+from tuning.studio.tune_panel import TunePanel, card
 from tuning.studio.tuner_card import TunerCard
 from tuning.target import AXES
 
@@ -33,7 +31,7 @@ assert tuple(COUPLING) == AXES
 def build(session: Session, visitor: Visitor) -> None:
     """Make the page, or say why there is no tuning for these drives."""
     if session.description.device is not None:
-        TunePanel(session, visitor).build()
+        TunePage(TunePanel(session, visitor)).build()
         return
     with card("Tune", "unknown"):
         ui.label(
@@ -43,56 +41,18 @@ def build(session: Session, visitor: Visitor) -> None:
         ).props("data-test=no-tuning")
 
 
-def card(title: str, name: str) -> ui.card:
-    """Return a card with a heading."""
-    made = ui.card().classes(f"studio-card card-{name}")
-    with made:
-        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
-    return made
-
-
-class TunePanel:
-    """The controls of one page; parts of other packages get it.
+class TunePage:
+    """The controls of one page.
 
     Args:
-        session: The drives, of a device that is known.
-        visitor: The page.
-
-    Attributes:
-        device: What they are.
+        panel: What its cards have in common.
     """
 
-    def __init__(self, session: Session, visitor: Visitor) -> None:
-        assert session.description.device is not None
-        self.device = session.description.device
-        self.session = session
-        self.visitor = visitor
-        self.desk: TuneDesk = desk_of(session)
-        self.gains, self.step, self.response = GainCard(self), StepCard(self), ResponseCard(self)
-        self.rules, self.tuner = RulesCard(self), TunerCard(self)
+    def __init__(self, panel: TunePanel) -> None:
+        self.panel = panel
+        self.gains, self.step, self.response = GainCard(panel, self._gains_slide), StepCard(panel), ResponseCard(panel)
+        self.rules, self.tuner = RulesCard(panel), TunerCard(panel)
         self._seen = -1
-
-    @property
-    def axis(self) -> int:
-        """The axis of the page."""
-        return self.visitor.axis
-
-    @property
-    def motor(self) -> Any:
-        """The motor that is turned, as far as it is known."""
-        made = self.session.glimpse(lambda machine: machine.drives.motor)
-        return made or find_motor(self.desk.entries.motor or self.device.default_motor)
-
-    @property
-    def supply(self) -> float:
-        """Supply voltage [V] that gains in SI are computed with."""
-        given = self.desk.entries.supply
-        return float(self.device.supply_of(self.motor)) if given is None else given
-
-    @property
-    def rated_rpm(self) -> float:
-        """Rated speed of the motor [rpm]."""
-        return float(self.motor.rated_speed) * 60.0 / (2.0 * np.pi)
 
     def build(self) -> None:
         """Make it."""
@@ -108,22 +68,18 @@ class TunePanel:
             with ui.element("div").classes("studio-stack"):
                 self.tuner.build_run()
                 self.rules.build()
-        self.visitor.hand_in(tune_jobs.look(self.desk), "Read the gains")
+        self.panel.visitor.hand_in(tune_jobs.look(self.panel.desk), "Read the gains")
         ui.timer(REFRESH, self._show)
         ui.timer(REREAD, self._reread)
 
-    def card(self, title: str, name: str) -> ui.card:
-        """Return a card with a heading."""
-        return card(title, name)
-
-    def gains_slide(self) -> None:
+    def _gains_slide(self) -> None:
         """Show what the sliders would make of the response."""
         self.response.show(tuple(self.gains.wanted))
 
     def _show(self) -> None:
-        if self.desk.version == self._seen:
+        if self.panel.desk.version == self._seen:
             return
-        self._seen = self.desk.version
+        self._seen = self.panel.desk.version
         self.gains.show()
         self.step.show()
         self.response.show(tuple(self.gains.wanted))
@@ -132,19 +88,20 @@ class TunePanel:
 
     async def _reread(self) -> None:
         """Read the gains again, unless something is under way."""
-        if self.session.job is None and not self.session.waiting:
-            future = self.session.do(tune_jobs.look(self.desk), "Read the gains", page=self.visitor.id, quiet=True)
+        session, page = self.panel.session, self.panel.visitor.id
+        if session.job is None and not session.waiting:
+            future = session.do(tune_jobs.look(self.panel.desk), "Read the gains", page=page, quiet=True)
             with contextlib.suppress(Exception):  # the next one may get through; what is wrong, other pages tell
                 await asyncio.wrap_future(future)
 
     def _machine_card(self) -> None:
         """Ask what no bus tells: motor, travel, supply, coupling."""
-        desk = self.desk
+        desk = self.panel.desk
         emulated = desk.is_emulated
-        with self.card("Machine", "machine"):
+        with card("Machine", "machine"):
             with ui.row().classes("studio-buttons"):
                 if not emulated:
-                    names, usual = sorted(MOTORS), self.device.default_motor
+                    names, usual = sorted(MOTORS), self.panel.device.default_motor
                     motor = ui.select(names, value=desk.entries.motor or usual, label="Motor", with_input=True)
                     motor.props("dense outlined").classes("grow")
                     motor.on_value_change(lambda event: setattr(desk.entries, "motor", str(event.value or "")))
@@ -152,11 +109,11 @@ class TunePanel:
                     "Travel [turns]", value=desk.entries.travel, placeholder="the load's" if emulated else "-0.5:0.5"
                 ).props("dense outlined data-test=travel").classes("grow")  # fmt: skip
                 travel.on_value_change(lambda event: setattr(desk.entries, "travel", str(event.value or "")))
-                if not emulated and self.session.num_axes > 1:
+                if not emulated and self.panel.session.num_axes > 1:
                     axes = ui.select(COUPLING, value=desk.entries.axes, label="Axes").props("dense outlined")
                     axes.on_value_change(lambda event: setattr(desk.entries, "axes", str(event.value)))
                 if not emulated:
-                    supply = ui.number("Supply [V]", value=self.supply, min=1).props("dense outlined")
+                    supply = ui.number("Supply [V]", value=self.panel.supply, min=1).props("dense outlined")
                     supply.on_value_change(lambda event: setattr(desk.entries, "supply", event.value))
             own = "; empty: as far as the load lets it" if emulated else ""
             ui.label(f"How far the rotor may turn from where it stands: LOW:HIGH, as -0.5:0.5, or free{own}.").classes(

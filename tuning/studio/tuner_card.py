@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from drive_env.gains import has_linear_model
+from drive_env.devices.gains import has_linear_model
 from drive_env.loops.dynamics import DEFAULT, known_dynamics
 from drive_env.studio.parts import studio_parts
 from drive_env.studio.runs_folder import RUNS, url_of
@@ -16,9 +16,9 @@ from tuning.runs.provenance import run_folder
 from tuning.studio import tune_jobs
 from tuning.studio.rules_card import table
 from tuning.studio.tune_desk import AxisVerdict, TunerSession
+from tuning.studio.tune_panel import TunePanel, card
 
 if TYPE_CHECKING:
-    from tuning.studio.tune_page import TunePanel
     from tuning.target import Target
 
 Work = Callable[["Target", TunerSession, Callable[[str, float], None]], Any]
@@ -33,20 +33,20 @@ LINES = 12  # of what a run says that are shown
 
 
 class TunerCard:
-    """What starts tuners, and what the present or last run says.
+    """What starts tuners, and what the present or last run says; parts of other packages get it.
 
     Args:
         panel: The page.
     """
 
     def __init__(self, panel: TunePanel) -> None:
-        self._panel = panel
+        self.panel = panel
         self._seen: tuple[Any, ...] = ()
 
     def build(self) -> None:
         """Make it, and the parts that other packages add."""
-        panel = self._panel
-        with panel.card("Tune automatically", "tuner"):
+        panel = self.panel
+        with card("Tune automatically", "tuner"):
             ui.label(
                 "auto identifies the axes, searches gains, tries and verifies them; gains that fail a check are rolled "
                 "back. The motor turns for 9 to 20 s an axis. Quick stop ends it, and the gains before come back."
@@ -64,11 +64,11 @@ class TunerCard:
                 self._store = ui.checkbox("Store the gains in the drive", value=not panel.desk.is_emulated)
                 self._store.set_visibility(not panel.desk.is_emulated)
             for part in studio_parts("/tune"):
-                part.build(panel)
+                part.build(self)
 
     def build_run(self) -> None:
         """Make the card that says what the run does and did."""
-        with self._panel.card("Run", "run"):
+        with card("Run", "run"):
             self._head = ui.label("No run yet.").classes("studio-strong").props("role=status data-test=run-head")
             self._bar = ui.linear_progress(value=0.0, show_value=False).props('aria-label="Progress of the run"')
             self._bar.set_visibility(False)
@@ -79,12 +79,12 @@ class TunerCard:
     async def _auto(self) -> None:
         store = bool(self._store.value)
         dynamics = str(self._dynamics.value)
-        title = f"auto, {dynamics} dynamics" if has_linear_model(self._panel.device) else "auto"
+        title = f"auto, {dynamics} dynamics" if has_linear_model(self.panel.device) else "auto"
         await self.start(title, "auto", tune_jobs.auto(store, dynamics))
 
     async def start(self, title: str, kind: str, work: Work, columns: tuple[str, ...] = ()) -> None:
         """Run a tuner: `kind` names its folder, `columns` are those of its trials."""
-        panel = self._panel
+        panel = self.panel
         if panel.desk.run is not None and not panel.desk.run.is_over:
             panel.visitor.say(f"{panel.desk.run.title} is under way; stop it first", "warning")
             return
@@ -92,15 +92,15 @@ class TunerCard:
         await panel.visitor.do(tune_jobs.run_tuner(panel.desk, run, work), title, paced=False)
 
     def _stop(self) -> None:
-        run = self._panel.desk.run
+        run = self.panel.desk.run
         if run is None or run.is_over:
-            self._panel.visitor.say("no tuner is running", "info")
+            self.panel.visitor.say("no tuner is running", "info")
             return
-        self._panel.session.end_job(f"{run.title} was stopped from a page")
+        self.panel.session.end_job(f"{run.title} was stopped from a page")
 
     def show(self) -> None:
         """Show how far the run is."""
-        run = self._panel.desk.run
+        run = self.panel.desk.run
         if run is None:
             return
         seen = (id(run), len(run.lines), len(run.trials), round(run.share, 2), run.is_over)

@@ -16,8 +16,8 @@ from typing import Any
 
 import yaml
 
+from agents.tasks import environment_name, row_of
 from agents.training.algorithms import ALGORITHMS, NOT_TAKEN, SAME_HYPERPARAMETERS
-from agents.training.tasks import environment_name, row_of
 from drive_env.envs import environment_of
 from drive_env.envs.suite import TASKS
 from mechanics.untrusted import check_table, read_text

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from functools import partial
 
 from drive_env.canopen.frames import SDO_REQUEST, SDO_RESPONSE
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port
-from drive_env.master.errors import BusError
 
 LOOK = 0.1  # s in which a node answers, if there is one
 _DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0, 0, 0, 0, 0))  # SDO request of 1000h, which every node has

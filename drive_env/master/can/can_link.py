@@ -11,6 +11,8 @@ from drive_env.canopen.frames import SYNC
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.link import ObjectClient, ReceivedEmergency, Wording
 from drive_env.held_signals import held_signals
 from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.bus_time import BusTime
@@ -22,8 +24,6 @@ from drive_env.master.can.pdo import PdoConfiguration
 from drive_env.master.can.port import Port
 from drive_env.master.can.process_data import PdoProcessData
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.description import Description
-from drive_env.master.link import ObjectClient, ReceivedEmergency, Wording
 
 _EMCY_COB_ID, _PRODUCER_HEARTBEAT = 0x1014, (0x1017, 0)
 TIME_LOOK = 0.012  # s for which a drive in lockstep must stand still

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from drive_env import cia402
 from drive_env.canopen.frames import SDO_REQUEST
 from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.fieldbus.description import Description
 from drive_env.master.can.port import Handler, Port
-from drive_env.master.description import Description
 
 # The statusword of the state that a command leads to.
 _OFF, _ENABLED = 0x0240, 0x0637  # enabled, and the target is reached

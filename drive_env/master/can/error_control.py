@@ -15,10 +15,10 @@ from functools import partial
 from drive_env import cia402
 from drive_env.canopen.frames import ERROR_CONTROL
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.link import NoWatchdogError, ObjectClient
 from drive_env.master.can.port import Port
 from drive_env.master.changed_objects import REMEDY, ChangedObjects
-from drive_env.master.description import Description
-from drive_env.master.link import NoWatchdogError, ObjectClient
 
 logger = logging.getLogger(__name__)
 

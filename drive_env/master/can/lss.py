@@ -19,9 +19,9 @@ from drive_env.canopen.lss import (
     Service,
 )
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
-from drive_env.master.errors import BusError, NoAnswerError
 
 # s. Several slaves answer a step of a scan, one after the other: what comes this long after the first answer is theirs,
 # and must not be taken for the answer to the next step.

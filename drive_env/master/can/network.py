@@ -7,9 +7,9 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 
 from drive_env.canopen.frames import EMCY, ERROR_CONTROL, IDENTIFIER, INVALID, NMT
+from drive_env.fieldbus.errors import NoAnswerError
+from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.can.port import Port
-from drive_env.master.errors import NoAnswerError
-from drive_env.master.link import ReceivedEmergency
 
 START, PRE_OPERATIONAL, RESET_NODE = 0x01, 0x80, 0x81  # NMT commands (CiA 301, 7.2.8.3.1)
 BOOT_UP = 0x00  # in an error control message

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from functools import partial
 
 from drive_env.canopen.frames import NMT, RPDO, SDO_REQUEST, SYNC
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port
-from drive_env.master.errors import BusError
 
 
 class OtherMastersError(BusError):

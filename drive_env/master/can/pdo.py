@@ -10,13 +10,13 @@ from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.errors import BusError, RefusedError
+from drive_env.fieldbus.link import ObjectClient
+from drive_env.fieldbus.tidying import Tidying
 from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.mapping import PDO_BITS, Slots, pack
-from drive_env.master.description import Description
-from drive_env.master.errors import BusError, RefusedError
-from drive_env.master.link import ObjectClient
 from drive_env.master.packing import Member
-from drive_env.master.tidying import Tidying
 
 # Transmission types of a TPDO (CiA 301, table 74): at each SYNC; with a SYNC at all.
 SYNC_EVERY, WITH_SYNC = 1, range(241)

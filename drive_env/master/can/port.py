@@ -17,8 +17,8 @@ from typing import Any
 
 import can
 
+from drive_env.fieldbus.errors import BusError, OpenError
 from drive_env.master.can.slcan_socket import SlcanSocket
-from drive_env.master.errors import BusError, OpenError
 
 Handler = Callable[[bytes], None]
 

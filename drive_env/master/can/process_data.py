@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from drive_env.dictionary.aborts import PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.fieldbus.description import Description
 from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.pdo import (
     INTO_DRIVE,
@@ -19,7 +20,6 @@ from drive_env.master.can.pdo import (
 )
 from drive_env.master.can.port import Port
 from drive_env.master.can.samples import PdoSamples
-from drive_env.master.description import Description
 from drive_env.master.packing import Bytes, pack_rows
 from mechanics.arrays import Integers
 

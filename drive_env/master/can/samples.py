@@ -8,9 +8,9 @@ import numpy as np
 
 from drive_env.canopen.frames import SYNC
 from drive_env.cia402 import Key
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can.pdo import RemotePdo
 from drive_env.master.can.port import Port
-from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.packing import Bytes, unpack_rows
 from mechanics.arrays import Integers
 

@@ -21,10 +21,10 @@ from canopen.sdo.client import SdoClient as CanopenClient
 
 from drive_env.canopen.frames import NMT, SDO_REQUEST, SDO_RESPONSE
 from drive_env.dictionary.aborts import UNKNOWN_COMMAND, UNSUPPORTED_ACCESS, ObjectAccessError
+from drive_env.fieldbus.errors import BusError, NoAnswerError, refused
 from drive_env.master.can import block_transfer
 from drive_env.master.can.block_transfer import BLOCK_FROM, NoBlockTransferError
 from drive_env.master.can.port import Port
-from drive_env.master.errors import BusError, NoAnswerError, refused
 
 _ABORT = 0x80
 _INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits

@@ -15,7 +15,7 @@ from contextlib import suppress
 import can
 
 from drive_env.bus.slcan import TOKEN_WANTED, check_token
-from drive_env.master.errors import OpenError
+from drive_env.fieldbus.errors import OpenError
 
 CONNECT_TIMEOUT = 3.0  # [s]
 _CHUNK = 65536  # bytes

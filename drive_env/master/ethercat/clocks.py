@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 
 from drive_env.ethercat import registers
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster
 
 NANOSECOND = 1e-9  # s

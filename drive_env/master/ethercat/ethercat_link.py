@@ -10,15 +10,15 @@ from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState
-from drive_env.master.description import Description
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.link import ObjectClient, ReceivedEmergency, Wording
 from drive_env.master.ethercat.clocks import FramePhase, check_clocks
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster, Sync0
 from drive_env.master.ethercat.image_data import FRAME, EtherCatProcessData
 from drive_env.master.ethercat.process_watchdog import FACTORY, ProcessWatchdog
 from drive_env.master.ethercat.slave_objects import SlaveObjects
 from drive_env.master.ethercat.state_names import state_name
-from drive_env.master.link import ObjectClient, ReceivedEmergency, Wording
 
 TIME_LOOK = 0.012  # s for which a drive in lockstep must stand still
 BOOT = 10.0  # s for a slave that is reset to come back

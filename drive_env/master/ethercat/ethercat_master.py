@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from drive_env.ethercat.application import AlState, AlStatusCode
-from drive_env.master.link import ReceivedEmergency
+from drive_env.fieldbus.link import ReceivedEmergency
 
 STATE, ERROR = 0x0F, 0x10  # of AL status
 READS = 5  # of a register, before its slave is taken to be silent: a frame may be lost

@@ -16,7 +16,8 @@ from drive_env.ethercat import datagrams, registers
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.datagrams import Datagram, DatagramCommand, at_station
 from drive_env.ethercat.state_machine import ACKNOWLEDGE
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.ethercat.clocks import check_clocks, set_offsets, start_sync0
 from drive_env.master.ethercat.ethercat_master import (
     ERROR,
@@ -30,7 +31,6 @@ from drive_env.master.ethercat.ethercat_master import (
 from drive_env.master.ethercat.frame_ways import FrameWay
 from drive_env.master.ethercat.mailbox_client import MailboxClient
 from drive_env.master.ethercat.state_names import refusal
-from drive_env.master.link import ReceivedEmergency
 
 C = DatagramCommand
 FIRST_STATION, LOGICAL = 0x1001, 0x10000

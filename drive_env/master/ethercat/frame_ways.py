@@ -13,7 +13,7 @@ from typing import Protocol
 
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.ways import LARGEST, LOOPBACK
-from drive_env.master.errors import OpenError
+from drive_env.fieldbus.errors import OpenError
 
 
 class FrameWay(Protocol):

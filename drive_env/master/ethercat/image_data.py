@@ -23,13 +23,13 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import Description
-from drive_env.master.errors import NoAnswerError
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.errors import NoAnswerError
+from drive_env.fieldbus.link import ObjectClient
 from drive_env.master.ethercat.clocks import FramePhase
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster, ImageSizes
 from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImageLayout, ImagePlanner
 from drive_env.master.ethercat.slave_images import SlaveImages
-from drive_env.master.link import ObjectClient
 from drive_env.master.packing import Member, unpack_rows
 from mechanics.arrays import Integers
 

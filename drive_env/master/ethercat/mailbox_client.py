@@ -25,7 +25,7 @@ from drive_env.ethercat.coe import (
     split,
 )
 from drive_env.ethercat.mailbox import COUNTER, COUNTER_SHIFT, PROTOCOL, MailboxProtocol
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 
 UPLOAD, DOWNLOAD, UPLOAD_SEGMENT = 0x40, 0x21, 0x60  # first bytes of requests
 LOOK = 0.0005  # s between two looks whether an answer is there

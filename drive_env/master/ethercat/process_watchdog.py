@@ -9,11 +9,11 @@ from collections.abc import Sequence
 
 from drive_env.cia402 import Key
 from drive_env.ethercat import registers
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.link import NoWatchdogError, ObjectClient
 from drive_env.master.changed_objects import REMEDY, ChangedObjects
-from drive_env.master.description import Description
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster
 from drive_env.master.ethercat.image_data import EtherCatProcessData
-from drive_env.master.link import NoWatchdogError, ObjectClient
 
 TICK = 40e-9  # s
 LONGEST = 0xFFFF  # ticks of the divider

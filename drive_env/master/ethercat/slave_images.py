@@ -6,10 +6,10 @@ import struct
 from functools import partial
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.description import Description
+from drive_env.fieldbus.description import Description
+from drive_env.fieldbus.link import ObjectClient
+from drive_env.fieldbus.tidying import Tidying
 from drive_env.master.ethercat.image_layout import FIRST_PDO, ImageLayout, ImagePlanner
-from drive_env.master.link import ObjectClient
-from drive_env.master.tidying import Tidying
 
 
 class SlaveImages:

@@ -18,7 +18,8 @@ from typing import Any
 
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState
-from drive_env.master.errors import BusError, NoAnswerError, OpenError
+from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
+from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.ethercat.clocks import check_clocks, start_sync0
 from drive_env.master.ethercat.ethercat_master import (
     ERROR,
@@ -31,7 +32,6 @@ from drive_env.master.ethercat.ethercat_master import (
 )
 from drive_env.master.ethercat.mailbox_client import MailboxClient, SdoAbortError
 from drive_env.master.ethercat.state_names import refusal
-from drive_env.master.link import ReceivedEmergency
 
 MICROSECONDS = 1e6
 REGISTER_TIMEOUT = 20_000  # us

@@ -9,20 +9,17 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from drive_env import cia402
-from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.axis_objects import AxisObjects
+from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import position_scale, velocity_ratio
 from drive_env.dictionary.roles import Role
-from drive_env.dictionary.units import split_unit
-from drive_env.drives.currents import MILLIAMPERE
+from drive_env.dictionary.units import MILLIAMPERE, split_unit
 from mechanics.arrays import Floats, Integers, Mask
-
-if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
 
 
 class EnteredUnit(NamedTuple):
@@ -100,13 +97,14 @@ def follows_scale(name: str) -> bool:
     return split_unit(name)[1] in (*_INCREMENTAL, *_BY_RATIO, *_OF_PEAK)
 
 
-def scales_of(drives: BusDrives) -> list[Scale]:
+def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
     """Return what the units of every axis follow, as far as the drive says it.
 
     Args:
-        drives: On a bus.
+        drives: Emulated, or on a bus.
+        known: Their objects.
     """
-    increments, roles = _increments_of(drives), drives.description.dictionary.roles
+    increments, roles = _increments_of(drives, known), known.roles
     ratio = velocity_ratio(roles)
     if ratio is None and Role.PEAK_CURRENT not in roles:
         return list(increments)
@@ -116,11 +114,10 @@ def scales_of(drives: BusDrives) -> list[Scale]:
     return [AxisScale(*one) for one in zip(increments, rpm, peak, strict=True)]
 
 
-def _increments_of(drives: BusDrives) -> list[float | None]:
+def _increments_of(drives: AxisObjects, known: ObjectDictionary) -> list[float | None]:
     """Return the position increments of a revolution of every axis, None where the drive does not say."""
-    known = drives.description
     encoder = (cia402.ENCODER_RESOLUTION, 1)
-    own = position_scale(known.dictionary.roles) is not None
+    own = position_scale(known.roles) is not None
     if not own and not known.has(encoder):
         return [None] * drives.num_axes
     return [float(value) or None for value in drives.read(Role.POSITION_SCALE if own else encoder)]

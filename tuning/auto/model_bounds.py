@@ -16,9 +16,9 @@ from tuning.response.measured_loop import GOOD_MISFIT, MODEL_LOW, MODEL_POINTS, 
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.gains import RawGains
+    from drive_env.devices.gains import RawGains
     from drive_env.loops.linear_model import Plant
-    from tuning.identify.estimate import Identification
+    from tuning.identify.identified_axis import Identification
 
 # Estimates whose intervals have corners, and what a plant calls them; the first two go up and down together, since
 # they change the outer loops by little.

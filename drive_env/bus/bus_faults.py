@@ -17,7 +17,7 @@ from drive_env.canopen.frames import NMT, Frame
 from drive_env.canopen.node import Node
 from drive_env.drives.arguments import whole_cycles
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.faults.machine_faults import axes_that_fulfil
+from drive_env.emulator.machine_faults import axes_that_fulfil
 from drive_env.faults.schedule import NEVER, Condition, Order, cycles_of
 from drive_env.faults.table import FaultRow, checked_parameters, find_fault
 from mechanics.arrays import Mask
@@ -105,7 +105,7 @@ class BusFaults:
             if is_of_machine:
                 assert node is not None
                 # Refused here if the machine refuses it; the world's own thread gives it to the machine.
-                self._drives_of(node).inside.faults.check(replace(order, axis=None))
+                self._drives_of(node).faults.check(replace(order, axis=None))
             self._next_number += 1
             fault = _BusFault(self._next_number, order, row, given, condition, node, delay, length)
             self._faults.append(fault)
@@ -155,7 +155,7 @@ class BusFaults:
 
     def _is_active(self, fault: _BusFault) -> bool:
         if fault.inner is not None and fault.node is not None:
-            found = [one for one in self._drives_of(fault.node).inside.faults.listing() if one.number == fault.inner]
+            found = [one for one in self._drives_of(fault.node).faults.listing() if one.number == fault.inner]
             return bool(found) and bool(found[0].active.any())
         return fault.ends is not None
 
@@ -188,16 +188,16 @@ class BusFaults:
     def _holds(self, fault: _BusFault) -> bool:
         """Return whether an axis of the fault's node, or any on the bus, fulfils its condition."""
         if fault.node is None:
-            return any(bool(axes_that_fulfil(fault.condition, drives).any()) for drives in self._world.drives)
+            return any(bool(axes_that_fulfil(fault.condition, drives.inside).any()) for drives in self._world.drives)
         node = self._emulated(fault.node)
-        met = axes_that_fulfil(fault.condition, node.drives)
+        met = axes_that_fulfil(fault.condition, node.drives.inside)
         return bool(met[self._axes_of(fault.node)].any())
 
     def _is_over(self, fault: _BusFault, now: int) -> bool:
         if fault.row.once:
             return True
         if fault.inner is not None and fault.node is not None:
-            return not any(one.number == fault.inner for one in self._drives_of(fault.node).inside.faults.listing())
+            return not any(one.number == fault.inner for one in self._drives_of(fault.node).faults.listing())
         return fault.ends is not None and fault.ends <= now
 
     def _begin(self, fault: _BusFault) -> None:
@@ -233,7 +233,7 @@ class BusFaults:
             chosen &= np.arange(len(chosen)) == node.first_axis + order.axis
         machines: Mask = np.logical_or.reduce(chosen.reshape(-1, drives.load.num_axes), axis=1)
         of_axis = order.axis is not None or fault.row.group in ("sensor", "motor", "supply")
-        return drives.inside.faults.add(replace(order, axis=None), machines, chosen if of_axis else None)
+        return drives.faults.add(replace(order, axis=None), machines, chosen if of_axis else None)
 
     def _axes_of(self, number: int) -> Mask:
         """Return which of the drives' axes are a node's, shape (num_axes,); those without a motor are none of them."""
@@ -277,6 +277,6 @@ class BusFaults:
         elif fault.row.name == "store_interrupted":
             self._emulated(fault.node).saves_lose_power = False
         elif fault.inner is not None:
-            faults = self._drives_of(fault.node).inside.faults
+            faults = self._drives_of(fault.node).faults
             if any(one.number == fault.inner for one in faults.listing()):
                 faults.clear(fault.inner, np.ones(self._drives_of(fault.node).num_machines, bool))

@@ -91,7 +91,7 @@ def opened(
         trust: As `open_policy` takes it.
     """
     from agents.policies.baselines import baseline
-    from agents.training.tasks import make_environments
+    from agents.tasks import make_environments
 
     if not is_baseline(text):
         return open_policy(text, trust=trust)

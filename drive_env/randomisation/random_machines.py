@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.emulator.parameters import check_known, check_parameter
-from drive_env.envs.random_faults import RandomFaults, check_ranges
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS, names_of
+from drive_env.randomisation.random_faults import RandomFaults, check_ranges
 from drive_env.saved_state import Saved
 from mechanics.arrays import Floats, Mask
 from mechanics.untrusted import read_toml
@@ -257,7 +257,7 @@ class RandomMachines(Saved):
         self._given: list[str] = []  # parameters without a law that have been given: an episode later they are default
         if distributions.faults is not None:
             for name in distributions.faults.names:
-                drives.inside.faults.check(Order(name))
+                drives.faults.check(Order(name))
             self.values |= {name: np.zeros(machines) for name in FAULT_VALUES}
 
     def redraw(
@@ -323,7 +323,7 @@ class RandomMachines(Saved):
             if order is None:
                 continue
             try:
-                self._drives.inside.faults.add(order, np.arange(len(where)) == lane)
+                self._drives.faults.add(order, np.arange(len(where)) == lane)
             except ValueError:  # a payload with which this machine cannot be stepped: it stays sound
                 continue
             self.values["fault.number"][lane] = 1.0 + list(FAULTS).index(order.name)

@@ -30,7 +30,7 @@ from drive_env.firmware.record import get_lanes, set_lanes
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.emulator.inside import Inside
 
 
 _CHANGING = ("axes", "state", "begins", "ends")  # of a fault, beside what its order says
@@ -84,9 +84,9 @@ class _MachineFault:
         return not bool(np.any((self.state != ABSENT) & (self.state != OVER)))
 
 
-def axes_that_fulfil(condition: Condition, drives: EmulatedDrives) -> Mask:
+def axes_that_fulfil(condition: Condition, inside: Inside) -> Mask:
     """Return which axes fulfil a condition now, shape (num_axes,)."""
-    records, count = drives.inside.records, drives.num_axes
+    records, count = inside.records, inside.num_axes
     if condition.quantity == NO_CONDITION:
         return np.ones(count, bool)
     if condition.quantity == ENABLED:
@@ -104,14 +104,14 @@ class MachineFaults:
     faults of one quantity act in the order in which they were given.
     """
 
-    def __init__(self, drives: EmulatedDrives) -> None:
-        self._drives = drives
-        self._axes_per_machine = drives.load.num_axes
+    def __init__(self, inside: Inside) -> None:
+        self._inside = inside
+        self._axes_per_machine = inside.load.num_axes
         self._faults: list[_MachineFault] = []
         self._next_number = 0
         self._base: dict[Quantity, Floats] = {}
         self._held: dict[Quantity, Mask] = {}
-        self._jam = np.zeros(drives.num_axes)
+        self._jam = np.zeros(inside.num_axes)
 
     # --- giving, listing, taking back -----------------------------------------------------------------------------
     def add(self, order: Order, machines: Mask, of_node: Mask | None = None) -> int:
@@ -122,7 +122,7 @@ class MachineFaults:
             machines: Machines that have the fault, shape (num_machines,).
             of_node: Axes that have it, of those the order is of, shape (num_axes,); all of them by default.
         """
-        drives, axis = self._drives, order.axis
+        inside, axis = self._inside, order.axis
         row, changes = self.check(order)
         given = checked_parameters(row, order.parameters)
         if row.name == "open_phase" and given["phase"] >= len(changes):
@@ -131,17 +131,17 @@ class MachineFaults:
         if row.name == "stage_short" and given["phase"] >= len(changes) - 1:
             raise ValueError(
                 f"fault stage_short: phase={given['phase']:g} must be -1 to {len(changes) - 2} of a "
-                f"{drives.device.name}; -1 is a short across the DC link"
+                f"{inside.device.name}; -1 is a short across the DC link"
             )
         axes = np.repeat(machines, self._axes_per_machine)
         if axis is not None:
-            axes &= np.arange(drives.num_axes) % self._axes_per_machine == axis
+            axes &= np.arange(inside.num_axes) % self._axes_per_machine == axis
         if of_node is not None:
             axes &= of_node
         fault = self._made(self._next_number + 1, order, axes)
         self._rehearse(changes, given, axes)
         self._next_number += 1
-        fault.begins[:] = drives.inside.cycle + fault.delay
+        fault.begins[:] = inside.cycle + fault.delay
         fault.state[:] = np.where(machines, DUE if fault.condition.quantity == NO_CONDITION else WAITING, ABSENT)
         self._faults.append(fault)
         return self._next_number
@@ -254,19 +254,19 @@ class MachineFaults:
     def _made(self, number: int, order: Order, axes: Mask, *changing: Integers) -> _MachineFault:
         """Return a fault as its order has it, with its axes, and its state, begin and end in each machine."""
         row, changes = self.check(order)
-        delay, length = cycles_of(order, row, self._drives.inside.cycles)
+        delay, length = cycles_of(order, row, self._inside.cycles)
         given, condition = checked_parameters(row, order.parameters), Condition.parse(order.when)
-        nothing = np.zeros(self._drives.num_machines, np.int64)
+        nothing = np.zeros(self._inside.num_machines, np.int64)
         state, begins, ends = (array.copy() for array in changing or (nothing, nothing, nothing + NEVER))
         return _MachineFault(
             number, order, row, given, condition, changes, delay, length, axes.copy(), state, begins, ends
         )
 
     def _changes(self, name: str) -> tuple[Change, ...]:
-        load = self._drives.load
+        load = self._inside.load
         names = tuple(parameter.name for parameter in load.parameters)
         changes = changes_of(name, names, str(load.name), self._axes_per_machine)
-        device = self._drives.device
+        device = self._inside.device
         return of_drives(name, changes, device.firmware.layout.dtype.names or (), device.name)
 
     def _rehearse(self, changes: tuple[Change, ...], given: Mapping[str, float], axes: Mask) -> None:
@@ -274,7 +274,7 @@ class MachineFaults:
         for change in changes:
             if change.quantity.kind == "load":
                 sound = self._get(change.quantity)
-                self._set(change.quantity, change.value(sound, given, self._drives.motor.rated_torque), axes)
+                self._set(change.quantity, change.value(sound, given, self._inside.motor.rated_torque), axes)
                 self._set(change.quantity, sound, axes)
 
     def _begin(self, fault: _MachineFault, machines: Mask, now: int) -> None:
@@ -282,15 +282,15 @@ class MachineFaults:
         if fault.row.name in MOMENTS:
             fault.state[machines] = OVER
             if fault.row.name == "node_reset":
-                self._drives.reset_node(axes)
+                self._inside.objects.restart(axes)
             else:
                 self._jump(fault.given["angle"], axes)
             return
         fault.state[machines] = ON
         fault.ends[machines] = now + fault.length if fault.length < NEVER else NEVER
         if any(change.quantity == ENCODER_NOISE for change in fault.changes):
-            seeds = np.mod(self._drives.inside.noise_seeds * SEED_STEP + fault.number, 2.0**32 - 1.0) + 1.0
-            set_lanes(self._drives.inside.records, "encoder_random", np.floor(seeds), axes)
+            seeds = np.mod(self._inside.noise_seeds * SEED_STEP + fault.number, 2.0**32 - 1.0) + 1.0
+            set_lanes(self._inside.records, "encoder_random", np.floor(seeds), axes)
         self._refresh(fault)
 
     def _end(self, fault: _MachineFault, machines: Mask) -> None:
@@ -299,7 +299,7 @@ class MachineFaults:
         fault.state[machines] = OVER
         self._refresh(fault)
         if fault.row.name == "broken_coupling":
-            for group in self._drives.inside.groups:
+            for group in self._inside.groups:
                 group.load.mend("stiffness", machines[group.machines])
 
     def _forget(self) -> None:
@@ -307,7 +307,7 @@ class MachineFaults:
 
     def _holds(self, fault: _MachineFault) -> Mask:
         """Return which machines fulfil a fault's condition, on any of its axes."""
-        return self._machines(axes_that_fulfil(fault.condition, self._drives) & fault.axes)
+        return self._machines(axes_that_fulfil(fault.condition, self._inside) & fault.axes)
 
     def _machines(self, axes: Mask) -> Mask:
         """Return the machines of which an axis is meant."""
@@ -330,7 +330,7 @@ class MachineFaults:
 
     def _refresh_quantity(self, quantity: Quantity) -> bool:
         """Bring one quantity to what its faults make of it; return whether the machines can have it."""
-        axes = self._drives.num_axes
+        axes = self._inside.num_axes
         held = self._held.setdefault(quantity, np.zeros(axes, bool))
         present = self._get(quantity)
         base = self._base.setdefault(quantity, present.copy())
@@ -341,11 +341,11 @@ class MachineFaults:
                 continue
             mask = one.axes & np.repeat(one.state == ON, self._axes_per_machine)
             if quantity.name in OF_LINK:
-                links = self._drives.machine.links
+                links = self._inside.links
                 mask = np.isin(links, links[mask])
             for change in one.changes:
                 if change.quantity == quantity:
-                    changed = change.value(wanted, one.given, self._drives.motor.rated_torque)
+                    changed = change.value(wanted, one.given, self._inside.motor.rated_torque)
                     wanted = np.where(mask, changed, wanted)
                     some |= mask
         touched = held | some
@@ -360,34 +360,34 @@ class MachineFaults:
         return True
 
     def _get(self, quantity: Quantity) -> Floats:
-        drives = self._drives
+        inside = self._inside
         if quantity.kind == "jam":
             return self._jam.copy()
         if quantity.kind == "load":
-            values = np.concatenate([group.load.get(quantity.name) for group in drives.inside.groups])
+            values = np.concatenate([group.load.get(quantity.name) for group in inside.groups])
             return np.repeat(values, self._axes_per_machine)
-        return get_lanes(drives.inside.records, quantity.name, drives.num_axes, quantity.part).astype(float)
+        return get_lanes(inside.records, quantity.name, inside.num_axes, quantity.part).astype(float)
 
     def _set(self, quantity: Quantity, values: Floats, axes: Mask) -> None:
-        drives = self._drives
+        inside = self._inside
         if quantity.kind == "jam":
             self._jam = np.where(axes, values, self._jam)
-            for group in drives.inside.groups:
+            for group in inside.groups:
                 group.load.jam(self._jam[group.axes].reshape(-1, self._axes_per_machine))
         elif quantity.kind == "load":
             machines = self._machines(axes)
             per_machine = values[:: self._axes_per_machine]
-            for group in drives.inside.groups:
+            for group in inside.groups:
                 group.load.set(quantity.name, per_machine[group.machines], machines[group.machines])
-            drives.inside.refresh_inertia()
+            inside.refresh_inertia()
         elif quantity in (ENCODER_GAIN, ENCODER_DIRECTION):
-            change_encoder(drives.inside.records, quantity.name, values, axes)
+            change_encoder(inside.records, quantity.name, values, axes)
         else:
-            set_lanes(drives.inside.records, quantity.name, values, axes, quantity.part)
+            set_lanes(inside.records, quantity.name, values, axes, quantity.part)
 
     def _jump(self, angle: float, axes: Mask) -> None:
         """Put the counters off by an angle [rad], as if so many edges came within one sample."""
-        records, count = self._drives.inside.records, self._drives.num_axes
+        records, count = self._inside.records, self._inside.num_axes
         forwards = 1.0 - 2.0 * get_lanes(records, "encoder_true_direction", count).astype(float)
         counts = np.rint(angle * forwards * get_lanes(records, "encoder_counts", count).astype(float) / TWO_PI)
         for name in ("count", "count_zero"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 
 SILENT = 2  # steps in a row without an answer, after which a node is not asked any more: each takes seconds
 

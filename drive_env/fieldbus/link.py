@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
-from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError, NoAnswerError
 from mechanics.arrays import Integers
 
 
@@ -44,8 +44,16 @@ class Wording(NamedTuple):
     sign_of_life: str
 
 
-class ObjectClient(Protocol):
-    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
+class Timing(NamedTuple):
+    """How punctual the SYNCs of a run were: their number, those more than a cycle late, the worst lateness [s]."""
+
+    cycles: int
+    late: int
+    worst: float
+
+
+class ObjectReader(Protocol):
+    """Reads objects of a node, as bytes."""
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
         """Return the bytes of an object.
@@ -54,6 +62,10 @@ class ObjectClient(Protocol):
             ObjectAccessError: With the abort code, if the drive refuses.
             NoAnswerError: If it does not answer; one try may take `timeout` [s].
         """
+
+
+class ObjectClient(ObjectReader, Protocol):
+    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
 
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Write the bytes of an object, once: a repeated write may mean something else.

@@ -6,17 +6,17 @@ What is written goes through the Drives interface, and so through its envelope.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.drives.interface import Drives
-from mechanics.arrays import Integers
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.description import Description
+    from drive_env.fieldbus.description import Description
 
 
 class SingleAxes:
@@ -47,6 +47,10 @@ class SingleAxes:
         found = self._drives.read((entry.index, entry.sub))[axis]
         return str(found) if entry.bits is None else int(found)
 
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
+        """Write an object of every axis, or of some."""
+        self._drives.write(name, value, where=where)
+
     def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
         """Write an object of one axis."""
         self._drives.write((entry.index, entry.sub), value, where=np.arange(self.num_axes) == axis)
@@ -54,10 +58,6 @@ class SingleAxes:
     def sdo(self, node: int) -> _Objects:
         """Return what reads the objects of a node as bytes."""
         return _Objects(self, node)
-
-    def as_bus(self) -> BusDrives:
-        """Return these as what the functions of `master/parameters.py` take."""
-        return cast("BusDrives", self)
 
 
 class _Objects:

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import yaml
 
+from agents.seeds import VALIDATION
 from agents.training.algorithms import ALGORITHMS, NOT_TAKEN
 from agents.training.hyperparameters import merge
-from agents.training.seeds import VALIDATION
 from agents.training.train import DivergedError, train, with_inputs
 from agents.training.training_run import TrainingRun
 from drive_env.whole_file import write_whole

@@ -1,11 +1,13 @@
-"""The results of an identification: each value with its 95 % interval, or with the reason why there is none."""
+"""The results of an identification of one axis."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
+
+from tuning.estimate import Estimate
 
 if TYPE_CHECKING:
     from tuning.identify.wiring import Settings
@@ -35,31 +37,6 @@ TITLES = {  # as people read them
     "loop_delay": "velocity loop delay",
     "velocity_filter": "velocity filter corner",
 }
-
-
-class Estimate(NamedTuple):
-    """A value with its 95 % confidence interval; one that was not identified is nan, with the `reason`."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
-    reason: str = ""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether there is a value."""
-        return math.isfinite(self.value)
-
-
-def interval(low: float, high: float) -> str:
-    """Return an interval in words; that of a whole number without doubt is "exact"."""
-    return "exact" if low == high else f"{low:.4g} to {high:.4g}"
-
-
-def refused(unit: str, reason: str) -> Estimate:
-    """Return the estimate of what could not be identified."""
-    return Estimate(math.nan, math.nan, math.nan, unit, reason)
 
 
 @dataclass(frozen=True)

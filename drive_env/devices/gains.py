@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike
 
 from drive_env.devices import Device
 from drive_env.dictionary.units import RPM, UNITS, Context, find_unit
-from drive_env.drives.interface import Drives, device_of
 from drive_env.motors import Motor
-from mechanics.arrays import Floats, Integers, Mask
+from mechanics.arrays import Floats, Integers
 
 RAW_MAX = 32767  # the chip's registers are signed
+VELOCITY_FILTER_DAMPING = 0.7
 DEFAULT_INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
 
 RawGains = Sequence[int] | Integers  # in the order of the device's gain set
@@ -238,7 +238,7 @@ def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz:
         velocity_filter: Corner frequency of the velocity filter [Hz].
         current_hz: Bandwidth of the current loop [Hz].
     """
-    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING  # the compiler comes with it
+    from drive_env.devices.gains import VELOCITY_FILTER_DAMPING  # the compiler comes with it
 
     filters = 2.0 * VELOCITY_FILTER_DAMPING / (2.0 * math.pi * np.asarray(velocity_filter, float))
     return np.asarray(1.0 / (2.0 * math.pi * current_hz) + 1.5 / device.current_rate + filters
@@ -365,16 +365,6 @@ def _of_device(device: Device, raw: Floats) -> Floats:
 
 def _context(device: Device) -> Context:
     return Context(65536.0, device.current_full_scale / 32768.0)
-
-
-def write_gains(drives: Drives, gains: Integers, where: Mask | None = None) -> None:
-    """Write raw gains of shape (num_axes, gains), in the order of the device's gain set."""
-    device_of(drives).gains.write(drives, gains, where)
-
-
-def read_gains(drives: Drives) -> Integers:
-    """Return the raw gains that drives have, shape (num_axes, gains)."""
-    return device_of(drives).gains.read(drives)
 
 
 _POSITION_P_SCALE = 4096.0 * 2.0 * math.pi / 65536.0 / RPM  # raw per 1/s

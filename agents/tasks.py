@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from agents.policies.agent_file import plain
+from agents.plain import plain
 from drive_env.envs import environment_of, make_vector
 from drive_env.envs.suite import TASKS as SUITE
 

@@ -12,7 +12,7 @@ import socket
 import threading
 from typing import Any
 
-from drive_env.faults.bus_faults import BusFaults
+from drive_env.bus.bus_faults import BusFaults
 from drive_env.faults.schedule import parse_order
 from mechanics.untrusted import parse_json
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import write_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
 from drive_env.safety.envelope import swinging_allowed

@@ -1,0 +1,24 @@
+"""Objects of several axes, read and written: all that most of what knows a dictionary asks of drives."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from numpy.typing import ArrayLike
+
+from drive_env.dictionary.entries import ObjectName
+from mechanics.arrays import Integers, Mask
+
+
+class AxisObjects(Protocol):
+    """Objects of axes. Integers are those of the wire, one for each axis, shape (num_axes,)."""
+
+    @property
+    def num_axes(self) -> int:
+        """Number of axes."""
+
+    def read(self, name: ObjectName) -> Integers:
+        """Return an object of every axis."""
+
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
+        """Write an object of every axis, or of some."""
