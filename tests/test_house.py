@@ -16,7 +16,8 @@ PACKAGES = ("mechanics", "drive_env", "tuning", "agents", "research")
 # is a folder of `drive_env`, `tuning` or `agents`, or a file beside these; `mechanics` and `research` are one each.
 ROOMS = (
     "mechanics",
-    "drive_env.cia402", "drive_env.cores", "drive_env.default_device", "drive_env.held_signals", "drive_env.realtime_section",
+    "drive_env.cia402", "drive_env.cores", "drive_env.default_device", "drive_env.held_signals",
+    "drive_env.realtime_section",
     "drive_env.saved_state", "drive_env.whole_file", "drive_env.own_packages", "drive_env.programs",
     "drive_env.dictionary", "drive_env.motors", "drive_env.firmware", "drive_env.devices", "drive_env.phase_current",
     "drive_env.fieldbus", "drive_env.drives", "drive_env.faults", "drive_env.emulator", "drive_env.node",
