@@ -20,7 +20,7 @@ def test_every_row_has_files_of_its_own_and_tests_that_are_there(row):
 def test_tests_that_name_a_file_come_first():
     table = [mutation.Row(("tuning/*",), ("test_swings.py", "test_fallback_gains.py"), ("tuning/auto/*",))]
     assert mutation.tests_of("tuning/target.py", table) == ("test_swings.py", "test_fallback_gains.py")
-    assert mutation.tests_of("tuning/fallback_gains.py", table) == ()
+    assert mutation.tests_of("tuning/auto/design.py", table) == ()
     named = [mutation.Row(("tuning/*",), ("test_swings.py", "test_fallback_gains.py"))]
     assert mutation.tests_of("tuning/fallback_gains.py", named) == ("test_fallback_gains.py", "test_swings.py")
 

@@ -132,7 +132,7 @@ def parse(text: str, entry: Entry, scale: Scale) -> int:
         scale: What the axis' units follow.
 
     Raises:
-        ValueError: For what is no number, or a unit that does not fit the object.
+        ValueError: For what is not a number, or a unit that does not fit the object.
     """
     try:
         return int(text, 0)

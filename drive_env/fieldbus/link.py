@@ -249,8 +249,8 @@ class OtherMastersHeard(Protocol):
 class Link(Protocol):
     """A fieldbus with the nodes of some drives.
 
-    Time passes by the clock, or by cycles alone (lockstep), as the drives' pace says: the link sends a cycle whenever
-    it is told to.
+    Time passes by the clock, or by cycles alone (lockstep), as the drives' pace says: the link sends a cycle
+    whenever `sync` is called.
     """
 
     @property

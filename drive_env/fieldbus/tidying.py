@@ -1,4 +1,4 @@
-"""Putting a drive back as it was: every step is tried, whatever became of the others, and what failed is told."""
+"""Putting a drive back as it was: every step is tried, also after one that failed; the error names what failed."""
 
 from __future__ import annotations
 
