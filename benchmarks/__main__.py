@@ -28,6 +28,7 @@ from rich.table import Table
 
 from benchmarks import bus, environments, ethercat, gain_tuning, studio, sweeps, training
 from drive_env import EmulatedDrives, motion
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices import device_names, find_device
 from drive_env.dictionary.position_scale import velocity_ratio
 from drive_env.drives.speeds import rpm_of_unit
@@ -56,7 +57,7 @@ def best_time(function: Callable[[], Any], repetitions: int = 5) -> float:
 
 
 def running_drives(
-    machines: int, threads: int, load: str = LOAD, speed: int | str = SPEED_PPS, device: str = "tmcm1636"
+    machines: int, threads: int, load: str = LOAD, speed: int | str = SPEED_PPS, device: str = DEFAULT_DEVICE
 ) -> EmulatedDrives:
     drives = EmulatedDrives(device, load, num_machines=machines, num_threads=threads)
     motion.enable(drives, mode="pv")
@@ -114,7 +115,7 @@ def arms() -> dict[str, dict[str, float]]:
 
 
 def bound(
-    load: str = LOAD, machines: int = 64, speed: int | str = SLOW_PPS, device: str = "tmcm1636"
+    load: str = LOAD, machines: int = 64, speed: int | str = SLOW_PPS, device: str = DEFAULT_DEVICE
 ) -> dict[str, float]:
     """Return microseconds per axis and millisecond on one core: the parts alone, the whole, and the ratio.
 

@@ -6,6 +6,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from drive_env.devices.variants import device_data
+
 HERE = Path(__file__).parent
 DEVICES = HERE.parent / "drive_env" / "devices"
 INTRODUCTION = """# When it says …
@@ -39,7 +41,7 @@ def load() -> dict[str, Any]:
 def emergencies() -> dict[str, dict[str, Any]]:
     """Return the emergencies of each device by name. Variants have those of their device."""
     files = sorted(DEVICES.glob("*/device.toml"))
-    tables = {file.parent.name: tomllib.loads(file.read_text(encoding="utf-8")) for file in files}
+    tables = {file.parent.name: device_data(file.parent) for file in files}
     return {name: table["emergencies"] for name, table in tables.items() if "emergencies" in table}
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+Key = tuple[int, int]  # index and sub-index of an object
+
 AXIS_OFFSET = 0x800  # between the profile areas of two axes of a node
 PROFILE_AREAS = range(0x6000, 0xA000)  # of up to eight axes (CiA 301)
 

@@ -9,14 +9,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices import Device
 from drive_env.devices.gain_set import RUN, STANDBY
 from drive_env.motors import Motor
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers
 
 RESERVE = 0.5  # of the holding torque, that a load takes: 30 degrees electrical, and half of the torque in reserve
 LOAD_SHARE = 0.3  # of the holding torque at rated current, which a standby current withstands

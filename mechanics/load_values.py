@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load, Parameter
-
-Floats = NDArray[np.float64]
 
 # Columns of the frictions, contacts and rolls as the rows give them.
 FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")
@@ -48,7 +46,7 @@ class LoadValues:
         load: Load,
         model: mujoco.MjModel,
         joints: Sequence[str],
-        bodies: Mapping[str, NDArray[np.int64]],
+        bodies: Mapping[str, Integers],
         armature: Floats,
         motor_friction: Floats,
     ) -> None:
@@ -89,12 +87,12 @@ class LoadValues:
             return np.asarray(high - low)
         return self._column(parameter, parameter.field).copy()
 
-    def store(self, name: str, values: Floats, where: slice | NDArray[np.bool_]) -> None:
+    def store(self, name: str, values: Floats, where: slice | Mask) -> None:
         """Store a parameter of the copies chosen, one value each; ValueError leaves all as it was."""
         self.check(name, values)
         self.store_checked(name, values, where)
 
-    def store_checked(self, name: str, values: Floats, where: slice | NDArray[np.bool_]) -> None:
+    def store_checked(self, name: str, values: Floats, where: slice | Mask) -> None:
         """Store what `check` has seen."""
         parameter = self._parameter(name)
         if parameter.field in _BODY_FIELDS:
@@ -132,7 +130,7 @@ class LoadValues:
         names = ", ".join(p.name for p in self._load.parameters)
         raise ValueError(f"load {self._load.name!r} has no parameter {name!r}; it has {names}")
 
-    def _distances(self, bodies: NDArray[np.int64]) -> Floats:
+    def _distances(self, bodies: Integers) -> Floats:
         """Return how far bodies' centres of mass are from their frames [m]."""
         return np.sqrt([place @ place for place in self._model.body_ipos[bodies]])
 
@@ -180,7 +178,7 @@ def check_places(load: Load, model: mujoco.MjModel, joints: Sequence[str]) -> No
             )
 
 
-def body_numbers(load: Load, model: mujoco.MjModel, copies: int) -> dict[str, NDArray[np.int64]]:
+def body_numbers(load: Load, model: mujoco.MjModel, copies: int) -> dict[str, Integers]:
     """Return the numbers of every copy's bodies that parameters of a load name: element -> shape (copies,)."""
     elements = {parameter.element for parameter in load.parameters if parameter.field in _BODY_FIELDS}
     return {

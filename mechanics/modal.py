@@ -21,9 +21,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mechanics.arrays import Complex, Floats
 
 
 class Corrections(NamedTuple):
@@ -126,6 +125,6 @@ def _mode(w: Floats, d: Floats, h: float) -> _Mode:
     )
 
 
-def _decayed(x: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def _decayed(x: Complex) -> Complex:
     """Return (1 - exp(-x)) / x."""
     return np.where(x == 0.0, 1.0, -np.expm1(-x) / np.where(x == 0.0, 1.0, x))

@@ -13,13 +13,10 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from mechanics.limited_child import call_limited
 from mechanics.load import Combination, Friction, Load
 from mechanics.model_files import hash_of_model
-
-Floats = NDArray[np.float64]
 
 MODELS = Path(__file__).parent / "models"  # ours
 # Copies in one model. mj_step per copy: 1154 ns alone, 318 in 8, 204 in 64, 199 in 128 (two-mass shaft); a multiple of

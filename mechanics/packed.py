@@ -14,14 +14,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Floats, Mask
 from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
 from mechanics.load import Load
 from mechanics.load_values import FRICTION_COLUMNS, VALUE_ARRAYS, LoadValues
 from mechanics.modal import Corrections, corrections
 from mechanics.plant import PackedPlant
 from mechanics.template import Template, template_of
-
-Floats = NDArray[np.float64]
 
 # Above this phase per step [rad] the discrete resonance cannot be put at the true one any more with good accuracy.
 MAX_PHASE_PER_STEP = 0.7
@@ -133,7 +132,7 @@ class PackedLoad:
         """Return a parameter of every copy, shape (copies,)."""
         return self.values.get(name)
 
-    def set(self, name: str, values: Floats, where: NDArray[np.bool_]) -> None:
+    def set(self, name: str, values: Floats, where: Mask) -> None:
         """Set a parameter of the copies where the mask is true; ValueError leaves all as it was."""
         before = self.get(name)
         self.values.store(name, np.asarray(values, float)[where], where)
@@ -165,9 +164,7 @@ class PackedLoad:
         self.values.motor_friction[:] = friction
         self._apply()
 
-    def set_all(
-        self, parameters: Mapping[str, Floats], where: NDArray[np.bool_], armature: Floats, friction: Floats
-    ) -> None:
+    def set_all(self, parameters: Mapping[str, Floats], where: Mask, armature: Floats, friction: Floats) -> None:
         """Set parameters of the copies where the mask is true, and all motors as `set_motor` does, at once.
 
         ValueError leaves all as it was.
@@ -192,7 +189,7 @@ class PackedLoad:
             self._apply(changed)
             raise
 
-    def reset(self, where: NDArray[np.bool_]) -> None:
+    def reset(self, where: Mask) -> None:
         """Put the copies where the mask is true to rest at their start; a frozen one lives again."""
         plant, data = self.plant, self.data
         self._by_copy(data.qpos)[where] = self.start
@@ -202,7 +199,7 @@ class PackedLoad:
         for values in (plant.bristle, plant.carried, plant.diverged, plant.load_torque, plant.clock):
             values[where] = 0
 
-    def place(self, joint: int, position: Floats, where: NDArray[np.bool_]) -> None:
+    def place(self, joint: int, position: Floats, where: Mask) -> None:
         """Put a joint of the copies where the mask is true to a position [rad or m], shape (copies,), at rest."""
         self._by_copy(self.data.qpos)[where, joint] = position[where]
         for array in (self.data.qvel, self.plant.qvel_before):
@@ -224,7 +221,7 @@ class PackedLoad:
         plant.jam[:] = held[: self.num_axes]
         plant.brake[self.num_axes :] = held[self.num_axes :]
 
-    def mend(self, name: str, where: NDArray[np.bool_]) -> None:
+    def mend(self, name: str, where: Mask) -> None:
         """Bring the parts that a stiffness joins together again, at rest to each other where the rotor is.
 
         Args:
@@ -373,7 +370,7 @@ class PackedLoad:
             diverged=np.zeros(copies, np.int64),
         )
 
-    def _apply(self, changed: NDArray[np.bool_] | None = None) -> None:
+    def _apply(self, changed: Mask | None = None) -> None:
         """Bring the parameters of the changed copies into MuJoCo's model and the plant; None is all."""
         if changed is None or np.any(changed):
             _derive([self], None if changed is None else np.flatnonzero(changed))

@@ -6,12 +6,10 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats, Mask
 from mechanics.load import Load
 from mechanics.packed import PackedLoad
-
-Floats = NDArray[np.float64]
 
 POSES = 16  # at which gravity and inertia are looked at, where they change
 
@@ -29,7 +27,7 @@ class Way(NamedTuple):
 
     joints: Floats  # (axes, D) speeds of the joints per speed of the rotor [1 or m/rad]
     position: Floats  # (axes,) speed of the axis's position per speed of the rotor [1 or m/rad]
-    linear: NDArray[np.bool_]  # (axes,) whether the position is one of slides alone [m], not an angle [rad]
+    linear: Mask  # (axes,) whether the position is one of slides alone [m], not an angle [rad]
     low: Floats  # (axes,) rotor angle from the start to the end of the travel, or to a limit switch [rad]; -inf without
     high: Floats  # (axes,)
 

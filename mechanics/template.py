@@ -11,16 +11,15 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats, Integers
 from mechanics.friction import FrictionModel
 from mechanics.load import Combination, Friction, Load
 from mechanics.load_values import body_numbers, check_places
 from mechanics.model import compile_packed, is_constant, is_constrained, is_varying, motion_of, read_model
 from mechanics.untrusted import read_bytes
 
-Floats = NDArray[np.float64]
-_INDICES = NDArray[np.int64]
+_INDICES = Integers
 _MOST_TEMPLATES = 32  # one of 64 copies takes about 6 MB
 
 

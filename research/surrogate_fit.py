@@ -9,13 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from agents.tuner.surrogate import ASKED, CONTEXT, IDENTIFIED, KEY, LAYERS, LEAST, MOST, SHOWN, Normaliser
-
-Array = NDArray[np.float32]
+from mechanics.arrays import Singles
 
 HEADS, VALUE, SUMMARY, HIDDEN, HIDDEN_OF_TRIAL = 4, 24, 64, 96, 128
 # Of the dynamics, over their standard deviation: exact ones would tell a set of machines, and with it their load.
@@ -30,17 +28,17 @@ class TrialData(NamedTuple):
     worth: ln of the robust cost, (n, trials); NaN where a machine had fewer trials than others.
     """
 
-    context: Array
-    gains: Array
-    shown: Array
-    worth: Array
+    context: Singles
+    gains: Singles
+    shown: Singles
+    worth: Singles
 
 
 def join(parts: Sequence[TrialData]) -> TrialData:
     """Return the machines of all parts."""
     most = max(part.worth.shape[1] for part in parts)
 
-    def padded(values: Array, filling: float) -> Array:
+    def padded(values: Singles, filling: float) -> Singles:
         none = ((0, 0),) * (values.ndim - 2)
         return np.pad(values, ((0, 0), (0, most - values.shape[1]), *none), constant_values=filling)
 
@@ -94,7 +92,7 @@ def fit(
     seed: int,
     networks: int,
     progress: Callable[[float], None] = lambda share: None,
-) -> dict[str, Array]:
+) -> dict[str, Singles]:
     """Return the arrays of a surrogate: the normaliser's, and the networks' weights in half precision.
 
     Args:
@@ -130,7 +128,7 @@ def _normaliser(data: TrialData, reach: Sequence[float]) -> Normaliser:
     )  # fmt: skip
 
 
-def _fit_one(data: TrialData, normal: Normaliser, seed: int, progress: Callable[[float], None]) -> dict[str, Array]:
+def _fit_one(data: TrialData, normal: Normaliser, seed: int, progress: Callable[[float], None]) -> dict[str, Singles]:
     """Return a network's weights, fitted to the worth of all trials, each time knowing other ones of the machine.
 
     It knows the trial at the rule's gains always, of the others a random number, the asked one included or not: so it

@@ -12,16 +12,14 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.policies.policy import load_policy
 from agents.shipped import TUNER, find_agent
 from agents.tuner.surrogate import IDENTIFIED, SHOWN
+from mechanics.arrays import Singles
 from research.surrogate_training import BUDGETS, UNSEEN, Answers, judge
 from research.tuner_recipes import RECIPES, Recipe
 from tuning.search.samplers import Proposer, new_proposer
-
-Array = NDArray[np.float32]
 
 SAMPLERS = ("tpe", "cmaes", "gp")
 
@@ -37,7 +35,7 @@ class SearchPolicy:
         """Forget the machines."""
         self._proposers = []
 
-    def act(self, observation: Array) -> Array:
+    def act(self, observation: Singles) -> Singles:
         """Return the change of the log gains to try, from the incumbent."""
         if not self._proposers:
             low, high = np.array(self._recipe.low), np.array(self._recipe.high)
@@ -53,7 +51,7 @@ class SearchPolicy:
         asked = np.array([proposer.ask(1)[0] for proposer in self._proposers])
         return np.asarray(asked - observation[:, IDENTIFIED + G : IDENTIFIED + 2 * G], np.float32)
 
-    def answer(self, observation: Array) -> Array:
+    def answer(self, observation: Singles) -> Singles:
         """Return no change: the incumbent stays."""
         return np.zeros((len(observation), len(self._recipe.gains)), np.float32)
 

@@ -13,7 +13,6 @@ import configparser
 import shutil
 
 from drive_env.devices import FOLDER, find_device
-from drive_env.devices.tmcm1636.bindings import BINDINGS
 
 AXES = 6
 MODULE = 0x900  # from 2702h to 3002h: objects of the module
@@ -83,17 +82,16 @@ def build(folder):
     write_eds(folder / "six.eds")
     text = (BASE / "device.toml").read_text(encoding="utf-8")
     for old, new in (
-        ("axes = 1\n", f"axes = {AXES}\n"),
         ('eds = "tmcm1636.eds"', 'eds = "six.eds"'),
         (
-            "axis_offsets = []",
-            "axis_offsets = [{ first = 0x2000, last = 0x21FF, step = 0x200 }, "
+            "axes = 1\n",
+            f"axes = {AXES}\naxis_offsets = [{{ first = 0x2000, last = 0x21FF, step = 0x200 }}, "
             "{ first = 0x6000, last = 0x67FF, step = 0x800 }, "
             + ", ".join(
                 f"{{ first = 0x{first:04X}, last = 0x{first + 0x3F:04X}, step = 0x40 }}"
                 for first in (0x1400, 0x1600, 0x1800, 0x1A00)
             )
-            + "]",
+            + "]\n",
         ),
         ("bytes = [0, 0, 0, 0, 0]", 'bytes = [0, "axis", 0, 0, 0]'),
         *((f"bytes = [{k}, 0, 0, 0, 0]", f'bytes = [{k}, "axis", 0, 0, 0]') for k in range(1, 5)),
@@ -116,7 +114,7 @@ def build(folder):
     rows = [
         f'"{moved(f"{row.index:04X}:{row.sub}")}" = {{ field = "{row.field}", unit = "{row.unit}", part = {row.part}, '
         f'event = "{row.event}" }}'
-        for row in BINDINGS
+        for row in find_device("tmcm1636").bindings.values()
         if row.index != 0x2702  # 3002h has the inputs of the module, which belong to no axis
     ]
     (folder / "bindings.toml").write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -21,6 +21,7 @@ from drive_env.trials import (
     open_loop_score,
     position_pid,
     position_pid_score,
+    score,
 )
 from drive_env.trials.closed_loop import (
     ClosedLoopTrial,
@@ -619,17 +620,17 @@ def score_of(kind, *records, **options):
 def sent(monkeypatch):
     """What the scores of a stepper write and where they send it."""
     found = SimpleNamespace(gains=[], targets=[])
+
+    def start(drives, target):
+        drives.log.append("go")
+        found.targets.append(np.asarray(target).tolist())
+
+    monkeypatch.setattr(score, "write_gains", lambda drives, gains: found.gains.append(gains))
+    monkeypatch.setattr(score, "write_profile", lambda drives, move: drives.log.append("profile"))
+    monkeypatch.setattr(score, "start", start)
+    monkeypatch.setattr(score, "ampere_per_count", lambda drives: 1e-3)
     for place in (closed_loop_score, open_loop_score, position_pid_score):
-        monkeypatch.setattr(place, "write_gains", lambda drives, gains: found.gains.append(gains))
-        monkeypatch.setattr(place, "write_profile", lambda drives, move: drives.log.append("profile"))
         monkeypatch.setattr(place, "power_up", lambda drives: drives.log.append("on"))
-
-        def start(drives, target):
-            drives.log.append("go")
-            found.targets.append(np.asarray(target).tolist())
-
-        monkeypatch.setattr(place, "start", start)
-    monkeypatch.setattr(closed_loop_score, "ampere_per_count", lambda drives: 1e-3)
     return found
 
 

@@ -16,14 +16,15 @@ PACKAGES = ("mechanics", "drive_env", "tuning", "agents", "research")
 # is a folder of `drive_env`, `tuning` or `agents`, or a file beside these; `mechanics` and `research` are one each.
 ROOMS = (
     "mechanics",
-    "drive_env.cia402", "drive_env.cores", "drive_env.held_signals", "drive_env.realtime_section",
+    "drive_env.cia402", "drive_env.cores", "drive_env.default_device", "drive_env.held_signals",
+    "drive_env.realtime_section",
     "drive_env.saved_state", "drive_env.whole_file", "drive_env.own_packages", "drive_env.programs",
     "drive_env.dictionary", "drive_env.motors", "drive_env.firmware", "drive_env.devices", "drive_env.phase_current",
     "drive_env.fieldbus", "drive_env.drives", "drive_env.faults", "drive_env.emulator", "drive_env.node",
     "drive_env.canopen", "drive_env.bus", "drive_env.ethercat", "drive_env.safety", "drive_env.master",
     "drive_env.loops", "drive_env.randomisation", "drive_env.trials", "drive_env.pictures", "drive_env.envs",
     "drive_env", "drive_env.studio", "drive_env.commands",
-    "tuning", "tuning.arrays", "tuning.bootstrap", "tuning.estimate", "tuning.fallback_gains", "tuning.lateness",
+    "tuning", "tuning.bootstrap", "tuning.estimate", "tuning.fallback_gains", "tuning.lateness",
     "tuning.linked_axes", "tuning.move_counter", "tuning.oscillation_watch", "tuning.stop_causes", "tuning.toml_tables",
     "tuning.runs", "tuning.target", "tuning.drive_audit", "tuning.link_energy", "tuning.outcome", "tuning.rules",
     "tuning.response", "tuning.identify", "tuning.certificate", "tuning.snapshot", "tuning.auto", "tuning.search",

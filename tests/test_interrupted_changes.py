@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
 from drive_env.bus.world import World
-from drive_env.commands import get, parameters
+from drive_env.commands import get
 from drive_env.commands.cli import app
+from drive_env.commands.options import BusOptions
 from drive_env.drives.lent_object import lent
 from drive_env.fieldbus.errors import NoAnswerError
 from drive_env.master.parameters import NotRestoredError, read_parameters, write_all_or_none
@@ -151,15 +152,15 @@ def test_a_commissioning_that_is_interrupted_says_what_it_wrote(served_node, mon
     machine, bus = served_node
     before = int(machine.read(VELOCITY)[0])
     assert CliRunner().invoke(app, ["set", "6081", "655361", *bus]).exit_code == 0
-    connect, opened = parameters._connected, []
+    connect, opened = BusOptions.connect, []
 
-    def once(*arguments):
+    def once(*arguments, **others):
         opened.append(None)
         if len(opened) > 1:
             raise KeyboardInterrupt
-        return connect(*arguments)
+        return connect(*arguments, **others)
 
-    monkeypatch.setattr(parameters, "_connected", once)
+    monkeypatch.setattr(BusOptions, "connect", once)
     done = CliRunner().invoke(app, ["commission", machine.motor.name, "--yes", "--json", *bus])
     assert (done.exit_code, int(machine.read(VELOCITY)[0])) == (130, before)
     assert f"6081h:00 Profile velocity: 655361 -> {before}" in done.stderr

@@ -775,7 +775,8 @@ def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path, monkeypatch):
             drives.write(0x6081, [1111, 2222])
             values = commissioned_values(drives)
         again = {"bus": bus, "nodes": (NODE,), "pace": "lockstep", "safety": False}
-        monkeypatch.setattr("drive_env.commands.export.connect", lambda *_, **__: CanDrives(eds=source, **again))
+        opened = lambda *_, **__: CanDrives(eds=source, **again)  # noqa: E731
+        monkeypatch.setattr("drive_env.commands.options.BusOptions.connect", opened)
         done = run("export", tmp_path / "named.eds", "--eds", source, "--node", NODE)
         assert done.stdout.endswith(f"{len(values)} parameters of {source.stem}\n"), done.output
     finally:

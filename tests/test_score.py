@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import MappingProxyType, SimpleNamespace
 from typing import NamedTuple
 
@@ -579,6 +580,7 @@ POSITION, CURRENT, STATUS = 0x6064, 0x6077, 0x6041
 def scored(variants=VARIANTS[:3], repeats=1, **recorded):
     """A score of two machines of two axes, three runs of each."""
     made = StepperScore.__new__(StepperScore)  # which runs as a servo's does, and needs no loops
+    made._settling_scale = partial(RobustScore._settling_scale, made)
     made.variants, made.num_machines, made.repeats = variants[: 3 // repeats], 2, repeats
     made._runs, made._axes = 3, (2, 3, 2)
     made.dynamics, made._has_loops = find_dynamics("standard"), False

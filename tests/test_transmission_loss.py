@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drive_env.motors import find_motor
+from drive_env.trials.positioning import CYCLE
 from tuning.identify.momentum_balance import balance_rows, motion, solve
 from tuning.identify.transmission_loss import Loss, find_losses, friction_of_whole_ways
-from tuning.identify.working_state import CYCLE
 
 MOTOR = find_motor("qbl4208")
 LOAD = 2.0 * MOTOR.inertia

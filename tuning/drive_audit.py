@@ -11,7 +11,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import find_device
@@ -23,15 +23,13 @@ from drive_env.drives.speeds import per_increment
 from drive_env.drives.trace import Trace
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import CYCLE, wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.move_counter import MoveCounter
 from tuning.target import Target
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # What counts as a violation, each time anew that it begins:
 OVERSPEED = 1.2  # times the target's limit of speed

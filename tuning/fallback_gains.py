@@ -19,7 +19,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.trace import Trace
 from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import WATCH
-from tuning.arrays import Floats, Integers, Mask
+from mechanics.arrays import Floats, Integers, Mask
 
 WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good gains have had the second to calm it
 

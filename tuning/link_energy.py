@@ -10,16 +10,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.roles import Role
 from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, highest_ramp, plan_move
+from mechanics.arrays import Floats, Mask
 
 if TYPE_CHECKING:
     from drive_env.motors import Motor
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
 
 LINK_SHARE = 0.8  # of what the link holds, that is filled: the supply may be higher than what was entered
 SLOWER = 0.9  # by which positioning moves are made slower in turn that would overcharge the link
@@ -115,7 +115,7 @@ def _overcharges(
     way: Floats,
     speed: Floats,
     ramp: Floats,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return which axes' moves would overcharge the DC link, (num_axes,); arguments as `bearable_speed` has them."""
     way, speed, ramp = (np.maximum(row, 1e-9) for row in (way, speed, ramp))
     rise = np.minimum(speed / ramp, np.sqrt(way / ramp))

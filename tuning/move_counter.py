@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.trials.positioning import CYCLE
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Key = tuple[int, int]
+from mechanics.arrays import Floats, Integers, Mask
 
 REST = 20  # cycles at rest that end a move
 SLOW, WEAK = 0.002, 0.02  # of the speed and the current that axes may be moved with: less holds a place

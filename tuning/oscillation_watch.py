@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
@@ -21,10 +21,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.trace import Trace
 from drive_env.trials.oscillation import OSCILLATION, strongest_frequency
 from drive_env.trials.positioning import WATCH
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 CLEAR = 3.0
 SOFTER = 4  # by what the velocity gains of an axis are divided that oscillates with gains of our own

@@ -6,12 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 class Outcome(NamedTuple):
@@ -32,7 +29,7 @@ class Outcome(NamedTuple):
     aborts: Integers
     violations: Integers
     notes: tuple[str, ...]
-    accepted: NDArray[np.bool_] | None = None
+    accepted: Mask | None = None
 
 
 Tuner = Callable[[Target, np.random.Generator], Outcome]

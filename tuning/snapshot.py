@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_writable
 from drive_env.drives.interface import Drives, device_of
-from drive_env.fieldbus.description import Description, Key, describe
+from drive_env.fieldbus.description import Description, describe
 from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
 from drive_env.master.identity import Identity, check_same_drive, load_identity, read_identity
@@ -41,6 +41,7 @@ from drive_env.master.parameters import (
 from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.envelope import SafetyError
 from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
+from mechanics.arrays import Mask
 from mechanics.untrusted import read_toml
 from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
     from drive_env.drives.interface import BusSide, DescribedAxes
     from tuning.target import Target
 
-Mask = NDArray[np.bool_]
 
 SWITCH_OFF = 1000  # cycles that switching the voltage off may take
 STORE = (0x1010, 1)

@@ -14,15 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
 from drive_env.drives.interface import Drives, Observer
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.speeds import per_increment
+from mechanics.arrays import Floats, Mask
 from tuning.lateness import Punctuality, late_first
 from tuning.stop_causes import ToldCauses
 
@@ -34,8 +36,6 @@ if TYPE_CHECKING:
     from mechanics.load import Load
     from tuning.runs.inputs import Input
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
 
 # How axes of a bus belong together: machines of their own; joints of one; ends of one thing, none of which goes alone.
@@ -154,7 +154,7 @@ class Target:
 
 
 def emulated(
-    device: str = "tmcm1636",
+    device: str = DEFAULT_DEVICE,
     load: str | Path | Load = "two_mass",
     motor: str | None = None,
     *,
@@ -263,7 +263,7 @@ def of_machines(
 
 
 def on_bus(
-    device: str = "tmcm1636",
+    device: str = DEFAULT_DEVICE,
     motor: str | None = None,
     *,
     interface: str | None = None,

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from agents.benchmark.results import RESULT, TRAINED, Row
-from agents.benchmark.statistics import Floats, ScoreEstimate, interquartile_mean, probability_of_improvement
+from agents.benchmark.statistics import ScoreEstimate, interquartile_mean, probability_of_improvement
 from agents.training.learning_curve import COLORS
 from agents.training.training_run import TABLE
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import write_picture, write_whole
+from mechanics.arrays import Floats
 from mechanics.untrusted import read_rows as read_rows_of
 
 TEXT, NUMBERS, CURVES = "results.md", "results.json", "learning_curves.png"

@@ -12,11 +12,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from tuning.bootstrap import ENDS, RESAMPLES
-
-Floats = NDArray[np.float64]
 
 
 class ScoreEstimate(NamedTuple):

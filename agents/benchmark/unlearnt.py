@@ -7,12 +7,10 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.envs import environment_of, make_vector
 from drive_env.envs.suite import TASKS
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation; the first two are the errors of position and speed
 PAIRS = ((4.0, 0.5), (6.0, 0.5), (8.0, 1.0), (16.0, 1.0), (16.0, 0.1), (32.0, 0.1), (0.0, 1.0), (0.0, 3.0))

@@ -4,18 +4,9 @@ from __future__ import annotations
 
 import importlib
 
-import typer
+from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 
-from agents.commands.options import interrupted
-from drive_env.commands.program import CONTEXT, Quiet, Verbose, Version, say_as_much
-
-app = typer.Typer(
-    name="drive-agent",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
-    pretty_exceptions_enable=False,
-    context_settings=CONTEXT,
-)
+app = Program("drive-agent")
 
 PANELS = {
     "Use an agent": ("tune", "evaluate", "margins", "export"),
@@ -37,12 +28,7 @@ def drive_agent(version: Version = False, quiet: Quiet = False, verbose: Verbose
     say_as_much(quiet, verbose)
 
 
-def main() -> None:
-    """Run the command; Ctrl-C ends it with 130."""
-    try:
-        app()
-    except KeyboardInterrupt:
-        interrupted()
+main = app.run
 
 
 if __name__ == "__main__":

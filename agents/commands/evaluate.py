@@ -33,6 +33,7 @@ from agents.commands.options import (
 from agents.seeds import EVALUATION
 from drive_env.commands.options import DeviceName, Yes, was_typed
 from drive_env.commands.tables import print_lines
+from drive_env.default_device import DEFAULT_DEVICE
 from tuning.commands.options import ask_to_turn
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def evaluate(
     channel: Channel = None,
     node: Nodes = None,
     bitrate: Bitrate = None,
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="For an emulator served with --lockstep: time passes by SYNC.")
     ] = False,

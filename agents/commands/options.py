@@ -122,9 +122,3 @@ def fail(error: object, code: int = USER_ERROR) -> NoReturn:
     """End the command with a red line on stderr."""
     typer.secho(f"drive-agent: {error}", fg=typer.colors.RED, err=True)
     raise typer.Exit(code)
-
-
-def interrupted() -> NoReturn:
-    """End the command as Ctrl-C does before it has begun."""
-    print("drive-agent: interrupted", file=sys.stderr)
-    sys.exit(INTERRUPTED)

@@ -27,6 +27,7 @@ from agents.commands.options import (
 )
 from drive_env.commands.options import DeviceName, Yes, look_first, names_a_bus
 from drive_env.commands.tables import print_lines
+from drive_env.default_device import DEFAULT_DEVICE
 from tuning.commands.options import (
     DriveOptions,
     DynamicsOption,
@@ -56,7 +57,7 @@ def tune(
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="For emulated drives served with --lockstep: time passes by SYNC.")
     ] = (False),
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     motor: MotorName = None,
     load: Annotated[str, typer.Option(help="Load of the emulated drive, where no --interface is given.")] = "two_mass",
     seed: Annotated[

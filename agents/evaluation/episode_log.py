@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.evaluation.scores import Episode
 from agents.plain import plain
 from agents.policies.guard import PATIENT, GuardedPolicy
 from drive_env.whole_file import write_arrays
+from mechanics.arrays import Mask, Singles
 from mechanics.untrusted import parse_json, read_arrays
 from tuning.runs.inputs import as_kept
 
@@ -24,8 +24,8 @@ class EpisodeRecording(NamedTuple):
     environment: str
     configuration: dict[str, Any]
     seeds: list[int]
-    observations: list[NDArray[np.float32]]
-    actions: list[NDArray[np.float32]]
+    observations: list[Singles]
+    actions: list[Singles]
 
 
 class Repeated(NamedTuple):
@@ -54,7 +54,7 @@ def save(path: Path, environment: str, configuration: dict[str, Any], episodes: 
     write_arrays(path, arrays)
 
 
-def ends_of(episodes: Sequence[Episode]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def ends_of(episodes: Sequence[Episode]) -> tuple[Mask, Mask]:
     """Return which steps of all episodes, one after the other, terminated one, and which truncated one."""
     lengths = [len(episode.actions) for episode in episodes]
     is_last = np.zeros(sum(lengths), bool)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.evaluation.evaluation import Evaluation
 from agents.evaluation.scores import Interval, interval
+from mechanics.arrays import Floats
 from tuning.bootstrap import bootstrap_interval
-
-Floats = NDArray[np.float64]
 
 EMULATOR = "emulator"  # as a side: machines that are drawn for each episode
 

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.policies.agent_file import AgentFile
 from agents.policies.policy import policy_of
@@ -24,8 +23,7 @@ from drive_env.envs import environment_of
 from drive_env.envs.tracking import Tracking
 from drive_env.loops.dynamics import Dynamics
 from drive_env.motors import find_motor
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Complex, Floats
 
 MACHINES = 32  # that are drawn
 REPEATS = 4  # of every machine, with other trajectories and phases, against non-linear parts
@@ -44,7 +42,7 @@ class Sensitivity(NamedTuple):
     """
 
     frequencies: Floats
-    response: NDArray[np.complex128]
+    response: Complex
 
     @property
     def ms(self) -> Floats:
@@ -177,7 +175,7 @@ class _Measured:
         self._amplitude = PUSH * rated * np.sqrt(2.0 / len(self._bins))
         self._machines = lanes.reset(seed=seed)[1]["parameters"]
 
-    def episode(self, repeat: int, axis: int | None) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    def episode(self, repeat: int, axis: int | None) -> tuple[Complex, Complex]:
         """Return lines of the motors' torque, shape (lines, machines, axes), and of the push, (lines, 1)."""
         lanes, config, everyone = self._lanes, self._lanes.config, np.ones(self._lanes.num_envs, bool)
         machine = emulated_of(lanes.drives).machine

@@ -11,6 +11,7 @@ import numpy as np
 from agents.policies.guard import GuardLimits
 from agents.tasks import OF_MACHINES, environment_name, make_environments
 from drive_env import cia402
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import given
 from drive_env.envs import environment_of
@@ -36,7 +37,7 @@ def target_for(
     configuration: Mapping[str, Any],
     guard: GuardLimits,
     *,
-    device: str = "tmcm1636",
+    device: str = DEFAULT_DEVICE,
     interface: str | None = None,
     channel: str | None = None,
     nodes: Sequence[int] | None = None,

@@ -9,14 +9,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.envs import environment_of
 from drive_env.envs.suite import TASKS
 from drive_env.trials.score import TRIP
+from mechanics.arrays import Floats
 from tuning.bootstrap import bootstrap_interval
-
-Floats = NDArray[np.float64]
 
 
 class Episode(NamedTuple):

@@ -22,9 +22,10 @@ from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import environment_of
 from drive_env.fieldbus.errors import BusError
 from drive_env.safety.envelope import SafetyError
+from mechanics.arrays import Integers
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 ROBUST_COST = "robust cost"
 PATIENCE = 30.0  # s, for a node that waits for us: a late answer says that the computer is busy, not that it is gone
@@ -161,5 +162,5 @@ def _add_robust_cost(machines: Sequence[Machine], sides: Sequence[Evaluation]) -
         yardstick.close()
 
 
-def _answer(episode: Any) -> NDArray[np.int64]:
+def _answer(episode: Any) -> Integers:
     return np.asarray(episode.last["gains"], np.int64)

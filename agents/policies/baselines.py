@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.policies.experts import (
     CarriageServo,
@@ -24,8 +23,8 @@ from agents.policies.experts import (
     TorqueCascade,
 )
 from agents.tasks import environment_name
+from mechanics.arrays import Singles
 
-Array = NDArray[np.float32]
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation
 ERROR, SPEED, SPEED_LATER = 0, 5, 6
 PREVIEW = 0.01  # s, how much later
@@ -51,10 +50,10 @@ class ControlLaw:
     def __init__(self, function: Any) -> None:
         self._function = function
 
-    def act(self, observation: Any) -> Array:
+    def act(self, observation: Any) -> Singles:
         """Return the action for one observation, or one for each environment."""
         action = np.clip(self._function(np.atleast_2d(observation)), -1.0, 1.0).astype(np.float32)
-        found: Array = action[0] if np.ndim(observation) == 1 else action
+        found: Singles = action[0] if np.ndim(observation) == 1 else action
         return found
 
     def reset(self, mask: Any = None) -> None:

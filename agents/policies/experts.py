@@ -12,15 +12,13 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import Rule, rule_gains
 from drive_env.envs.gain_scheduling import base_inertia
 from drive_env.motors import find_motor
+from mechanics.arrays import Floats, Singles
 from mechanics.loads import find_load
-
-Floats = NDArray[np.float64]
 
 AXIS_ENTRIES = 8
 ERROR, SPEED_ERROR, POSITION, SPEED, TORQUE, WANTED_SPEED, WANTED_SPEED_LATER = range(7)  # of an axis in Tracking
@@ -58,11 +56,11 @@ class Expert:
     def reset(self, mask: Any = None) -> None:
         """Forget the state of episodes that have ended."""
 
-    def act(self, observation: Any) -> NDArray[np.float32]:
+    def act(self, observation: Any) -> Singles:
         """Return the action for one observation, or one for each environment."""
         rows = np.atleast_2d(np.asarray(observation, float))
         action = np.clip(self.actions(rows), -1.0, 1.0).astype(np.float32)
-        found: NDArray[np.float32] = action[0] if np.ndim(observation) == 1 else action
+        found: Singles = action[0] if np.ndim(observation) == 1 else action
         return found
 
     def actions(self, rows: Floats) -> Floats:

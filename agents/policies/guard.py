@@ -22,6 +22,7 @@ from agents.policies.deadline import Deadline, DeadlineError
 from agents.policies.policy import PolicyError
 from drive_env import cia402, motion
 from drive_env.drives.interface import Drives, device_of
+from mechanics.arrays import Mask
 
 logger = logging.getLogger(__name__)
 
@@ -98,12 +99,12 @@ class GuardedPolicy:
         self._ask(self._policy.act, observation, within=PATIENT.stall)
         self._ask(self._policy.reset, None, within=PATIENT.stall)
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Mask | None = None) -> None:
         """Begin an episode."""
         self._at_limit[:] = 0
         self._ask(self._policy.reset, mask, within=self._limits.stall)
 
-    def told(self, parameters: Any, mask: NDArray[np.bool_]) -> None:
+    def told(self, parameters: Any, mask: Mask) -> None:
         """Tell a policy that asks for it which machines begin."""
         if parameters is not None and hasattr(self._policy, "told"):
             self._ask(lambda known: self._policy.told(known, mask), parameters, within=self._limits.stall)

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.policies.agent_file import AgentFile, BundleError
 from drive_env.whole_file import write_whole
+from mechanics.arrays import Singles
 
 OPSET, IR_VERSION = 17, 8  # old enough for the runtimes of the last years
 TOLERANCE = 1e-5  # of an action's range: float32 adds up in another order there
@@ -119,7 +119,7 @@ def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | Non
     return worst
 
 
-def trial_observations(bundle: AgentFile, steps: int = 200) -> NDArray[np.float32]:
+def trial_observations(bundle: AgentFile, steps: int = 200) -> Singles:
     """Return observations as a training had them and far beyond, shape (steps, 16, entries)."""
     mean, scale = bundle.arrays["observation_mean"], bundle.arrays["observation_scale"]
     rng = np.random.default_rng(0)

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from agents.policies.agent_file import BundleError
 from agents.policies.policy import PolicyError
+from mechanics.arrays import Mask, Singles
 from mechanics.limited_child import call_limited
 from mechanics.untrusted import parse_json, read_bytes
 
@@ -62,10 +63,10 @@ class OnnxPolicy:
                 raise BundleError(f"{path}: {name} has shape {inputs[name]}; a policy's is (environments, cells)")
         self._outputs = ["action", *(CARRIED[name] for name in CARRIED if name in inputs)]
         self._cells = {name: int(inputs[name][1]) for name in CARRIED if name in inputs}
-        self._carried: dict[str, NDArray[np.float32]] = {}
+        self._carried: dict[str, Singles] = {}
         self._lanes = 0
 
-    def act(self, observation: ArrayLike) -> NDArray[np.float32]:
+    def act(self, observation: ArrayLike) -> Singles:
         """Return the action for one observation, or one for each environment.
 
         Raises:
@@ -84,10 +85,10 @@ class OnnxPolicy:
         self._carried = dict(zip(self._carried, after, strict=True))
         if not np.isfinite(action).all():
             raise PolicyError("the policy's output is not a number")
-        found: NDArray[np.float32] = action[0] if np.ndim(observation) == 1 else action
+        found: Singles = action[0] if np.ndim(observation) == 1 else action
         return found
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Mask | None = None) -> None:
         """Reset the state, in all environments or where the mask is true."""
         if mask is None:
             self._lanes = 0

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from agents.policies.agent_file import AgentFile, BundleError
-
-Array = NDArray[np.float32]
+from mechanics.arrays import Mask, Singles
 
 ACTOR = "observation"  # the entry of a dict observation that the actor sees
 
@@ -57,17 +56,17 @@ def policy_of(bundle: AgentFile) -> Any:
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
-def sigmoid(x: Array) -> Array:
+def sigmoid(x: Singles) -> Singles:
     """Return 1/(1 + exp(-x)), which overflows nowhere in this form."""
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)), np.float32)
 
 
-def _elu(x: Array) -> Array:
+def _elu(x: Singles) -> Singles:
     return np.asarray(np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))), np.float32)
 
 
 # Names as the settings have them; torch's own defaults (elu's alpha 1, leaky_relu's slope 0.01).
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+ACTIVATIONS: dict[str, Callable[[Singles], Singles]] = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, np.float32(0.0)),
     "elu": _elu,
@@ -76,16 +75,16 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 }
 
 
-def _clip(x: Array, low: Array, high: Array) -> Array:
+def _clip(x: Singles, low: Singles, high: Singles) -> Singles:
     return np.minimum(np.maximum(x, low), high)
 
 
-def _squash(x: Array, low: Array, high: Array) -> Array:
+def _squash(x: Singles, low: Singles, high: Singles) -> Singles:
     return np.asarray(low + np.float32(0.5) * (np.tanh(x) + np.float32(1.0)) * (high - low), np.float32)
 
 
 # How a network's output becomes an action: cut off at the space's bounds (PPO), or squashed into them (SAC).
-OUTPUTS: dict[str, Callable[[Array, Array, Array], Array]] = {"clip": _clip, "tanh": _squash}
+OUTPUTS: dict[str, Callable[[Singles, Singles, Singles], Singles]] = {"clip": _clip, "tanh": _squash}
 
 
 class Ends:
@@ -105,7 +104,7 @@ class Ends:
         self.low, self.high = (np.asarray(arrays[f"action_{end}"], np.float32) for end in ("low", "high"))
         self._output = OUTPUTS[_choice("output", settings["output"], OUTPUTS)]
 
-    def enter(self, observation: ArrayLike) -> Array:
+    def enter(self, observation: ArrayLike) -> Singles:
         """Return the normalised observations, shape (environments, entries)."""
         x = np.asarray(observation)
         if x.shape[-1:] != self.mean.shape or x.ndim > 2:
@@ -120,7 +119,7 @@ class Ends:
             x = np.minimum(np.maximum((x - self.mean) * self.scale, -self.clip), self.clip)
         return np.atleast_2d(x.astype(np.float32))
 
-    def leave(self, x: Array, observation: ArrayLike) -> Array:
+    def leave(self, x: Singles, observation: ArrayLike) -> Singles:
         """Return the action of a network's output, in the observation's shape."""
         if not np.isfinite(x).all():
             raise PolicyError("the policy's output is not a number")
@@ -128,9 +127,9 @@ class Ends:
         return action[0] if np.ndim(observation) == 1 else action
 
 
-def _layers(bundle: AgentFile) -> list[tuple[Array, Array]]:
+def _layers(bundle: AgentFile) -> list[tuple[Singles, Singles]]:
     """Return weights (in, out) and biases of the layers, in order."""
-    found: list[tuple[Array, Array]] = []
+    found: list[tuple[Singles, Singles]] = []
     while f"weight_{len(found)}" in bundle.arrays:
         weight, bias = (bundle.arrays[f"{name}_{len(found)}"] for name in ("weight", "bias"))
         found.append((np.ascontiguousarray(weight, np.float32), np.asarray(bias, np.float32)))
@@ -159,7 +158,7 @@ class MlpPolicy:
         *self._hidden, self._last = _layers(bundle)
         self._activation = ACTIVATIONS[_choice("activation", bundle.settings["activation"], ACTIVATIONS)]
 
-    def act(self, observation: ArrayLike) -> Array:
+    def act(self, observation: ArrayLike) -> Singles:
         """Return the action for one observation, or one for each environment.
 
         Raises:
@@ -172,7 +171,7 @@ class MlpPolicy:
             x = x @ self._last[0] + self._last[1]
         return self._ends.leave(x, observation)
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Mask | None = None) -> None:
         """Do nothing: there is no state."""
 
 
@@ -193,7 +192,7 @@ class LstmPolicy:
         )
         self._state = self._cell = np.zeros((0, len(self._recurrent)), np.float32)
 
-    def act(self, observation: ArrayLike) -> Array:
+    def act(self, observation: ArrayLike) -> Singles:
         """Return the action for one observation, or one for each environment, and update the state.
 
         Raises:
@@ -212,7 +211,7 @@ class LstmPolicy:
             x = x @ self._last[0] + self._last[1]
         return self._ends.leave(x, observation)
 
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+    def reset(self, mask: Mask | None = None) -> None:
         """Reset the state, in all environments or where the mask is true."""
         keep = np.zeros(len(self._state), bool) if mask is None else ~np.asarray(mask, bool)
         if len(keep) != len(self._state):  # of an earlier number of environments
@@ -232,7 +231,7 @@ class Latency(NamedTuple):
         return f"median {1e6 * self.median:.0f} µs, p99 {1e6 * self.p99:.0f} µs, worst {1e6 * self.worst:.0f} µs"
 
 
-def measure_latency(act: Callable[[Array], Any], entries: int, calls: int = 2000) -> Latency:
+def measure_latency(act: Callable[[Singles], Any], entries: int, calls: int = 2000) -> Latency:
     """Return how long a policy takes for one observation of so many entries, on this computer as it is now."""
     rng = np.random.default_rng(0)
     observations = rng.uniform(-1.0, 1.0, (64, entries)).astype(np.float32)

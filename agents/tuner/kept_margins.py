@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices.gains import cascade_columns
+from mechanics.arrays import Integers, Mask
 from tuning.auto.correction import LOWERED
 from tuning.auto.loop_margins import MEASURED
 from tuning.auto.loop_model import LoopModel, loop_models
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # The least lowered ones first.
 NEAREST = LOWERED[np.abs(np.log(LOWERED)).sum(axis=1).argsort(kind="stable")]

@@ -19,14 +19,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.policy import PolicyError, sigmoid
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
-
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Mask, Singles
 
 # Of an axis's observation (the class docstring of GainTuning): what was identified, then gains, then two trials.
 IDENTIFIED, SHOWN = 4, 16
@@ -43,12 +41,12 @@ LAYERS = ("trial_in", "trial_out", "query", "worth_in", "worth_hidden", "worth_o
 WEIGHTS = ("nearness", *(f"{layer}_{part}" for layer in LAYERS for part in ("weight", "bias")))
 
 
-def silu(x: Array) -> Array:
+def silu(x: Singles) -> Singles:
     """Return x/(1 + exp(-x))."""
     return x * sigmoid(x)
 
 
-def context_of(identified: Array, shown: Array, dynamics: Dynamics) -> Array:
+def context_of(identified: Singles, shown: Singles, dynamics: Dynamics) -> Singles:
     """Return the context of machines, (n, 21).
 
     Args:
@@ -63,21 +61,21 @@ def context_of(identified: Array, shown: Array, dynamics: Dynamics) -> Array:
 class Normaliser(NamedTuple):
     """The scaling of inputs: mean and 1/standard deviation, shapes (21,), (16,); 1/reach of gains."""
 
-    context_mean: Array
-    context_scale: Array
-    shown_mean: Array
-    shown_scale: Array
-    gains_scale: Array
+    context_mean: Singles
+    context_scale: Singles
+    shown_mean: Singles
+    shown_scale: Singles
+    gains_scale: Singles
 
-    def context(self, raw: Array) -> Array:
+    def context(self, raw: Singles) -> Singles:
         """Return contexts as the networks take them."""
         return np.asarray(np.clip((raw - self.context_mean) * self.context_scale, -CLIP, CLIP))
 
-    def shown(self, raw: Array) -> Array:
+    def shown(self, raw: Singles) -> Singles:
         """Scale the results of trials for the networks."""
         return np.asarray(np.clip((raw - self.shown_mean) * self.shown_scale, -CLIP, CLIP))
 
-    def gains(self, raw: Array) -> Array:
+    def gains(self, raw: Singles) -> Singles:
         """Return log gains over the rule's as the networks take them."""
         return raw * self.gains_scale
 
@@ -90,18 +88,18 @@ class Memory(NamedTuple):
     1, trials, value). hidden: What is no trial of the machine, (machines, 1, 1, trials).
     """
 
-    shared: Array
-    query: Array
-    gains: Array
-    keys: Array
-    values: Array
+    shared: Singles
+    query: Singles
+    gains: Singles
+    keys: Singles
+    values: Singles
     hidden: Mask
 
 
 class EnsembleMember:
     """One member of the ensemble; weights as (in, out), `nearness` is ln of s, (heads,)."""
 
-    def __init__(self, weights: dict[str, Array]) -> None:
+    def __init__(self, weights: dict[str, Singles]) -> None:
         self._w = weights
         self._near = np.exp(weights["nearness"])[:, None, None]
         self._heads = len(weights["nearness"])
@@ -111,7 +109,7 @@ class EnsembleMember:
         rest = len(weights["worth_in_weight"]) - self._gains - CONTEXT
         self._value = (rest - (total - keys)) // (self._heads - 1)
 
-    def read(self, context: Array, tried: Array, showed: Array, known: Mask) -> Memory:
+    def read(self, context: Singles, tried: Singles, showed: Singles, known: Mask) -> Memory:
         """Return the memory of normalised contexts (n, 21) and trials (n, trials, ...), where `known` is true."""
         w, (n, trials), value = self._w, known.shape, self._value
         each = np.concatenate([np.repeat(context[:, None], trials, axis=1), tried, showed], axis=2)
@@ -125,7 +123,7 @@ class EnsembleMember:
         keys = told[..., first_key:].reshape(n, trials, self._heads, KEY).transpose(0, 2, 3, 1)
         return Memory(shared, query, tried, keys, told[:, None, :, :value], ~known[:, None, None])
 
-    def ask(self, memory: Memory, gains: Array) -> tuple[Array, Array]:
+    def ask(self, memory: Memory, gains: Singles) -> tuple[Singles, Singles]:
         """Return median and ln of the scale for normalised gains of shape (machines, n, gains)."""
         w, (count, n, _), heads = self._w, gains.shape, self._heads
         query = (gains @ w["query_weight"][: self._gains] + memory.query[:, None]).reshape(count, n, heads, KEY)
@@ -177,7 +175,7 @@ class SurrogatePolicy:
         else:
             self._known[np.repeat(mask, len(self._known) // len(mask))] = False
 
-    def act(self, observation: ArrayLike) -> NDArray[np.float64]:
+    def act(self, observation: ArrayLike) -> Floats:
         """Return the change of the log gains to try, in steps, in the observation's shape.
 
         Raises:
@@ -192,7 +190,7 @@ class SurrogatePolicy:
         chosen = self._least(memory, np.concatenate([chosen[:, None], self._around(chosen)], axis=1))
         return self._leave(chosen - incumbent, observation)
 
-    def answer(self, observation: ArrayLike) -> NDArray[np.float64]:
+    def answer(self, observation: ArrayLike) -> Floats:
         """Return the change of the log gains to the final choice, in steps: to a trial's gains, or the rule's.
 
         All axes of an environment get the same trial: that whose worst axis is best, of those that were not stopped. It
@@ -214,7 +212,7 @@ class SurrogatePolicy:
         self._showed = np.zeros((count, 0, SHOWN), np.float32)
         self._known = np.zeros((count, 0), bool)
 
-    def _take(self, observation: ArrayLike) -> tuple[Array, Array]:
+    def _take(self, observation: ArrayLike) -> tuple[Singles, Singles]:
         """Record the last trial; return the axes' observations and their incumbents' gains."""
         given = np.asarray(observation, np.float32)
         lanes = np.atleast_2d(given)
@@ -251,30 +249,30 @@ class SurrogatePolicy:
         seen = normal.context(self._context), normal.gains(self._tried), normal.shown(self._showed)
         return [network.read(*seen, self._known) for network in self._networks]
 
-    def _ask(self, memory: list[Memory], gains: Array) -> tuple[Array, Array]:
+    def _ask(self, memory: list[Memory], gains: Singles) -> tuple[Singles, Singles]:
         """Return median and scale for gains of shape (machines, n, gains), with the networks' spread in the scale."""
         normal = self._normal.gains(gains)
         told = [network.ask(one, normal) for network, one in zip(self._networks, memory, strict=True)]
         medians, scales = np.stack([one[0] for one in told]), np.exp([one[1] for one in told])
         return medians.mean(axis=0), scales.mean(axis=0) + medians.std(axis=0)
 
-    def _least(self, memory: list[Memory], candidates: Array) -> Array:
+    def _least(self, memory: list[Memory], candidates: Singles) -> Singles:
         """Return the candidate to try of every machine, (machines, gains)."""
         median, scale = self._ask(memory, candidates)
         return _pick(candidates, median - self._curiosity * scale)
 
-    def _around(self, gains: Array) -> Array:
+    def _around(self, gains: Singles) -> Singles:
         """Return candidates around gains of shape (machines, gains), within the range."""
         return np.asarray(np.clip(gains[:, None] + self._near, self._low, self._high))
 
-    def _leave(self, change: Array, observation: ArrayLike) -> NDArray[np.float64]:
+    def _leave(self, change: Singles, observation: ArrayLike) -> Floats:
         lanes = np.atleast_2d(observation)
         # Not float32: times the step it is to be the change again, to the integer that was tried.
         action = np.clip(change.astype(float), -self._step, self._step).reshape(len(lanes), -1) / self._step
-        found: NDArray[np.float64] = action[0] if np.ndim(observation) == 1 else action
+        found: Floats = action[0] if np.ndim(observation) == 1 else action
         return found
 
 
-def _pick(gains: Array, value: Array) -> Array:
+def _pick(gains: Singles, value: Singles) -> Singles:
     """Return the gains with the least value of every machine, (machines, gains)."""
     return np.asarray(gains[np.arange(len(gains)), value.argmin(axis=1)], np.float32)

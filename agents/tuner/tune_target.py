@@ -13,6 +13,7 @@ from agents.shipped import TUNER, shipped
 from agents.tuner.known_range import outside
 from drive_env.devices import find_device
 from drive_env.trials.positioning import longer_way
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from agents.policies.guard import GuardedPolicy, GuardLimits
@@ -23,9 +24,6 @@ if TYPE_CHECKING:
     from tuning.outcome import Outcome
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TRIAL_SECONDS = 0.75
 WIDEST = 10.4  # ln of the range of a gain

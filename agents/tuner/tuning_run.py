@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.tuner.tune_target import TrialShown, tune_target
 from drive_env.loops.dynamics import DEFAULT
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.certificate.certificate import Certificate
     from tuning.target import Target
-
-Integers = NDArray[np.int64]
 
 
 class TunerRun(NamedTuple):

@@ -31,6 +31,7 @@ from drive_env.pictures.demonstration import PictureFormat
 from drive_env.pictures.recording import CYCLE, Recorder
 from drive_env.pictures.render import Picture
 from drive_env.trials.gain_trial import PROBE
+from mechanics.arrays import Integers
 from mechanics.loads import LOADS
 from mechanics.shaft import one
 from tuning.auto.one_button import auto
@@ -126,7 +127,7 @@ def in_words(titles: tuple[str, ...], gains: Iterable[int]) -> str:
     return ", ".join(f"{title} {gain}" for title, gain in zip(titles, gains, strict=True) if "torque" not in title)
 
 
-def move_frames(title: str, gains: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+def move_frames(title: str, gains: Integers) -> Iterator[NDArray[np.uint8]]:
     """Move the axis once with some gains, and draw it as it moves."""
     with EmulatedDrives(load="belt") as drives:
         write_gains(drives, gains)

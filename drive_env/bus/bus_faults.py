@@ -10,7 +10,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.bus.faults import Faults
 from drive_env.bus.world import CYCLE, World
@@ -21,6 +20,7 @@ from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.machine_faults import axes_that_fulfil
 from drive_env.faults.schedule import NEVER, Condition, Order, cycles_of
 from drive_env.faults.table import FaultRow, checked_parameters, find_fault
+from mechanics.arrays import Mask
 
 logger = logging.getLogger(__name__)
 
@@ -231,15 +231,15 @@ class BusFaults:
         chosen = self._axes_of(number)
         if order.axis is not None:
             chosen &= np.arange(len(chosen)) == node.first_axis + order.axis
-        machines: NDArray[np.bool_] = np.logical_or.reduce(chosen.reshape(-1, drives.load.num_axes), axis=1)
+        machines: Mask = np.logical_or.reduce(chosen.reshape(-1, drives.load.num_axes), axis=1)
         of_axis = order.axis is not None or fault.row.group in ("sensor", "motor", "supply")
         return drives.faults.add(replace(order, axis=None), machines, chosen if of_axis else None)
 
-    def _axes_of(self, number: int) -> NDArray[np.bool_]:
+    def _axes_of(self, number: int) -> Mask:
         """Return which of the drives' axes belong to a node, shape (num_axes,); without axes that have no motor."""
         node = self._emulated(number)
         axes = np.arange(node.drives.num_axes) - node.first_axis
-        of_node: NDArray[np.bool_] = (axes >= 0) & (axes < node.drives.device.num_axes)
+        of_node: Mask = (axes >= 0) & (axes < node.drives.device.num_axes)
         return of_node
 
     def _check_axis(self, order: Order, is_of_machine: bool, node: int | None) -> None:

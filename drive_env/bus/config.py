@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from drive_env.bus.faults import Faults
 from drive_env.bus.wire import BIT_RATE, Wire
 from drive_env.bus.world import World
+from drive_env.default_device import DEFAULT_DEVICE
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:  # MuJoCo takes long to import
@@ -34,7 +35,7 @@ class Machine:
     EtherCAT master and no nodes.
     """
 
-    device: str = "tmcm1636"
+    device: str = DEFAULT_DEVICE
     load: str = "two_mass"
     motor: str | None = None
     nodes: tuple[int, ...] = (1,)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import nullcontext
-from types import TracebackType
 
 from drive_env.bus.lateness import Lateness
 from drive_env.bus.transport import Transport
@@ -91,9 +90,7 @@ class Server:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # --- inside ---------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import typer
 
 from drive_env.commands.options import DeviceName, Json, check_free, errors_as_exit_codes, print_json
 from drive_env.commands.tables import print_lines
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectDictionary
@@ -20,7 +21,7 @@ LEAST = 16  # machines that a fit needs
 
 def check_model(
     log: Annotated[Path, typer.Argument(help="Log of a move from rest, as `scope` writes it (CSV).")],
-    device: DeviceName = "tmcm1636",
+    device: DeviceName = DEFAULT_DEVICE,
     motor: Annotated[
         str | None,
         typer.Option(

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
-import typer
-
 from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.eds import print_eds
@@ -21,9 +17,8 @@ from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
 from drive_env.commands.new import new_from_eds
-from drive_env.commands.options import INTERRUPTED
 from drive_env.commands.parameters import backup, commission, diff, restore
-from drive_env.commands.program import CONTEXT, Quiet, Verbose, Version, say_as_much
+from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 from drive_env.commands.render import render
 from drive_env.commands.scan import scan
 from drive_env.commands.scope import scope
@@ -31,13 +26,7 @@ from drive_env.commands.serve import serve
 from drive_env.commands.signed_values import SignedValues
 from drive_env.commands.studio import studio
 
-app = typer.Typer(
-    name="drive-env",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
-    pretty_exceptions_enable=False,
-    context_settings=CONTEXT,
-)
+app = Program("drive-env")
 
 PANELS = {
     "A page for drives": (("studio", studio),),
@@ -85,10 +74,4 @@ def drive_env(version: Version = False, quiet: Quiet = False, verbose: Verbose =
     say_as_much(quiet, verbose)
 
 
-def main() -> None:
-    """Run the command; Ctrl-C ends it with 130."""
-    try:
-        app()
-    except KeyboardInterrupt:
-        print("drive-env: interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+main = app.run

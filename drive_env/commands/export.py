@@ -9,38 +9,30 @@ import typer
 
 from drive_env.commands.options import (
     AxisOfNode,
-    Bitrate,
-    Channel,
-    DeviceName,
     Eds,
-    Interface,
-    Node,
-    Timeout,
+    NodeOptions,
     check_free,
-    connect,
     errors_as_exit_codes,
+    grouped,
     names_a_bus,
 )
 
 KBIT = 1000  # bit/s
 
 
+@grouped
 def export(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(help="New file, .eds or .dcf.", show_default=False)],
     dcf: Annotated[bool, typer.Option("--dcf", help="Write the DCF beside the EDS, too.")] = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
+    *,
+    bus: NodeOptions,
     axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
     eds: Eds = None,
     motor: Annotated[
         str | None,
         typer.Option("--motor", help="Of an emulated drive: what it is commissioned for.", show_default="the device's"),
     ] = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
 ) -> None:
     """Write the EDS or DCF of a drive with its commissioned values: of one on a bus, else of an emulated one.
 
@@ -60,16 +52,7 @@ def export(
         for one in files:
             check_free(one)
         if names_a_bus(context):
-            with connect(
-                interface,
-                channel,
-                None if node is None else [node],
-                device,
-                eds,
-                bitrate=bitrate,
-                timeout=timeout,
-                safety=False,
-            ) as drives:
+            with bus.connect(eds, safety=False) as drives:
                 if axis is not None:
                     chosen_parts([axis], drives.description.num_axes, drives.description.name)
                 values = commissioned_values(drives, axis=axis)
@@ -82,18 +65,17 @@ def export(
                 )
             from drive_env.emulator.emulated_drives import EmulatedDrives
 
-            known = find_device(device)
+            device, known = bus.device, find_device(bus.device)
             if axis is not None:
                 chosen_parts([axis], known.num_axes, device)
             source, whose = known.eds, device
             with EmulatedDrives(device, "inertia", motor, num_machines=known.num_axes, num_threads=1) as emulated:
                 values = commissioned_values(emulated, axis=axis)
         part = "" if axis is None else f", axis {axis} alone"
+        number = bus.node or 1
         for one in files:
             is_dcf = one.suffix.lower() == ".dcf"
-            kbit = CAN_KBIT if bitrate is None else bitrate // KBIT
-            text = commissioned_eds(source, values, one.name, node_id=(node or 1) if is_dcf else None, bit_rate=kbit)
+            kbit = CAN_KBIT if bus.bitrate is None else bus.bitrate // KBIT
+            text = commissioned_eds(source, values, one.name, node_id=number if is_dcf else None, bit_rate=kbit)
             write_whole(one, text)
-            print(
-                f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {node or 1}'}{part}"
-            )
+            print(f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {number}'}{part}")

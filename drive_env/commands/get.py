@@ -11,25 +11,18 @@ import typer
 from drive_env import cia402
 from drive_env.commands.options import (
     REFUSED,
-    AxisOfNode,
-    Bitrate,
-    Channel,
-    DeviceName,
+    AxesOptions,
     Eds,
-    Interface,
     Json,
-    Nodes,
-    Timeout,
     WouldDo,
     Yes,
     ask,
     axes_of,
     axis_name,
     axis_place,
-    connect,
     errors_as_exit_codes,
     fail,
-    look_first,
+    grouped,
     object_name,
     print_json,
     scales_of,
@@ -44,16 +37,12 @@ if TYPE_CHECKING:
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
 
+@grouped
 def get(
     objects: Annotated[list[str], typer.Argument(help="6041, 607D:1 (hexadecimal) or 'Velocity actual value'.")],
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxesOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     raw: Raw = False,
     json: Json = False,
 ) -> None:
@@ -64,14 +53,14 @@ def get(
     """
     with (
         errors_as_exit_codes(),
-        connect(interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout, safety=False) as drives,
+        bus.connect(eds, safety=False) as drives,
     ):
         entries = [drives.description.dictionary.find(object_name(name)) for name in objects]
         scales = [None] * drives.num_axes if raw else scales_of(drives)
         rows = []
         for entry in entries:
             values = drives.read((entry.index, entry.sub))
-            rows += [(k, entry, values[k], scales[k]) for k in axes_of(drives, entry, axis)]
+            rows += [(k, entry, values[k], scales[k]) for k in axes_of(drives, entry, bus.axis)]
         if json:
             print_json([axis_place(drives, k) | _row(*row) for k, *row in rows])
             return
@@ -79,17 +68,13 @@ def get(
             print(f"{axis_name(drives, k)}  {entry.label} = {_text(value, entry, scale, raw)}")
 
 
+@grouped
 def set_object(
     name: Annotated[str, typer.Argument(metavar="OBJECT", help="2042:1 (hexadecimal) or 'Profile velocity'.")],
     value: Annotated[str, typer.Argument(help="An integer, or a quantity: '1000 rpm', '7 A', '0.5 rev', '20 ms'.")],
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxesOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     raw: Raw = False,
     yes: Yes = False,
     json: Json = False,
@@ -106,13 +91,12 @@ def set_object(
     from drive_env.master.can.error_control import is_of_a_watchdog
     from drive_env.master.parameters import command
 
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes(), ExitStack() as stack:
         if dry_run:
-            look_first(interface, channel, node, bitrate, device, eds, timeout)
-        drives = stack.enter_context(connect(interface, channel, node, device, eds, **options))
+            bus.look_first(eds)
+        drives = stack.enter_context(bus.connect(eds, safety=False))
         entry = drives.description.dictionary.find(object_name(name))
-        chosen = axes_of(drives, entry, axis)
+        chosen = axes_of(drives, entry, bus.axis)
         is_controlword = cia402.of_first_axis(entry.index) == cia402.CONTROLWORD
         # A controlword has no unit, and one that stops is not kept waiting for what one would need.
         scales = [None] * drives.num_axes if raw or is_controlword else scales_of(drives)

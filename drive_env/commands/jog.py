@@ -13,21 +13,15 @@ import typer
 from drive_env import cia402
 from drive_env.commands.options import (
     REFUSED,
-    Bitrate,
-    Channel,
-    DeviceName,
+    AxisOptions,
     Eds,
-    Interface,
     Json,
-    Node,
-    Timeout,
     WouldDo,
     axis_name,
-    connect,
     cycle_for,
     errors_as_exit_codes,
     fail,
-    look_first,
+    grouped,
     print_json,
     scales_of,
 )
@@ -39,7 +33,6 @@ if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
     from drive_env.master.bus_drives import BusDrives
 
-AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
 DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
 BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and besides the time that it should take
 RELATIVE = cia402.ENABLE_OPERATION | cia402.RELATIVE
@@ -49,18 +42,14 @@ LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed aske
 LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less with an emergency was stopped by that
 
 
+@grouped
 def jog(
     speed: Annotated[str, typer.Argument(help="Speed: '100 rpm', '1 rev/s', or an integer of the drive's unit.")],
     duration: Annotated[float, typer.Option("--for", help="Duration, without --by [s].")] = 1.0,
     by: Annotated[str | None, typer.Option(help="Distance: '1 rev', '-90 deg', or increments.")] = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: AxisNumber = 0,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     max_current: Annotated[
         str | None, typer.Option(help="Current limit, set in the drive for the movement; by default the drive's own.")
     ] = None,
@@ -82,8 +71,8 @@ def jog(
         from drive_env.drives.limits import Limits
         from drive_env.fieldbus.description import describe
 
-        description = describe(device, eds)
-        known = description.dictionary
+        description = describe(bus.device, eds)
+        known, axis = description.dictionary, bus.axis
         if not 0 <= axis < description.num_axes:
             raise ValueError(f"--axis {axis}: a {description.name} has {description.num_axes} axes, from 0")
         if max_current is not None:
@@ -94,12 +83,9 @@ def jog(
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
         files = None if out is None else new_files(out)
-        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "cycle": cycle_for(description)}
         if dry_run:
-            look_first(interface, channel, None if node is None else [node], bitrate, device, eds, timeout)
-        with connect(
-            interface, channel, None if node is None else [node], device, eds, safety=Limits(current=current), **options
-        ) as drives:
+            bus.look_first(eds)
+        with bus.connect(eds, safety=Limits(current=current), cycle=cycle_for(description)) as drives:
             one = _OneAxis(drives, axis)
             scale = scales_of(drives)[axis]
             movement = _asked_for(one, known, scale, speed, by, duration)

@@ -9,21 +9,15 @@ import typer
 
 from drive_env import cia402
 from drive_env.commands.options import (
-    AxisOfNode,
-    Bitrate,
-    Channel,
-    DeviceName,
+    AxesOptions,
     Eds,
-    Interface,
     Json,
-    Nodes,
-    Timeout,
     axes_of_nodes,
     axis_name,
     check_time,
-    connect,
     default_objects,
     errors_as_exit_codes,
+    grouped,
     object_name,
     print_json,
     scales_of,
@@ -38,18 +32,14 @@ if TYPE_CHECKING:
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
 
+@grouped
 def monitor(
     objects: Annotated[
         list[str] | None, typer.Argument(help="Objects; by default status, mode, position, velocity, current.")
     ] = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxesOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     period: Annotated[float, typer.Option(help="Time between two readings [s].")] = 0.2,
     duration: Annotated[
         float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
@@ -61,14 +51,13 @@ def monitor(
     An axis that stands with its current at its limit for half a second (blocked, against a stop, or its encoder is
     stuck) is named, too. With --json a line for each reading.
     """
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():
         check_time("--period", period)
         check_time("--duration", duration)
-        with connect(interface, channel, node, device, eds, **options) as drives:
+        with bus.connect(eds, safety=False) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
-            axes = axes_of_nodes(drives, axis)
+            axes = axes_of_nodes(drives, bus.axis)
             watch = _Pushing(drives, axes)
             end = time.monotonic() + (float("inf") if duration is None else duration)
             try:

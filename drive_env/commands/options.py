@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.programs import CLOSED, output_is_closed
 
 if TYPE_CHECKING:
@@ -60,6 +64,7 @@ AxisOfNode = Annotated[
     int | None,
     typer.Option("--axis", help="Axis of nodes with several, from 0.", show_default="all that have the object"),
 ]
+AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
 DeviceName = Annotated[
     str, typer.Option("--device", help="Device by name, or your own by its path: a folder, or a variant's .toml.")
 ]
@@ -107,28 +112,117 @@ def object_name(text: str) -> ObjectName:
     return int(found[1], 16), int(found[2] or "0", 16)
 
 
-def connect(
-    interface: str | None,
-    channel: str | None,
-    nodes: list[int] | None,
-    device: str,
-    eds: Path | None,
-    **others: Any,
-) -> BusDrives:
-    """Open drives with a command's options."""
-    from drive_env.master.open_drives import open_drives
+@dataclass(frozen=True, kw_only=True)
+class BusOptions:
+    """Options that name drives on a bus; `grouped` gives a command those of a kind in place of its argument of it."""
 
-    bitrate = others.pop("bitrate", None)
-    if bitrate is not None:
-        others["bitrate"] = bitrate
-    return open_drives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or None, **others)
+    interface: Interface = None
+    channel: Channel = None
+    device: DeviceName = DEFAULT_DEVICE
+    bitrate: Bitrate = None
+    timeout: Timeout = None
+
+    @property
+    def nodes(self) -> list[int] | None:
+        """The nodes that are named; None for the first."""
+        return None
+
+    def connect(self, eds: Path | None = None, **others: Any) -> BusDrives:
+        """Open the drives, of a device or an EDS; `others` as `open_drives` has them."""
+        from drive_env.master.open_drives import open_drives
+
+        if self.bitrate is not None:
+            others["bitrate"] = self.bitrate
+        return open_drives(
+            self.device, eds=eds, interface=self.interface, channel=self.channel, nodes=self.nodes,
+            timeout=self.timeout, **others,
+        )  # fmt: skip
+
+    def look_first(self, eds: Path | None = None) -> None:
+        """Raise NoAnswerError for a node on CAN that is silent, as the function `look_first` does."""
+        look_first(self.interface, self.channel, self.nodes, self.bitrate, self.device, eds, self.timeout)
 
 
-def chosen_node(interface: str | None, node: int | None) -> int:
-    """Return the node that was asked for, or the first."""
-    from drive_env.master.open_drives import default_nodes
+@dataclass(frozen=True, kw_only=True)
+class NodesOptions(BusOptions):
+    """The same of several nodes."""
 
-    return default_nodes(interface)[0] if node is None else node
+    node: Nodes = None
+
+    @property
+    def nodes(self) -> list[int] | None:
+        """The nodes that are named; None for the first."""
+        return self.node or None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxesOptions(NodesOptions):
+    """The same of the axes of several nodes."""
+
+    axis: AxisOfNode = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeOptions(BusOptions):
+    """The same of one node."""
+
+    node: Node = None
+
+    @property
+    def nodes(self) -> list[int] | None:
+        """The node, if it is named; None for the first."""
+        return None if self.node is None else [self.node]
+
+    @property
+    def number(self) -> int:
+        """The node that was asked for, or the first."""
+        from drive_env.master.open_drives import default_nodes
+
+        return default_nodes(self.interface)[0] if self.node is None else self.node
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisOptions(NodeOptions):
+    """The same of one axis of one node."""
+
+    axis: AxisNumber = 0
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command have the fields of a dataclass as options, for each argument that is one."""
+    own = inspect.signature(command, eval_str=True).parameters
+    kinds = {name: p.annotation for name, p in own.items()}
+    groups = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and is_dataclass(kind)}
+    taken = []
+    for name, parameter in own.items():
+        if name in groups:
+            taken += options_of(groups[name])
+        else:
+            taken.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        for name, group in groups.items():
+            given[name] = group(**{f.name: given.pop(f.name) for f in fields(group)})
+        command(**given)
+
+    return with_options(run, taken)
+
+
+def options_of(group: type[Any]) -> list[inspect.Parameter]:
+    """Return the options that the fields of a dataclass are."""
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+        for f in fields(group)
+    ]
+
+
+def with_options(run: Callable[..., None], taken: list[inspect.Parameter]) -> Callable[..., None]:
+    """Return a function that typer gives these options."""
+    run.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]  # what typer reads
+    run.__annotations__ = {p.name: p.annotation for p in taken}
+    return run
 
 
 def look_first(

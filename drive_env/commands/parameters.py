@@ -6,29 +6,22 @@ import sys
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drive_env.commands.options import (
     REFUSED,
-    Bitrate,
-    Channel,
-    DeviceName,
+    AxisOptions,
     Eds,
-    Interface,
     Json,
-    Node,
-    Timeout,
     WouldDo,
     Yes,
     ask,
     check_free,
-    chosen_node,
-    connect,
     errors_as_exit_codes,
     fail,
-    look_first,
+    grouped,
     names_a_bus,
     print_json,
     scales_of,
@@ -40,7 +33,6 @@ if TYPE_CHECKING:
     from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
 
-Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
 Store = Annotated[
     bool,
@@ -54,16 +46,12 @@ Unchecked = Annotated[
 ]
 
 
+@grouped
 def backup(
     file: Annotated[Path, typer.Argument(help="New file (TOML); - prints it.")],
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     json: Json = False,
 ) -> None:
     """Read all parameters of a drive into a file, without commands and services."""
@@ -74,11 +62,10 @@ def backup(
     with errors_as_exit_codes():
         if str(file) != "-":
             check_free(file)
-        node = chosen_node(interface, node)
-        with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
-            _check_axis(drives, axis)
-            values = read_parameters(drives, axis)
-            text = sealed(parameters_text(drives, axis, values))
+        with bus.connect(eds, safety=False) as drives:
+            _check_axis(drives, bus.axis)
+            values = read_parameters(drives, bus.axis)
+            text = sealed(parameters_text(drives, bus.axis, values))
         if str(file) == "-":
             print_text(text)
             return
@@ -86,21 +73,17 @@ def backup(
         if json:
             print_json({"file": str(file), "parameters": len(values)})
         else:
-            print(f"{len(values)} parameters of node {node} written to {file}")
+            print(f"{len(values)} parameters of node {bus.number} written to {file}")
 
 
+@grouped
 def diff(
     context: typer.Context,
     file: File,
     other: Annotated[Path | None, typer.Argument(help="Another file to compare with, instead of the drive.")] = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     json: Json = False,
 ) -> None:
     """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
@@ -112,7 +95,7 @@ def diff(
         if other is not None:
             if names_a_bus(context):
                 raise ValueError(f"{file} is compared with {other}, and with no drive; leave the bus out, or {other}")
-            dictionary = describe(device, eds).dictionary
+            dictionary = describe(bus.device, eds).dictionary
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             _tell_of_changes(file)
             _tell_of_changes(other)
@@ -123,26 +106,22 @@ def diff(
             ]
             scale = None
         else:
-            with _connected(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout) as drives:
-                _check_axis(drives, axis)
-                differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
+            with bus.connect(eds, safety=False) as drives:
+                _check_axis(drives, bus.axis)
+                differences = compare(drives, load_parameters(file, drives.description.dictionary), bus.axis)
                 _tell_of_changes(file)
-                scale = scales_of(drives)[axis]
+                scale = scales_of(drives)[bus.axis]
         _print(differences, "drive" if other is None else other.name, file.name, scale, json)
         if differences:
             raise typer.Exit(REFUSED)
 
 
+@grouped
 def restore(
     file: File,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxisOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     store: Store = False,
     other_drive: OtherDrive = False,
     unchecked: Unchecked = False,
@@ -161,32 +140,27 @@ def restore(
     from drive_env.master.parameters import check_no_commands
 
     with errors_as_exit_codes():
-        known = describe(device, eds)
+        known = describe(bus.device, eds)
         wanted = load_parameters(file, known.dictionary)
         written, axis_then = checked_origin(file, unchecked=unchecked)
         check_no_commands(wanted, file, known.hints)
-        bus = _Bus(interface, channel, chosen_node(interface, node), device, eds, bitrate, timeout)
 
         def check(drives: BusDrives) -> None:
             check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
-            if axis_then not in (None, axis) and not other_drive:
+            if axis_then not in (None, bus.axis) and not other_drive:
                 raise ValueError(
-                    f"{file} was read from axis {axis_then}, and --axis is {axis}; nothing was written. To write it "
-                    "to this axis all the same, add --other-drive"
+                    f"{file} was read from axis {axis_then}, and --axis is {bus.axis}; nothing was written. To write "
+                    "it to this axis all the same, add --other-drive"
                 )
 
-        _exchange(bus, wanted, axis, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
+        _exchange(bus, eds, wanted, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
 
 
+@grouped
 def commission(
     motor: Annotated[str, typer.Argument(help="Motor whose preset is written; ? lists them.")],
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Node = None,
-    axis: Axis = 0,
-    device: DeviceName = "tmcm1636",
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
+    *,
+    bus: AxisOptions,
     store: Store = False,
     yes: Yes = False,
     json: Json = False,
@@ -200,34 +174,21 @@ def commission(
         from drive_env.devices import find_device
         from drive_env.motors import find_motor
 
-        known = find_device(device)
+        known = find_device(bus.device)
         if motor == "?":
             print("\n".join(known.motors))
             return
         preset = known.preset(find_motor(motor))
         dictionary = known.new_dictionary()
         wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
-        bus = _Bus(interface, channel, chosen_node(interface, node), device, None, bitrate, timeout)
         name = f"preset {motor}"
-        _exchange(bus, wanted, axis, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
-
-
-class _Bus(NamedTuple):
-    """A node, as the options name it."""
-
-    interface: str | None
-    channel: str | None
-    node: int
-    device: str
-    eds: Path | None
-    bitrate: int | None
-    timeout: float | None
+        _exchange(bus, None, wanted, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
 
 
 def _exchange(
-    bus: _Bus,
+    bus: AxisOptions,
+    eds: Path | None,
     wanted: dict[tuple[int, int], int],
-    axis: int,
     name: str,
     check: Callable[[Any], None],
     *,
@@ -239,9 +200,9 @@ def _exchange(
     """Write parameters, and print the drive's values as another connection reads them then.
 
     Args:
-        bus: The node.
+        bus: The axis.
+        eds: What describes the drive in place of its device.
         wanted: The parameters.
-        axis: Of the node.
         name: Their source.
         check: Raises for a drive that they are not meant for.
         store: Have the drive keep them.
@@ -252,11 +213,12 @@ def _exchange(
     from drive_env.fieldbus.description import describe
     from drive_env.master import parameters
 
-    wanted = parameters.restorable(wanted, describe(bus.device, bus.eds).hints)
+    axis, node = bus.axis, bus.number
+    wanted = parameters.restorable(wanted, describe(bus.device, eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
-        look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
+        bus.look_first(eds)
     with ExitStack() as written:
-        with _connected(*bus) as drives:
+        with bus.connect(eds, safety=False) as drives:
             _check_axis(drives, axis)
             check(drives)
             differences = parameters.compare(drives, wanted, axis)
@@ -265,21 +227,21 @@ def _exchange(
                 _print(differences, "drive", name, scale, json)
             if dry_run:
                 parameters.check_at_rest(drives, wanted, axis)
-                _tell_plan(differences, scale, bus.node, store=store, json=json)
+                _tell_plan(differences, scale, node, store=store, json=json)
                 return
             if differences:
-                ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
+                ask(f"Write {len(differences)} parameters to node {node}?", yes)
             changes = parameters.write_all_or_none(drives, wanted, axis)
             told = "".join(f"; {one.entry.label}: {one.found} -> {one.wanted}" for one in changes)
-            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {bus.node}{told}"))
+            written.enter_context(told_if_interrupted(f"{len(changes)} written to node {node}{told}"))
             if store:
                 drives.write((0x1010, 1), parameters.SAVE)
         # What was just written is not believed to whom wrote it: another connection reads it anew.
-        with _connected(*bus) as drives:
+        with bus.connect(eds, safety=False) as drives:
             left = parameters.compare(drives, wanted, axis)
     if left:
         fail(
-            f"node {bus.node} does not have the values that were written, by a second reading: "
+            f"node {node} does not have the values that were written, by a second reading: "
             f"{parameters.list_differences(left)}; is another master writing to it? Look with `drive-env diff`, "
             "then restore again",
             REFUSED,
@@ -312,19 +274,6 @@ def _tell_of_changes(file: Path) -> None:
         checked_origin(file, unchecked=False)
     except FileChangedError as error:
         print(f"drive-env: note: {error}", file=sys.stderr)
-
-
-def _connected(
-    interface: str | None,
-    channel: str | None,
-    node: int,
-    device: str,
-    eds: Path | None,
-    bitrate: int | None,
-    timeout: float | None,
-) -> Any:
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
-    return connect(interface, channel, [node], device, eds, **options)
 
 
 def _check_axis(drives: BusDrives, axis: int) -> None:

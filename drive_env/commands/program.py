@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 
 from drive_env import __version__
 from drive_env.commands.compile_bar import show_compiling
+from drive_env.programs import INTERRUPTED
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
 AGAIN = 10.0  # s, after which a line that was printed is printed again
@@ -52,6 +54,33 @@ Version = Annotated[
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print results and errors only: no progress, no warnings.")]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print more about what is done.")]
+
+
+class Program(typer.Typer):
+    """The application of a program: its commands are put into it, and `run` runs the one that is asked for.
+
+    Args:
+        name: The program's.
+        interrupted: What is said of a command that Ctrl-C ends before it can say anything itself.
+    """
+
+    def __init__(self, name: str, interrupted: str = "interrupted") -> None:
+        super().__init__(
+            name=name,
+            no_args_is_help=True,
+            rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
+            pretty_exceptions_enable=False,
+            context_settings=CONTEXT,
+        )
+        self._interrupted = f"{name}: {interrupted}"
+
+    def run(self) -> None:
+        """Run the command; Ctrl-C ends it with 130."""
+        try:
+            self()
+        except KeyboardInterrupt:
+            print(self._interrupted, file=sys.stderr)
+            sys.exit(INTERRUPTED)
 
 
 def say_as_much(quiet: bool, verbose: bool) -> None:

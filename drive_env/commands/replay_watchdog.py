@@ -9,6 +9,7 @@ from typing import Any
 
 from drive_env import cia402
 from drive_env.canopen.frames import NMT, SDO_REQUEST
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.fieldbus.errors import BusError
 from drive_env.fieldbus.tidying import Tidying
@@ -25,8 +26,6 @@ QUICK_STOP, NO_ACTION = 3, 0  # of 6007h
 RAMPS, COASTS = 2, 0  # of 605Ah, the quick stop's option
 # NMT commands; nothing of 1016h is left after the resets.
 START, RESETS = 0x01, (0x81, 0x82)
-
-Key = tuple[int, int]
 
 
 class ReplayWatchdog:

@@ -11,23 +11,17 @@ import typer
 from drive_env.commands.options import (
     INTERRUPTED,
     REFUSED,
-    AxisOfNode,
-    Bitrate,
-    Channel,
-    DeviceName,
+    AxesOptions,
     Eds,
-    Interface,
     Json,
-    Nodes,
-    Timeout,
     axes_of_nodes,
     axis_name,
     check_free,
     check_writable,
-    connect,
     default_samples,
     errors_as_exit_codes,
     fail,
+    grouped,
     object_name,
     print_json,
     scales_of,
@@ -53,19 +47,15 @@ class Trigger(NamedTuple):
     text: str
 
 
+@grouped
 def scope(
     objects: Annotated[
         list[str] | None,
         typer.Argument(help="Objects that can be mapped; by default demands and responses."),
     ] = None,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    axis: AxisOfNode = None,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: AxesOptions,
     eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     duration: Annotated[float, typer.Option(help="Duration of the recording after the trigger [s].")] = 1.0,
     trigger: Annotated[
         str | None, typer.Option(help="Start condition: '606C > 100 rpm', 'Statusword == 0x1637'.")
@@ -82,16 +72,15 @@ def scope(
     It sends SYNC and maps TPDOs, which it restores. Where another master commands the drive it refuses, or ends with
     what came until then: samples of two masters would be wrong.
     """
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():
         _check_times(duration=duration, before=before, wait=wait, period=period)
         table, picture = new_files(out)
-        refuse_other_masters(interface, channel, node, bitrate)
-        with connect(interface, channel, node, device, eds, **options) as drives:
+        refuse_other_masters(bus.interface, bus.channel, bus.nodes, bus.bitrate)
+        with bus.connect(eds, safety=False) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_samples(known, DEFAULT)]
             condition = None if trigger is None else _parse(trigger, known)
-            axes = axes_of_nodes(drives, axis)
+            axes = axes_of_nodes(drives, bus.axis)
             every_scale = scales_of(drives)
             scales = [every_scale[k] for k in axes]
             labels = [axis_name(drives, k) for k in axes]

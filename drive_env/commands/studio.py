@@ -7,22 +7,17 @@ import time
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from drive_env.commands.options import (
-    Bitrate,
-    Channel,
-    DeviceName,
     Eds,
-    Interface,
-    Nodes,
-    Timeout,
+    NodesOptions,
     check_time,
-    connect,
     cycle_for,
     errors_as_exit_codes,
+    grouped,
     names_a_bus,
     was_typed,
 )
@@ -36,21 +31,18 @@ OF_EMULATED = ("load", "motor", "seed", "factory")
 LOOK = 0.02  # s between two looks whether the bus is open
 
 
+@grouped
 def studio(
     context: typer.Context,
-    device: DeviceName = "tmcm1636",
+    *,
+    bus: NodesOptions,
+    eds: Eds = None,
     load: Annotated[str, typer.Option(help="Load of the emulated machine, a name or an MJCF file.")] = "two_mass",
     motor: Annotated[
         str | None, typer.Option(help="Its motor, a name or a TOML file; the device's usual one by default.")
     ] = None,
     factory: Annotated[bool, typer.Option("--factory", help="Emulated drives with factory values.")] = False,
     seed: Annotated[int, typer.Option(help="Seed of everything random in the emulated machine.")] = 0,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    eds: Eds = None,
-    bitrate: Bitrate = None,
-    timeout: Timeout = None,
     port: Annotated[int, typer.Option(help="TCP port of the page; 0 for a free one.")] = 29640,
     listen: Annotated[
         str, typer.Option(help="Address of the page; any but loopback lets the network in, with a token.")
@@ -84,14 +76,12 @@ def studio(
             raise ValueError(f"--port {port} must be 0 to 65535")
         if not listen:
             raise ValueError("--listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in")
+        device = bus.device
         described = describe(device, eds)
-        opener = (
-            _bus(described, interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout)
-            if is_bus
-            else _machine(device, load, motor, factory, seed)
-        )
-        title = _title(described, interface, channel, node) if is_bus else f"{device}, emulated, load {load}"
-        address = {"interface": interface, "channel": channel, "nodes": node, "bitrate": bitrate} if is_bus else {}
+        opener = _bus(described, bus, eds) if is_bus else _machine(device, load, motor, factory, seed)
+        title = _title(described, bus) if is_bus else f"{device}, emulated, load {load}"
+        named = {"interface": bus.interface, "channel": bus.channel, "nodes": bus.node, "bitrate": bus.bitrate}
+        address = named if is_bus else {}
         session = Session(opener, title, described, {name: one for name, one in address.items() if one is not None})
         pages = studio_pages(emulated=not is_bus)
         if is_loopback(listen) and token is None:
@@ -143,27 +133,19 @@ def _machine(device: str, load: str, motor: str | None, factory: bool, seed: int
     return open_machine
 
 
-def _bus(
-    described: Description,
-    interface: str | None,
-    channel: str | None,
-    nodes: list[int] | None,
-    device: str,
-    eds: Path | None,
-    **options: Any,
-) -> Callable[[], Drives]:
+def _bus(described: Description, bus: NodesOptions, eds: Path | None) -> Callable[[], Drives]:
     """Return a function that opens drives of a bus with the envelope; it raises where another master commands them."""
 
     def open_bus() -> Drives:
-        refuse_other_masters(interface, channel, nodes, options["bitrate"])
-        return connect(interface, channel, nodes, device, eds, cycle=cycle_for(described), **options)
+        refuse_other_masters(bus.interface, bus.channel, bus.nodes, bus.bitrate)
+        return bus.connect(eds, cycle=cycle_for(described))
 
     return open_bus
 
 
-def _title(described: Description, interface: str | None, channel: str | None, nodes: list[int] | None) -> str:
+def _title(described: Description, bus: NodesOptions) -> str:
     from drive_env.master.open_drives import default_nodes
 
-    where = " ".join(filter(None, (interface, channel))) or "the bus"
-    numbers = ", ".join(map(str, nodes or default_nodes(interface)))
+    where = " ".join(filter(None, (bus.interface, bus.channel))) or "the bus"
+    numbers = ", ".join(map(str, bus.nodes or default_nodes(bus.interface)))
     return f"{described.name}, node {numbers} on {where}"

@@ -14,12 +14,13 @@ from drive_env import cia402
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
-from drive_env.devices.own_folder import BINDINGS, check_scale, is_own_folder, naming, own_bindings, own_data
+from drive_env.devices.own_folder import BINDINGS, bindings_of, check_scale, is_own_folder, naming, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
 from drive_env.devices.variants import (
     check_rates,
     compose_eds,
     converted_preset,
+    device_data,
     merged,
     own_variant,
     parse_key,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 STANDARD_COMMISSIONING = "standard"
+OF_INDICES = ("timeouts", "commands", "addresses")  # tables of `master` whose keys are indices
 HIGHEST, MASK = "highest", "mask"  # the object's highest value; the bits of its highest value
 
 
@@ -197,6 +199,11 @@ class Device(NamedTuple):
     beyond_range: Mapping[tuple[int, int], str] = MappingProxyType({})
 
     @property
+    def cycle(self) -> float:
+        """Communication cycle [s]."""
+        return 1.0 / self.communication_rate
+
+    @property
     def firmware(self) -> Firmware:
         """The drive's firmware; it is composed at the first look, and compiled at its first use."""
         return find_firmware(self.firmware_name)
@@ -276,17 +283,15 @@ class Device(NamedTuple):
         preset: dict[str, int]
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(read_toml(path)["objects"])
+        elif (table := self.presets.parent / "commissioning.toml").exists():
+            preset = importlib.import_module("drive_env.devices.commissioning").preset(self, motor, read_toml(table))
         elif self.commissioning == STANDARD_COMMISSIONING:
-            rule = importlib.import_module("drive_env.devices.standard_commissioning")
-            preset = rule.preset(self, motor)
-        elif self.presets.parent.parent != FOLDER:
+            preset = importlib.import_module("drive_env.devices.commissioning").standard_preset(self, motor)
+        else:
             raise ValueError(
                 f"{self.name} has no preset for a {motor.name}; write {path} with [objects], name = integer, or take a "
                 f"motor that it has one for: {', '.join(sorted(one.stem for one in self.presets.glob('*.toml')))}"
             )
-        else:
-            rule = importlib.import_module(f"drive_env.devices.{self.presets.parent.name}.commissioning")
-            preset = rule.preset(self, motor)
         if not self.variant_of:
             return preset
         before = find_device(self.variant_of).bindings
@@ -332,9 +337,9 @@ def find_device(name: str) -> Device:
     if name not in device_names() and is_own_folder(name):
         return _own_device(Path(name))
     if name.endswith(".toml"):
-        own = own_variant(Path(name), {known: _read(FOLDER / known) for known in device_names()})
+        own = own_variant(Path(name), {known: device_data(FOLDER / known) for known in device_names()})
     elif name in device_names():
-        own = _read(folder)
+        own = device_data(folder)
     else:
         near = did_you_mean(name, device_names())
         raise ValueError(
@@ -345,13 +350,12 @@ def find_device(name: str) -> Device:
     if "variant_of" in own:
         base = find_device(own["variant_of"])
         folder = FOLDER / base.name
-        data = merged(_read(folder), own)
+        data = merged(device_data(folder), own)
         eds: Path | EdsText = compose_eds(f"{name}.eds", eds_text(base.eds), own)
         bindings = variant_bindings(base.bindings, own["objects"])
     else:
-        rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
-        eds, bindings = folder / data["eds"], {(row.index, row.sub): row for row in rows}
-    return _device(data, folder, eds, bindings, _roles(folder), load_gain_set(folder / "gains.toml"))
+        eds, bindings = folder / data["eds"], bindings_of(folder, data)
+    return _device(data, folder, eds, bindings, _roles(folder, data), load_gain_set(folder / "gains.toml"))
 
 
 def _own_device(folder: Path) -> Device:
@@ -360,9 +364,9 @@ def _own_device(folder: Path) -> Device:
         data = own_data(folder)
         eds = folder / data["eds"]
     with naming(folder / BINDINGS):
-        bindings = own_bindings(folder)
+        bindings = bindings_of(folder, data)
     with naming(folder / "roles.toml"):
-        roles = _roles(folder)
+        roles = _roles(folder, data)
     with naming(folder / "gains.toml"):
         gains = load_gain_set(folder / "gains.toml")
         if missing := [f"{index:04X}h:{sub:02X}" for index, sub in gains.keys if (index, sub) not in bindings]:
@@ -434,12 +438,8 @@ def _device(
     )
 
 
-def _read(folder: Path) -> dict[str, Any]:
-    return read_toml(folder / "device.toml")
-
-
-def _roles(folder: Path) -> dict[Role, tuple[int, int]]:
-    rows = read_toml(folder / "roles.toml")
+def _roles(folder: Path, data: Mapping[str, Any]) -> dict[Role, tuple[int, int]]:
+    rows: dict[str, str] = data.get("roles", {}) | read_toml(folder / "roles.toml")
     return {Role[name.upper()]: parse_key(text) for name, text in rows.items()}
 
 
@@ -480,33 +480,19 @@ def _values(item: int | str) -> Sequence[int]:
     return range(int(first), int(last) + 1)
 
 
-def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
-    return CanopenBehaviour(
-        sdo_timeout=data["sdo_timeout"],
-        boot_time=data["boot_time"],
-        sdo_time=data["sdo_time"],
-        store_time=data["store_time"],
-        frames_per_cycle=data["frames_per_cycle"],
-        receive_buffer=data["receive_buffer"],
-        inhibit_unit=data["inhibit_unit"],
-        event_unit=data["event_unit"],
-        error_behaviour={int(value): state for value, state in data["error_behaviour"].items()},
-        objects={role: parse_key(text) for role, text in data["objects"].items()},
-        save_signature=data["save_signature"],
-        load_signature=data["load_signature"],
-        bootloader_signature=data["bootloader_signature"],
-        store_groups={int(sub): tuple(sections) for sub, sections in data["store_groups"].items()},
-        services=services_of(data),
-        quirks=node_quirks_of(data),
-    )
+def _canopen(data: Mapping[str, Any]) -> CanopenBehaviour:
+    rows = {name: data[name] for name in CanopenBehaviour._fields}
+    rows |= {
+        "error_behaviour": {int(value): state for value, state in data["error_behaviour"].items()},
+        "objects": {role: parse_key(text) for role, text in data["objects"].items()},
+        "store_groups": {int(sub): tuple(sections) for sub, sections in data["store_groups"].items()},
+        "services": services_of(data),
+        "quirks": node_quirks_of(data),
+    }
+    return CanopenBehaviour(**rows)
 
 
-def _master(data: dict[str, Any]) -> MasterHints:
-    return MasterHints(
-        rpdo_type=data["rpdo_type"],
-        timeout=data["timeout"],
-        timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
-        turns_positions_round=tuple(parse_key(text) for text in data["turns_positions_round"]),
-        commands={int(index, 16): what for index, what in data.get("commands", {}).items()},
-        addresses={int(index, 16): what for index, what in data.get("addresses", {}).items()},
-    )
+def _master(data: Mapping[str, Any]) -> MasterHints:
+    by_index = {name: {int(index, 16): row for index, row in data[name].items()} for name in OF_INDICES}
+    turns = tuple(parse_key(text) for text in data["turns_positions_round"])
+    return MasterHints(data["rpdo_type"], data["timeout"], turns_positions_round=turns, **by_index)

@@ -1,21 +1,6 @@
 """Quirks of a drive's profile, where real ones differ from CiA 402: the table `quirks` of a device's data.
 
-Each is a switch that is off where a device does not name it:
-
-    refuses_same_mode           6060h cannot be written with the mode that it has (08000022h): some firmwares begin a
-                                mode anew with each write, and so forbid it
-    mode_display_delay          s from the write of 6060h until mode and 6061h change: a firmware that changes modes in
-                                a slow task; a master that goes on at once is still in the mode before
-    mode_change_needs_halt      an enabled axis changes its mode only at rest with halt (controlword bit 8) set: the
-                                firmware does not hand a motion over from one generator to another
-    absent_status_bits          bits of 6041h that never come: CiA 402 leaves 4, 7, 9, 10 ... 15 to the maker in part
-    set_point_buffer            1: pp keeps a second set-point while it moves to the first, bit 12 stays while the
-                                buffer is full, and bit 5 of the controlword changes the set-point at once (CiA 402-2);
-                                0: each set-point replaces the one before, whatever bit 5 is
-    pv_slows_down_by_6084h      pv speeds up with 6083h and slows down with 6084h (CiA 402-2); else with 6083h both ways
-    pv_starts_and_stops         pv begins with a jump to 2010h and ends with one from 6082h, as pp does
-    strict_transmission_types   a PDO takes the types of the table `strict_transmission_types` alone
-
+`defaults.toml` has every quirk as it is off, and what it is; a field of `DriveQuirks` is one that the record has.
 Speeds in rpm are a unit of `bindings`; inhibit time in ms, bit 30 of an RPDO, latencies and block transfer are rows of
 `canopen` (drive_env/devices/services.py).
 """
@@ -28,12 +13,7 @@ from typing import Any, NamedTuple
 from mechanics.near_names import did_you_mean
 
 MAY_BE_ABSENT = (4, 7, 9, 10, 11, 13, 14, 15)  # the others are the state, or what a handshake waits for
-NO_SWITCH: dict[str, Any] = {
-    "mode_display_delay": 0.0, "mode_change_needs_halt": False, "absent_status_bits": [], "set_point_buffer": 0,
-    "pv_slows_down_by_6084h": False, "pv_starts_and_stops": False,
-}  # fmt: skip
-SWITCHES = ("mode_change_needs_halt", "pv_slows_down_by_6084h", "pv_starts_and_stops")
-ALWAYS = ("refuses_same_mode", "strict_transmission_types")
+OF_OBJECTS = ("refuses_same_mode", "strict_transmission_types")  # what the record knows nothing of
 LONGEST_DELAY = 1.0  # s
 
 
@@ -59,17 +39,16 @@ class DriveQuirks(NamedTuple):
 
 def drive_quirks_of(data: Mapping[str, Any]) -> DriveQuirks:
     """Return the quirks of a device's data; ValueError for a key or a value that cannot be."""
-    row = data["quirks"]
-    for key in row:
-        if key not in NO_SWITCH and key not in ALWAYS:
-            raise ValueError(f"quirks has no {key!r}{did_you_mean(key, (*NO_SWITCH, *ALWAYS))}")
-    row = {**NO_SWITCH, **row}
+    row = {name: value for name, value in data["quirks"].items() if name not in OF_OBJECTS}
+    known = DriveQuirks._field_defaults
+    for name, value in row.items():
+        if name not in known:
+            raise ValueError(f"quirks has no {name!r}{did_you_mean(name, (*known, *OF_OBJECTS))}")
+        if isinstance(known[name], bool) and not isinstance(value, bool):
+            raise ValueError(f"quirks.{name} = {value!r} must be true or false")
     delay, bits, buffer = row["mode_display_delay"], row["absent_status_bits"], row["set_point_buffer"]
     if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay <= LONGEST_DELAY:
         raise ValueError(f"quirks.mode_display_delay = {delay!r} must be 0 to {LONGEST_DELAY:g} s")
-    for name in SWITCHES:
-        if not isinstance(row[name], bool):
-            raise ValueError(f"quirks.{name} = {row[name]!r} must be true or false")
     if not isinstance(bits, list) or any(bit not in MAY_BE_ABSENT for bit in bits):
         raise ValueError(
             f"quirks.absent_status_bits = {bits!r} must be some of {', '.join(map(str, MAY_BE_ABSENT))}: the others "
@@ -77,5 +56,5 @@ def drive_quirks_of(data: Mapping[str, Any]) -> DriveQuirks:
         )
     if buffer not in (0, 1) or isinstance(buffer, bool):
         raise ValueError(f"quirks.set_point_buffer = {buffer!r} must be 0, or 1 for one more set-point")
-    needs_halt, *of_pv = (row[name] for name in SWITCHES)
-    return DriveQuirks(float(delay), needs_halt, sum(1 << bit for bit in set(bits)), buffer, *of_pv)
+    row |= {"mode_display_delay": float(delay), "absent_status_bits": sum(1 << bit for bit in set(bits))}
+    return DriveQuirks(**row)

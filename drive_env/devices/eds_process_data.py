@@ -6,9 +6,8 @@ from collections.abc import Iterator, Mapping
 
 from canopen.objectdictionary import ODVariable
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.eds_file import Section, object_section
-
-Key = tuple[int, int]
 
 RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
 TO_MAPPING = 0x200

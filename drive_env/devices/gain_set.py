@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from drive_env.cia402 import Key
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.axis_objects import AxisObjects
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Key = tuple[int, int]
 
 
 class Gain(NamedTuple):
@@ -215,7 +213,7 @@ class GainSet:
         result[..., columns] = np.clip(wanted, lowest, np.asarray(highest)[columns])
         return result
 
-    def change(self, raw: Integers, since: Integers, columns: Sequence[int] | Integers) -> NDArray[np.float64]:
+    def change(self, raw: Integers, since: Integers, columns: Sequence[int] | Integers) -> Floats:
         """Return how far some gains are from others, (..., len(columns)), as `changed` takes it."""
         unit = self._per_unit(columns)
         now, before = raw[..., columns], since[..., columns]
@@ -224,7 +222,7 @@ class GainSet:
         ratio = np.log(np.where(unit > 0.0, 1, now)) - np.log(np.where(unit > 0.0, 1, before))
         return np.asarray(np.where(unit > 0.0, (now - before) / np.where(unit > 0.0, unit, 1.0), ratio))
 
-    def _per_unit(self, columns: Sequence[int] | Integers) -> NDArray[np.float64]:
+    def _per_unit(self, columns: Sequence[int] | Integers) -> Floats:
         return np.array([PER_UNIT.get(self.rows[k].loop, 0.0) for k in columns])
 
     def scaled(self, raw: Integers, factor: ArrayLike, columns: Sequence[int]) -> Integers:

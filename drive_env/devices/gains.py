@@ -18,17 +18,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices import Device
 from drive_env.dictionary.units import RPM, UNITS, Context, find_unit
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Integers
 
 RAW_MAX = 32767  # the chip's registers are signed
 VELOCITY_FILTER_DAMPING = 0.7
 DEFAULT_INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
 
-RawGains = Sequence[int] | NDArray[np.int64]  # in the order of the device's gain set
+RawGains = Sequence[int] | Integers  # in the order of the device's gain set
 Part = tuple[str, str]  # of a cascade: loop, and "P" or "I"
 
 
@@ -131,7 +132,7 @@ def bandwidth_gains(
     position_hz: float,
     supply: float | None = None,
     integration: float = DEFAULT_INTEGRATION,
-) -> NDArray[np.int64]:
+) -> Integers:
     """Return the device's gains for the bandwidths wanted, shape (count,); arguments as `gains_from_bandwidths` has.
 
     Raises:
@@ -195,7 +196,7 @@ BASELINE_RULE = Rule(current_hz=1000.0, speed=0.25, integration=4.0, position=0.
 
 def rule_gains(
     device: Device, motor: Motor, inertia: ArrayLike, rule: Rule = BASELINE_RULE, *, supply: float | None = None
-) -> NDArray[np.int64]:
+) -> Integers:
     """Return a rule's raw gains, shape (n, count) in the order of the device's set, clipped to their ranges.
 
     Args:
@@ -226,7 +227,7 @@ def rule_gains(
     return device.gains.clipped(_of_device(device, raw))
 
 
-def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz: float = 1000.0) -> NDArray[np.float64]:
+def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz: float = 1000.0) -> Floats:
     """Return the sum of the small time constants of the velocity loop [s].
 
     The current loop as a lag, one and a half PWM periods until the voltage acts, the velocity filter's delay, and one
@@ -356,7 +357,7 @@ def integers_per_si(device: Device, supply: float) -> dict[Part, float]:
     return {part: chip[part] * ratio for part, ratio in per_chip(device).items()}
 
 
-def _of_device(device: Device, raw: NDArray[np.float64]) -> NDArray[np.float64]:
+def _of_device(device: Device, raw: Floats) -> Floats:
     """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units."""
     ratios, order = per_chip(device), list(_CHIP)
     return np.asarray(raw[..., [order.index(part) for part in ratios]] * np.array(list(ratios.values())))

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from canopen.objectdictionary import ODVariable
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices.eds_process_data import repair_process_data
 from drive_env.devices.standard_objects import (
     BY_THEMSELVES,
     GAINS,
     HOMING_METHODS,
     MOTOR,
-    MOTOR_ROLES,
     NEEDED,
     QUICK_STOP_OPTIONS,
     STANDARD,
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from drive_env.firmware.common.modes import Mode
     from drive_env.motors import Motor
 
-Key = tuple[int, int]
 Types = Mapping[Key, ODVariable]
 
 TEMPLATE = Path(__file__).parent / "template.toml"
@@ -323,8 +322,8 @@ class _Draft:
             fields.add("position_scaler")
         others = [
             row
-            for row, modes in NEEDED
-            if row.field not in fields and (modes is None or any(mode in self._modes for mode in modes))
+            for row in NEEDED
+            if row.field not in fields and (not row.modes or any(mode in self._modes for mode in row.modes))
         ]
         groups: tuple[tuple[str, Sequence[OwnObject]], ...] = (
             ("Emulator: gains", GAINS), ("Emulator: motor", MOTOR), ("Emulator: what the EDS lacks", others)
@@ -338,9 +337,8 @@ class _Draft:
                 self._write_own(self._base + offset + axis * OWN_PER_AXIS, title, rows)
         told = self._units.increments
         for key, row in self._own:
-            role = {"position_scaler": "position_scale", "i_max": "current_limit"} | MOTOR_ROLES
-            if row.field in role:
-                self._roles[role[row.field]] = key
+            if row.role:
+                self._roles[row.role] = key
             if row.field == "position_scaler" and told:
                 why = f"{told} units a turn by {self._units.sources['position']}, which no object has"
             else:
@@ -479,7 +477,7 @@ class _Draft:
             f"[current]  # A of peak i_q\nrated = {current:.6g}  # base of thousandths: {self._motor.name}\n",
         )
         if info.get("LSS_Supported", "0") not in ("", "0"):
-            text = text.replace("lss = false", "lss = true")
+            text += "\n[canopen.services]\nlss = true\n"
         return f"{head}{text}\n{self._tables()}"
 
     def _axis_offsets(self) -> str:
@@ -506,9 +504,9 @@ class _Draft:
         services = [
             _text((index, sub)) for index in (STORE, RESTORE) for i, sub in self._types if i == index and sub > 0
         ]
-        lines = ["[states]", "", "[values]  # objects that know a few values only"]
+        lines = ["[values]  # objects that know a few values only"]
         lines += [f'"{key}" = [{", ".join(map(_toml, row))}]' for key, row in values.items()]
-        lines += ["", "[strict_transmission_types]", "", "[unsupported]  # without a node on a bus"]
+        lines += ["", "[unsupported]  # without a node on a bus"]
         lines += [f"objects = [{', '.join(map(_quoted, services))}]", "", "[canopen.store_groups]  # CiA 301, 1010h"]
         motors = [f"motor {axis}" for axis in range(self._axes)] + ["module"]
         groups = {

@@ -1,11 +1,12 @@
-"""A device in a folder of one's own: the same files as of those that ship, and all of them data.
+"""A device's folder, one that ships or one of one's own: all of it is data.
 
-    device.toml     rates, limits, causes, what it does on a bus: as drive_env/devices/tmcm1636/device.toml has them
+    device.toml     rates, limits, causes, what it does on a bus; what it leaves out is as defaults.toml has it
     *.eds           its dictionary; device.toml names it
     bindings.toml   "index:sub" = { field, unit, part, event }: which object is which field of the drive record
     roles.toml      which object plays which part
     gains.toml      its gains, and the cascade that they belong to
-    presets/        <motor>.toml for each motor that it is commissioned for
+    commissioning.toml   may be left out: what is written for a motor, by a rule (commissioning.py)
+    presets/        <motor>.toml for each motor that it is commissioned for otherwise
 
 Nothing in the folder is executed.
 """
@@ -20,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from drive_env.devices.variants import Key, parse_key
+from drive_env.cia402 import Key
+from drive_env.devices.variants import device_data, parse_key
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.dictionary.position_scale import COARSEST, FINEST, is_scale, position_scale
@@ -43,7 +45,7 @@ def own_data(folder: Path) -> dict[str, Any]:
     Raises:
         ValueError: If it cannot be read, or is a variant of another device.
     """
-    data = read_toml(folder / "device.toml")
+    data = device_data(folder)
     if "variant_of" in data:
         raise ValueError(
             f"variant_of = {data['variant_of']!r} is for a file alone: give the path of this file as the device"
@@ -51,15 +53,15 @@ def own_data(folder: Path) -> dict[str, Any]:
     return data | {"name": str(folder)}
 
 
-def own_bindings(folder: Path) -> dict[Key, Binding]:
-    """Return the bindings in a folder's `bindings.toml`.
+def bindings_of(folder: Path, data: Mapping[str, Any]) -> dict[Key, Binding]:
+    """Return the bindings in a folder's `bindings.toml`, and those of its family, in the order of their objects.
 
     Raises:
         ValueError: For a unit that there is not, with a near one.
     """
-    rows: Mapping[str, Mapping[str, Any]] = read_toml(folder / BINDINGS)
+    rows: dict[str, dict[str, Any]] = data.get("bindings", {}) | read_toml(folder / BINDINGS)
     bindings = {}
-    for text, row in rows.items():
+    for text, row in sorted(rows.items(), key=lambda row: parse_key(row[0])):
         bindings[parse_key(text)] = binding = Binding(*parse_key(text), **row)
         try:
             find_unit(binding.unit)
@@ -97,8 +99,8 @@ def naming(path: Path) -> Iterator[None]:
         raise ValueError(f"{path} is not a TOML file: {error}") from None
     except KeyError as error:
         raise ValueError(
-            f"{path} lacks or does not know {error}; every key is explained where the TMCM-1636 has it, in "
-            f"drive_env/devices/tmcm1636/{path.name}"
+            f"{path} lacks or does not know {error}; every key is explained in drive_env/devices/defaults.toml, or "
+            f"where the TMCM-1636 has it, in drive_env/devices/tmcm1636/{path.name}"
         ) from None
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from drive_env import cia402
-from drive_env.devices.drive_quirks import NO_SWITCH
+from drive_env.cia402 import Key
 from drive_env.devices.services import OPTIONAL_EMERGENCIES
 from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
@@ -29,7 +29,8 @@ from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
 
-Key = tuple[int, int]
+FAMILIES = ("stepper",)  # each a file beside `DEFAULTS`
+DEFAULTS = Path(__file__).parent / "defaults.toml"
 
 # Data types of CiA 301, table 44; codes of object types of CiA 306.
 TYPES = {
@@ -49,6 +50,25 @@ def parse_key(text: str) -> Key:
     """Return index and sub-index of "2042:5"."""
     index, sub = text.split(":")
     return int(index, 16), int(sub)
+
+
+def device_data(folder: Path) -> dict[str, Any]:
+    """Return what a folder's `device.toml` says, over `defaults.toml` and what the family that it is `like` has.
+
+    A variant's is returned as it is.
+
+    Raises:
+        ValueError: If it cannot be read, or names a family that there is not.
+    """
+    own = read_toml(folder / "device.toml")
+    if "variant_of" in own:
+        return own
+    data = read_toml(DEFAULTS)
+    if like := own.get("like"):
+        if like not in FAMILIES:
+            raise ValueError(f"like = {like!r} names no family of devices; there are {', '.join(FAMILIES)}")
+        data = merged(data, read_toml(DEFAULTS.with_name(f"{like}.toml")))
+    return merged(data, own)
 
 
 def merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,7 +147,6 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
         **base,
         "emergencies": {**more, **emergencies},
         "canopen": {**canopen, "objects": objects},
-        "quirks": {**NO_SWITCH, **base["quirks"]},
     }
 
 

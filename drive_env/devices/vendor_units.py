@@ -15,9 +15,8 @@ from typing import NamedTuple
 from canopen.objectdictionary import ODVariable
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.position_scale import COARSEST, FINEST, is_scale
-
-Key = tuple[int, int]
 
 # Codes of CiA 303-2 in 60A8h to 60AAh: powers of ten above, then numerator, denominator, and a byte that is 0.
 RADIAN, GRADIAN, DEGREE, ARC_MINUTE, ARC_SECOND = 0x10, 0x40, 0x41, 0x42, 0x43

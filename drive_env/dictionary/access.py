@@ -16,6 +16,7 @@ from drive_env.dictionary.aborts import (
     WRONG_TYPE,
     ObjectAccessError,
 )
+from mechanics.arrays import Integers
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
@@ -42,7 +43,7 @@ def check_writable(entry: Entry) -> None:
         raise ObjectAccessError(READ_ONLY, f"{entry.label} can only be read")
 
 
-def checked_values(entry: Entry, value: Any, num_axes: int) -> NDArray[np.int64]:
+def checked_values(entry: Entry, value: Any, num_axes: int) -> Integers:
     """Return values as the wire carries them, int64 of shape (num_axes,), after the checks of type and range.
 
     Args:
@@ -83,7 +84,7 @@ def check_in_range(entry: Entry, raw: NDArray[Any]) -> None:
     _check_range(entry, raw)
 
 
-def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]) -> None:
+def check_allowed(entry: Entry, raw: Integers, allowed: tuple[int, ...]) -> None:
     """Raise 06090030h for a value that is not among the few that the object allows."""
     wrong = raw[~np.isin(raw, allowed)]
     if wrong.size:

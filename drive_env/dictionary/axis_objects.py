@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.entries import ObjectName
-
-Mask = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Integers, Mask
 
 
 class AxisObjects(Protocol):

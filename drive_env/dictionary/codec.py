@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.units import Context, find_unit
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers
 
 
 class Code(NamedTuple):

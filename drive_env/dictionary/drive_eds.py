@@ -9,10 +9,9 @@ from canopen.objectdictionary import ODVariable
 from canopen.objectdictionary.datatypes import UNSIGNED8
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.eds_file import place_of_line
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_text, read_eds
-
-Key = tuple[int, int]
 
 # Objects whose integers are taken apart bit by bit, or tell where an axis is and goes: their length [bits] by CiA 402.
 _BITS = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-Key = tuple[int, int]
+from drive_env.cia402 import Key
 
 
 class Part(NamedTuple):

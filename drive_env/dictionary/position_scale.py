@@ -11,12 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
-
-Floats = NDArray[np.float64]
-Key = tuple[int, int]
+from mechanics.arrays import Floats
 
 # Units of position in a turn: by fewer no position could be held, and of more 32 bits hold fewer than 8 turns.
 COARSEST, FINEST = 100.0, float(2**28)

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.axis_objects import AxisObjects
@@ -20,6 +19,7 @@ from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import position_scale, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import MILLIAMPERE, split_unit
+from mechanics.arrays import Floats, Integers, Mask
 
 
 class EnteredUnit(NamedTuple):
@@ -164,9 +164,7 @@ def is_quantity(value: object) -> bool:
     return found is not None and found[2] is not None
 
 
-def integers(
-    text: str, entry: Entry, scale: Sequence[Scale], where: NDArray[np.bool_] | None = None
-) -> NDArray[np.int64]:
+def integers(text: str, entry: Entry, scale: Sequence[Scale], where: Mask | None = None) -> Integers:
     """Return the integer of each axis for an object that is written as a quantity, 0 where the mask is not true.
 
     Args:
@@ -182,7 +180,7 @@ def integers(
     return np.array([parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)], np.int64)
 
 
-def in_unit(raw: NDArray[np.int64], entry: Entry, unit: str, scale: Sequence[Scale]) -> NDArray[np.float64]:
+def in_unit(raw: Integers, entry: Entry, unit: str, scale: Sequence[Scale]) -> Floats:
     """Return integers of an object in a unit, of the same shape; axes are the last dimension.
 
     Args:

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from mechanics.near_names import did_you_mean
 
-Floats = NDArray[np.float64]
 TWO_PI = 2.0 * np.pi
 MILLIAMPERE = 1e-3  # [A]
 

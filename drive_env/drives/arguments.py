@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
+from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
 
-Mask = NDArray[np.bool_]
 
 LONGEST = 1e7  # s, that any one call, wait or recording may last: 115 days
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.drives.arguments import checked_mask
 from drive_env.drives.drives_proxy import DrivesProxy
 from drive_env.drives.interface import Drives, SafetyWatch
 from drive_env.drives.trace import Trace
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectName

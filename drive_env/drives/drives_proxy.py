@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 from numpy.typing import ArrayLike
 
-from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.drives.interface import BusSide, Drives, MachineSide, Observer, SafetyWatch
 from drive_env.drives.trace import Trace
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

@@ -10,10 +10,10 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from drive_env.dictionary.axis_objects import AxisObjects, Integers, Mask
+from drive_env.dictionary.axis_objects import AxisObjects
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
     from drive_env.fieldbus.link import Link, ObjectReader, Timing
     from mechanics.load import Load
-
-Floats = NDArray[np.float64]
 
 
 class BasicDrives(AxisObjects, Protocol):

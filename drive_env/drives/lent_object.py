@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from drive_env.dictionary.axis_objects import Mask
 from drive_env.drives.arguments import checked_mask
 from drive_env.drives.interface import Drives
 from drive_env.held_signals import held_signals
+from mechanics.arrays import Mask
 
 logger = logging.getLogger(__name__)
 

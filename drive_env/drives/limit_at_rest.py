@@ -7,14 +7,13 @@ reached. The motor has its greatest torque meanwhile, and turns as soon as what 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Mask
 
 SHARE = 0.95  # of the current limit, from which on a current is at it: samples are noisy
 HELD = 0.5  # s, for which it stands so: to set off takes all the current, too, and less time
@@ -34,7 +33,7 @@ class LimitAtRest:
 
     def __init__(self, drives: Drives) -> None:
         self.axes = drives.num_axes
-        self._since: NDArray[np.float64] = np.full(self.axes, np.nan)  # s, when it began
+        self._since: Floats = np.full(self.axes, np.nan)  # s, when it began
         device = drives.device
         self.is_known = device is not None and Role.CURRENT_LIMIT in device.roles
         if device is not None and self.is_known:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats
+
 PerAxis = float | Sequence[float | None]
 
 NO_LIMIT = 2**62  # beyond what any object holds
@@ -75,12 +75,12 @@ class Limits:
                 raise ValueError(f"{name} has {count} values for {num_axes} axes; give one for all, or one each")
 
 
-def given(value: PerAxis | None, num_axes: int) -> NDArray[np.float64]:
+def given(value: PerAxis | None, num_axes: int) -> Floats:
     """Return the user's limit of each axis, shape (num_axes,); nan where only the drive's own limit holds."""
     return np.broadcast_to(_values(value, math.nan), (num_axes,)).astype(float)
 
 
-def _values(value: PerAxis | None, absent: float) -> NDArray[np.float64]:
+def _values(value: PerAxis | None, absent: float) -> Floats:
     if value is None or np.ndim(value) == 0:  # type: ignore[arg-type]
         return np.asarray(absent if value is None else value, float)
     return np.array([absent if one is None else one for one in value], np.float64)  # type: ignore[union-attr]

@@ -7,18 +7,17 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import BasicDrives, axis_number
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
 
-Mask = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 WIDEST = 2**31  # increments: a window of more is a switch
 
 STEP = 0.001  # time between two looks at the statusword [s]

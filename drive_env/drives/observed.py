@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drive_env.dictionary.axis_objects import Mask
 from drive_env.dictionary.roles import Role
 from drive_env.drives.drives_proxy import DrivesProxy
 from drive_env.drives.interface import Drives, MachineSide, Observer
 from drive_env.drives.trace import Trace
+from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName

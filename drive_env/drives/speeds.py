@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.dictionary.position_scale import velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import split_unit
 from drive_env.drives.interface import Drives
+from mechanics.arrays import Floats
 
 _BY_MINUTE = ("rpm", "rpm/s")
 _BY_RATIO = ("velocity unit", "velocity unit/s")  # a drive's own, so many rpm as two of its objects say
 
 
-def per_increment(drives: Drives, name: int | tuple[int, int]) -> NDArray[np.float64] | float:
+def per_increment(drives: Drives, name: int | tuple[int, int]) -> Floats | float:
     """Return the counts that an object has of one increment a second (or second squared), 1 or shape (num_axes,).
 
     A drive that is known by its EDS alone is taken to count increments.
@@ -33,7 +33,7 @@ def per_increment(drives: Drives, name: int | tuple[int, int]) -> NDArray[np.flo
     return rpm if base in _BY_MINUTE else rpm / rpm_of_unit(drives)
 
 
-def rpm_of_unit(drives: Drives) -> NDArray[np.float64]:
+def rpm_of_unit(drives: Drives) -> Floats:
     """Return the rpm of a velocity unit, shape (num_axes,); 1 of drives that have no such unit."""
     device = drives.device
     ratio = None if device is None else velocity_ratio(device.roles)

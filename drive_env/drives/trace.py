@@ -7,17 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.quantities import SHOWN, Scale, find_unit, follows_scale, in_unit
 from drive_env.whole_file import write_table
+from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
 Scales = Callable[[], Sequence[Scale]]
 
 

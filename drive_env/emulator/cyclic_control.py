@@ -11,20 +11,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.interface import Drives
 from drive_env.emulator.group import call_of
 from drive_env.emulator.prepared_record import PreparedRecord, from_od_rows, to_od_rows
+from mechanics.arrays import Integers
 from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Numbers, reader
 from mechanics.calls import address_of_hook, call_hook
 from mechanics.compiled import cached
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
-
-Integers = NDArray[np.int64]
 
 
 class Hooks(NamedTuple):
@@ -124,7 +122,7 @@ class EmulatedCyclicControl(CyclicControl):
     def __init__(
         self, drives: EmulatedDrives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int
     ) -> None:
-        super().__init__(drives, objects, play, cycles, 1.0 / drives.device.communication_rate)
+        super().__init__(drives, objects, play, cycles, drives.device.cycle)
         self._emulated = drives
         self._cycles = cycles
         self._scale_changes = -1

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.cores import usable_cores
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
@@ -43,13 +44,10 @@ from drive_env.firmware.cycle import Call
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor, find_motor
 from drive_env.saved_state import Saved, State, check_alike
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.packed import PackedLoad
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MOST_PREPARED = 64  # calls of record that are kept prepared: more than any loop makes in turn
 
@@ -104,7 +102,7 @@ class EmulatedDrives(Saved):
 
     def __init__(
         self,
-        device: str = "tmcm1636",
+        device: str = DEFAULT_DEVICE,
         load: str | Path | Load = "two_mass",
         motor: str | Path | Motor | None = None,
         num_machines: int = 1,
@@ -222,7 +220,7 @@ class EmulatedDrives(Saved):
         cycles = self.inside.cycles(duration)
         every = self.inside.cycles(period)
         if every < 1:
-            raise ValueError(f"period must be at least {1.0 / self.device.communication_rate:g} s, not {period:g} s")
+            raise ValueError(f"period must be at least {self.device.cycle:g} s, not {period:g} s")
         objects, play = object_names(objects), play or {}
         names = (*objects, None, *play)
         prepared = self._prepared.get(names)
@@ -253,7 +251,7 @@ class EmulatedDrives(Saved):
         return self._trace(result, rows, every)
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
-        t = np.arange(rows, dtype=np.float64) * (every / self.device.communication_rate)
+        t = np.arange(rows, dtype=np.float64) * (every * self.device.cycle)
         scale = self._scales()
         return Trace(t, values, self.inside.objects.entries, lambda: scale)
 

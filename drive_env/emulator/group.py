@@ -11,14 +11,15 @@ from drive_env.devices import Device
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Firmware
 from drive_env.firmware.record import LANES, RecordLayout
+from mechanics.arrays import Floats, Integers
 from mechanics.packed import PackedLoad
 
 
 class Channels(NamedTuple):
     """Fields that a run plays or records: kind and index of lane 0, each of shape (objects,)."""
 
-    kinds: NDArray[np.int64]
-    offsets: NDArray[np.int64]
+    kinds: Integers
+    offsets: Integers
 
 
 def channels(layout: RecordLayout, fields: list[tuple[str, int]], kinds: list[int] | None = None) -> Channels:
@@ -32,9 +33,7 @@ def channels(layout: RecordLayout, fields: list[tuple[str, int]], kinds: list[in
     return Channels(np.array(found, np.int64), np.array(offsets, np.int64))
 
 
-def call_of(
-    values: NDArray[np.float64], played: Channels, samples: NDArray[np.float64], sampled: Channels, every: int
-) -> cycle.Call:
+def call_of(values: Floats, played: Channels, samples: Floats, sampled: Channels, every: int) -> cycle.Call:
     """Return the call that plays `values`, (cycles, objects, axes), into `samples`, (rows, objects, axes), both SI."""
     return cycle.Call(values, played.kinds, played.offsets, samples, sampled.kinds, sampled.offsets, every)
 

@@ -18,13 +18,10 @@ from drive_env.emulator.parameters import MachineParameter
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.motors import Motor
 from drive_env.saved_state import Saved
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
 from mechanics.model import copies_per_model
 from mechanics.packed import pack
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
 LINK_FIELD = "link_shared"  # of firmware whose axes 2k and 2k + 1 may have one DC link
@@ -166,7 +163,7 @@ class Inside(Saved):
         Raises:
             ValueError: If it is no time, or no whole number of them.
         """
-        return whole_cycles(duration, 1.0 / self.device.communication_rate)
+        return whole_cycles(duration, self.device.cycle)
 
     def connect_axes(self, first: int, number: int) -> None:
         """Let machines of one axis each share what axes of one drive do, as a DC link: as on a node.
@@ -189,9 +186,9 @@ class Inside(Saved):
 
     def _apply_to_records(self, name: str, values: Floats, axes: Mask) -> bool:
         """Write a motor or stage parameter into the records; return False for one that is the mechanics'."""
-        if name not in self._kind.known:
+        if (write := self._kind.writes.get(name)) is None:
             return False
-        self._kind.apply(self.records, self.device, self.motor, name, values, axes)
+        write(self.records, self.device, self.motor, values, axes)
         return True
 
     def _armature(self) -> Floats:

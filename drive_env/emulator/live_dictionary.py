@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
-from drive_env.cia402 import State
+from drive_env.cia402 import Key, State
 from drive_env.devices import Device
 from drive_env.dictionary import units
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, WRONG_STATE, ObjectAccessError
@@ -35,11 +35,7 @@ from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.common.modes import MODES
 from drive_env.firmware.record import get_lanes, set_lanes
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Key = tuple[int, int]
+from mechanics.arrays import Floats, Integers, Mask
 
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))

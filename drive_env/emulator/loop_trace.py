@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.interface import Drives
@@ -18,11 +18,11 @@ from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.emulator.group import call_of, channels
 from drive_env.emulator.live_dictionary import NOTHING
 from drive_env.firmware.record import get_lanes, set_lanes
+from mechanics.arrays import Floats
 
 if TYPE_CHECKING:
     pass
 
-Floats = NDArray[np.float64]
 
 # Signal -> unit; fields of the drive's record (firmware/record.py), as they are at a window's start. A drive has
 # those that its firmware has.

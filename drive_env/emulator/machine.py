@@ -21,6 +21,7 @@ from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.record import get_lanes, set_lanes
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from drive_env.emulator.parameters import MachineParameter
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors
@@ -252,7 +251,7 @@ class Machines:
             set_lanes(inside.records, "supply_voltage", volts)
 
     @property
-    def links(self) -> NDArray[np.int64]:
+    def links(self) -> Integers:
         """Which DC link each axis has, shape (num_axes,): the number of the first axis that has it."""
         return self.inside.links
 
@@ -272,7 +271,7 @@ class Machines:
         return self._axis_field("tau_m")
 
     @property
-    def switches(self) -> NDArray[np.int64]:
+    def switches(self) -> Integers:
         """Inputs as the load presses them, bits of 60FDh, shape (num_axes,)."""
         return self._axis_field("inputs").astype(np.int64)
 
@@ -289,14 +288,14 @@ class Machines:
             set_lanes(inside.records, "enable_input", closed.astype(np.int32))
 
     @property
-    def outputs(self) -> NDArray[np.int64]:
+    def outputs(self) -> Integers:
         """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,)."""
         read = self.drives.read
         pins = (1 << self.inside.device.num_outputs) - 1
         return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & pins
 
     @property
-    def digital_inputs(self) -> NDArray[np.int64]:
+    def digital_inputs(self) -> Integers:
         """Levels of the inputs that belong to no axis, bit 0 is IN0, shape (num_axes,); set them likewise, 0 to 255.
 
         A node with several axes shows those of its first one.
@@ -316,7 +315,7 @@ class Machines:
             inside.objects.impose(Role.DIGITAL_INPUTS, values.astype(np.int64) << INPUTS_SHIFT)
 
     @property
-    def analog_inputs(self) -> NDArray[np.int64]:
+    def analog_inputs(self) -> Integers:
         """Readings of the analog inputs, 0...4095, shape (inputs, num_axes); set them likewise."""
         return np.stack([self.drives.read(key) for key in self._analog_inputs()])
 
@@ -333,7 +332,7 @@ class Machines:
         return [(entry.index, entry.sub) for entry in entries if entry.index == first.index and entry.sub >= first.sub]
 
     @property
-    def drive_mode(self) -> NDArray[np.int64]:
+    def drive_mode(self) -> Integers:
         """The drive's own mode, shape (num_axes,), as its maker's service program sets it (the TGZ's D-Mode, 2303h).
 
         Setting it is what such a program does beside a master: none of its frames is seen on the bus. The numbers are
@@ -346,7 +345,7 @@ class Machines:
         self.drives.write(Role.MODE_GATE, value)
 
     @property
-    def error_bits(self) -> NDArray[np.int64]:
+    def error_bits(self) -> Integers:
         """Errors that are there whatever machine and drive do, shape (num_axes,); bit k is error k of the table.
 
         Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is not of

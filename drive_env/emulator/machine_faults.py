@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.emulator.parameters import change_encoder
@@ -28,12 +27,11 @@ from drive_env.faults.effects import (
 from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
 from drive_env.faults.table import FaultRow, checked_parameters, find_fault
 from drive_env.firmware.record import get_lanes, set_lanes
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.inside import Inside
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _CHANGING = ("axes", "state", "begins", "ends")  # of a fault, beside what its order says
 ABSENT, WAITING, DUE, ON, OVER = range(5)  # a machine: not concerned, waits for the condition, for the time, ...
@@ -74,9 +72,9 @@ class _MachineFault:
     delay: int
     length: int
     axes: Mask
-    state: NDArray[np.int64]
-    begins: NDArray[np.int64]
-    ends: NDArray[np.int64]
+    state: Integers
+    begins: Integers
+    ends: Integers
 
     def changes_some(self, quantity: Quantity) -> bool:
         """Return whether it is there on some machine, and changes a quantity."""
@@ -253,7 +251,7 @@ class MachineFaults:
                 self._refresh(fault)
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _made(self, number: int, order: Order, axes: Mask, *changing: NDArray[np.int64]) -> _MachineFault:
+    def _made(self, number: int, order: Order, axes: Mask, *changing: Integers) -> _MachineFault:
         """Return a fault as its order has it, with its axes, and its state, begin and end in each machine."""
         row, changes = self.check(order)
         delay, length = cycles_of(order, row, self._inside.cycles)

@@ -14,7 +14,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
+
 _Halves = NDArray[np.uint32]
 _Words = NDArray[np.uint64]
 _Wide = tuple[_Words, _Words]  # 128 bits: upper and lower half

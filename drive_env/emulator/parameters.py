@@ -14,12 +14,12 @@ from drive_env.emulator.machine_numbers import machine_numbers
 from drive_env.firmware.common.encoder import encoder_count
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
 from mechanics.near_names import did_you_mean
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Records = NDArray[np.void]
+Write = Callable[[Records, Device, Motor, Floats, Mask], None]
 
 # How a motor's cable is wired, each 0 or 1: what 2080h:01, 2070h:01 and 2070h:02 must say for the motor to turn.
 WIRING = ("motor.encoder_direction", "motor.hall_polarity", "motor.hall_direction")
@@ -42,18 +42,16 @@ class MachineKind(NamedTuple):
     Attributes:
         motor_parameters: (motor) -> parameters of the motor, in the order in which they are drawn.
         wiring_parameters: (motor) -> those of its cables, drawn after all others.
-        known: Names of all parameters that `apply` brings into the records.
         set_constants: (records, device, motor): writes the fields that no parameter is.
-        apply: (records, device, motor, name, values, axes): brings a parameter's values, one per axis, into records.
+        writes: Name of a parameter -> what brings its values, one per axis, into the records of some axes.
         noise: Field that is the state of the axes' noise generator; "" without one.
         connect: (records, device, axes): connects what the axes of one drive have in common; None: nothing.
     """
 
     motor_parameters: Callable[[Motor], list[MachineParameter]]
     wiring_parameters: Callable[[Motor], list[MachineParameter]]
-    known: frozenset[str]
     set_constants: Callable[[Records, Device, Motor], None]
-    apply: Callable[[Records, Device, Motor, str, Floats, Mask], None]
+    writes: Mapping[str, Write]
     noise: str
     connect: Callable[[Records, Device, Mask], None] | None = None
 
@@ -68,8 +66,8 @@ def parameter_table(
     """
     rows = kind.motor_parameters(motor)
     for name, row in device.stage.items():
-        if f"stage.{name}" not in kind.known:
-            known = sorted(one.removeprefix("stage.") for one in kind.known if one.startswith("stage."))
+        if f"stage.{name}" not in kind.writes:
+            known = sorted(one.removeprefix("stage.") for one in kind.writes if one.startswith("stage."))
             raise ValueError(
                 f"{device.name}: [stage.{name}] is no parameter of firmware {device.firmware_name!r}; there are "
                 f"{', '.join(known)}{did_you_mean(name, known)}"
@@ -139,7 +137,7 @@ _MAY_VANISH = (
 )  # fmt: skip
 
 
-def check_one_supply(volts: Floats, links: NDArray[np.int64]) -> None:
+def check_one_supply(volts: Floats, links: Integers) -> None:
     """Raise ValueError for axes that share a DC link and would have different supplies [V]."""
     axes = np.flatnonzero(volts != volts[links])
     if axes.size:
@@ -206,6 +204,23 @@ def velocity_filter(cutoff: Floats, rate: float) -> tuple[Floats, Floats, Floats
     return K * K * norm, 2.0 * (K * K - 1.0) * norm, (1.0 - 2.0 * VELOCITY_FILTER_DAMPING * K + K * K) * norm
 
 
+def field(name: str, part: int = 0, live: str = "") -> Write:
+    """Return what writes a parameter that is a field of the record as it stands.
+
+    Args:
+        name: The field.
+        part: Of a deep one.
+        live: Field that the thermal model sets once a period; until then it is the value at 25 degC. "" for none.
+    """
+
+    def write(records: Records, device: Device, motor: Motor, values: Floats, axes: Mask) -> None:
+        set_lanes(records, name, values, axes, part)
+        if live:
+            set_lanes(records, live, values, axes)
+
+    return write
+
+
 def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> None:
     """Change how encoders count from here on, by a field of the record: their counts so far stay."""
 
@@ -241,3 +256,36 @@ def set_velocity_filter(records: Records, device: Device, cutoff: Floats, axes: 
     set_lanes(records, "velocity_filter_b", b, axes)
     set_lanes(records, "velocity_filter_a", a1, axes, 0)
     set_lanes(records, "velocity_filter_a", a2, axes, 1)
+
+
+# Of the machines of every firmware.
+COMMON: dict[str, Write] = {
+    "motor.R_s": field("R_nominal", live="R_s"),
+    "motor.psi_m": field("psi_nominal", live="psi_m"),
+    "motor.thermal_resistance": field("thermal_resistance"),
+    "motor.thermal_time": field("thermal_time"),
+    "motor.ambient": field("ambient"),
+    "motor.encoder_broken": field("encoder_broken"),
+    "motor.encoder_direction": lambda records, device, motor, values, axes: change_encoder(
+        records, "encoder_true_direction", values, axes
+    ),
+    "motor.encoder_interpolation": lambda records, device, motor, values, axes: set_encoder_counts(
+        records, motor, values, axes
+    ),
+    "motor.encoder_line_error": field("encoder_line_error"),
+    "motor.encoder_line_phase": field("encoder_line_phase"),
+    "motor.index_angle": field("index_angle"),
+    "motor.open_a": field("open_a"),
+    "motor.open_b": field("open_b"),
+    "stage.velocity_filter": lambda records, device, motor, values, axes: set_velocity_filter(
+        records, device, values, axes
+    ),
+    "stage.supply_resistance": field("supply_resistance"),
+    "stage.dc_capacitance": field("dc_capacitance"),
+    "stage.idle_current": field("idle_current"),
+    "stage.supply_sinks": field("supply_sinks"),
+    "stage.on_resistance": field("on_resistance"),
+    "stage.thermal_resistance": field("stage_thermal_resistance"),
+    "stage.thermal_time": field("stage_thermal_time"),
+    "stage.short_conductance": field("short_conductance"),
+}

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from drive_env.emulator.group import channels
 from drive_env.firmware import cycle
 from drive_env.firmware.record import LANES, RecordLayout
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Mask
 
 _AT_ONCE = 4096  # axes whose places in memory are computed together: those of 65,536 would take 100 MB
 

@@ -12,18 +12,12 @@ import numpy as np
 
 from drive_env.devices import Device
 from drive_env.emulator import servo_machine
-from drive_env.emulator.parameters import (
-    Floats,
-    MachineKind,
-    MachineParameter,
-    Mask,
-    Records,
-    check_one_supply,
-)
+from drive_env.emulator.parameters import MachineKind, MachineParameter, Records, check_one_supply, field
 from drive_env.emulator.servo_machine import SERVO
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
 from drive_env.motors import Motor
+from mechanics.arrays import Mask
 
 AXES = 2  # that share a link
 OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off
@@ -32,16 +26,6 @@ OVERSPEED = 1.5  # of the rated speed
 # degC; class values. A thermostat of class F insulation, its sensor's limit just below, and a cabinet.
 THERMOSTAT, MOTOR_TEMPERATURE, AMBIENT = 155.0, 145.0, 60.0
 
-# Parameters that are a field of the record as they stand.
-_FIELDS = {
-    "stage.mains_frequency": "mains_frequency",
-    "stage.charging_resistance": "charging_resistance",
-    "stage.idle_power": "idle_power",
-    "stage.brake_power": "brake_power",
-    "stage.brake_thermal_time": "brake_thermal_time",
-    "stage.mains_phase_lost": "mains_phase_lost",
-    "stage.emergency_stop": "emergency_stop",
-}
 _NOT_HERE = {"stage.idle_current", "stage.supply_sinks"}  # the rectifier feeds only
 
 
@@ -51,14 +35,6 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
     for name in ("mains_phase_lost", "emergency_stop"):
         rows.append(MachineParameter(f"stage.{name}", "1", 0.0, 0.0, 0.0, 0.0))
     return rows
-
-
-def apply(records: Records, device: Device, motor: Motor, name: str, values: Floats, axes: Mask) -> None:
-    """Write a motor or stage parameter into the records of the axes where the mask is true."""
-    if name in _FIELDS:
-        set_lanes(records, _FIELDS[name], values, axes)
-    else:
-        servo_machine.apply(records, device, motor, name, values, axes)
 
 
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
@@ -100,9 +76,17 @@ def connect(records: Records, device: Device, axes: Mask) -> None:
 SERVO_MAINS = MachineKind(
     motor_parameters,
     SERVO.wiring_parameters,
-    frozenset((SERVO.known | _FIELDS.keys()) - _NOT_HERE),
     set_constants,
-    apply,
+    {name: write for name, write in SERVO.writes.items() if name not in _NOT_HERE}
+    | {
+        "stage.mains_frequency": field("mains_frequency"),
+        "stage.charging_resistance": field("charging_resistance"),
+        "stage.idle_power": field("idle_power"),
+        "stage.brake_power": field("brake_power"),
+        "stage.brake_thermal_time": field("brake_thermal_time"),
+        "stage.mains_phase_lost": field("mains_phase_lost"),
+        "stage.emergency_stop": field("emergency_stop"),
+    },
     noise=SERVO.noise,
     connect=connect,
 )

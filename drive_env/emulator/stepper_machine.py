@@ -2,67 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from drive_env import motors
 from drive_env.devices import Device
-from drive_env.emulator.parameters import (
-    Floats,
-    MachineKind,
-    MachineParameter,
-    Mask,
-    Records,
-    change_encoder,
-    set_encoder_counts,
-    set_velocity_filter,
-)
-from drive_env.firmware.record import set_lanes
+from drive_env.emulator.parameters import COMMON, MachineKind, MachineParameter, Records, field
 from drive_env.motors import Motor
-
-# Parameters that are a field of the record as they stand.
-_FIELDS = {
-    "motor.R_s": "R_nominal",
-    "motor.L_s": "L_s",
-    "motor.psi_m": "psi_nominal",
-    "motor.detent_torque": "detent_torque",
-    "motor.saturation": "saturation",
-    "motor.thermal_resistance": "thermal_resistance",
-    "motor.thermal_time": "thermal_time",
-    "motor.ambient": "ambient",
-    "motor.encoder_broken": "encoder_broken",
-    "motor.index_angle": "index_angle",
-    "motor.index_inverted": "index_inverted",
-    "motor.brake_opens_in": "brake_opens_in",
-    "motor.brake_closes_in": "brake_closes_in",
-    "motor.open_a": "open_a",
-    "motor.open_b": "open_b",
-    "motor.encoder_line_error": "encoder_line_error",
-    "motor.encoder_line_phase": "encoder_line_phase",
-    "stage.chopper_clock": "chopper_clock",
-    "stage.supply_resistance": "supply_resistance",
-    "stage.dc_capacitance": "dc_capacitance",
-    "stage.idle_current": "idle_current",
-    "stage.supply_sinks": "supply_sinks",
-    "stage.on_resistance": "on_resistance",
-    "stage.thermal_resistance": "stage_thermal_resistance",
-    "stage.thermal_time": "stage_thermal_time",
-    "stage.short_conductance": "short_conductance",
-    "stage.short_a": "short_a",
-    "stage.short_b": "short_b",
-}
-_AT_TEMPERATURE = {"motor.R_s": "R_s", "motor.psi_m": "psi_m"}
-_ENCODER_DIRECTION = "motor.encoder_direction"
-
-# Parameters that are no field as they stand: how each is brought into the records.
-_SPECIAL: dict[str, Callable[[Records, Device, Motor, Floats, Mask], None]] = {
-    _ENCODER_DIRECTION: lambda r, device, motor, values, axes: change_encoder(
-        r, "encoder_true_direction", values, axes
-    ),
-    "motor.encoder_interpolation": lambda r, device, motor, values, axes: set_encoder_counts(r, motor, values, axes),
-    "stage.velocity_filter": lambda r, device, motor, values, axes: set_velocity_filter(r, device, values, axes),
-}
 
 
 def motor_parameters(motor: Motor) -> list[MachineParameter]:
@@ -103,7 +48,7 @@ def wiring_parameters(motor: Motor) -> list[MachineParameter]:
     """Return how the motor's cables may be wired, where its encoder's index is, and how quick a brake on it is."""
     wired = float(motor.encoder_direction)
     return [
-        MachineParameter(_ENCODER_DIRECTION, "1", wired, 0.0, 1.0, wired),
+        MachineParameter("motor.encoder_direction", "1", wired, 0.0, 1.0, wired),
         MachineParameter("motor.index_angle", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0),
         MachineParameter("stage.short_a", "S", 0.0, 0.0, 0.0, 0.0),
         MachineParameter("stage.short_b", "S", 0.0, 0.0, 0.0, 0.0),
@@ -112,17 +57,6 @@ def wiring_parameters(motor: Motor) -> list[MachineParameter]:
         MachineParameter("motor.brake_opens_in", "s", 0.04, 0.02, 0.08, 0.04),
         MachineParameter("motor.brake_closes_in", "s", 0.02, 0.01, 0.04, 0.02),
     ]
-
-
-def apply(records: Records, device: Device, motor: Motor, name: str, values: Floats, axes: Mask) -> None:
-    """Write a motor or stage parameter into the records of the axes where the mask is true."""
-    if name in _SPECIAL:
-        _SPECIAL[name](records, device, motor, values, axes)
-        return
-    set_lanes(records, _FIELDS[name], values, axes)
-    if name in _AT_TEMPERATURE:
-        # The thermal model sets the live value once a period; until then it is the one at 25 degC.
-        set_lanes(records, _AT_TEMPERATURE[name], values, axes)
 
 
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
@@ -135,5 +69,20 @@ def set_constants(records: Records, device: Device, motor: Motor) -> None:
 
 
 STEPPER = MachineKind(
-    motor_parameters, wiring_parameters, frozenset({*_FIELDS, *_SPECIAL}), set_constants, apply, noise=""
+    motor_parameters,
+    wiring_parameters,
+    set_constants,
+    COMMON
+    | {
+        "motor.L_s": field("L_s"),
+        "motor.detent_torque": field("detent_torque"),
+        "motor.saturation": field("saturation"),
+        "motor.index_inverted": field("index_inverted"),
+        "motor.brake_opens_in": field("brake_opens_in"),
+        "motor.brake_closes_in": field("brake_closes_in"),
+        "stage.chopper_clock": field("chopper_clock"),
+        "stage.short_a": field("short_a"),
+        "stage.short_b": field("short_b"),
+    },
+    noise="",
 )

@@ -6,18 +6,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.envs.vector_environment import check_choice
 from drive_env.saved_state import Saved
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 PAYLOADS = ("load.payload", "load.mass", "load.inertia")  # which "auto" takes: the first there is
 NO_PAYLOAD = "none"

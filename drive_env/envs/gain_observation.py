@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.motors import Motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats, Singles
 
 RATIO_MAX = 100.0  # of a true parameter over its default
 
@@ -95,7 +93,7 @@ def tried_entries(tried: Trial, following: Floats, measured: Floats) -> Floats:
     return np.concatenate([flat, np.log(measured)[:, None]], axis=1)
 
 
-def true_entries(parameters: Mapping[str, Floats], defaults: Mapping[str, Floats]) -> NDArray[np.float32]:
+def true_entries(parameters: Mapping[str, Floats], defaults: Mapping[str, Floats]) -> Singles:
     """Return each true parameter's relative difference from its default, shape (environments, parameters)."""
     true = np.stack(
         [

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import find_device
@@ -33,15 +32,13 @@ from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvir
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.motors import Motor, find_motor
 from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
+from mechanics.arrays import Floats, Integers, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
 
 if TYPE_CHECKING:
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
@@ -282,9 +279,8 @@ class GainScheduling(VectorEnvironment):
         self._margins: OnlineMargins | None = None
         c = self.config
         self._payload = find_payload(row, c.payload, c.payload_low, c.payload_high)
-        self._pictures: Pictures | None = None
         self._owned = drives is None
-        self.drives = self._new_drives() if drives is None else drives
+        self.drives = self._new_drives(num_envs) if drives is None else drives
         try:
             if render_mode:
                 self._pictures = Pictures(self.drives, render_mode)
@@ -300,7 +296,7 @@ class GainScheduling(VectorEnvironment):
 
     # --- Environments
     # ----------------------------------------------------------------------------------------------------
-    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Singles, Info]:
         axes = np.repeat(mask, self._axes)
         # First, so that it is the same on a bus, where no machine is drawn.
         self._programme.draw(self.config.excitation, self.reach, self.rngs, mask)
@@ -332,7 +328,7 @@ class GainScheduling(VectorEnvironment):
         self._samples = error, velocity, current
         return self._present()
 
-    def _present(self) -> tuple[NDArray[np.float32], Info]:
+    def _present(self) -> tuple[Singles, Info]:
         return self._observe(*self._samples), self._tell(np.full(self.num_envs, "", object))
 
     def _step_environments(self, action: Any) -> Stepped:
@@ -357,22 +353,7 @@ class GainScheduling(VectorEnvironment):
         info = self._tell(fault) | {"reward_terms": terms}
         return self._observe(*self._samples), np.asarray(reward, float), terminated, self._now >= self._steps, info
 
-    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        return None if self._pictures is None else self._pictures.draw(lane)
-
-    def _close_environments(self) -> None:
-        if self._pictures is not None:
-            self._pictures.close()
-        if self._owned:
-            self.drives.close()
-
     # --- construction ---------------------------------------------------------------------------------------------
-    def _new_drives(self) -> Any:
-        from drive_env.emulator.emulated_drives import EmulatedDrives
-
-        c = self.config
-        return EmulatedDrives(c.device, c.load, c.motor, self.num_envs, friction=c.friction, num_threads=c.num_threads)
-
     def _prepare(self, load: Load) -> None:
         n, axes = self.num_envs, self.drives.num_axes
         if axes != n * self._axes:
@@ -518,7 +499,7 @@ class GainScheduling(VectorEnvironment):
         arrived = came.transpose(2, 0, 1, 3).reshape(3, self._cycles, -1)
         return arrived[0], arrived[1], arrived[2]
 
-    def _observe(self, error: Floats, velocity: Floats, current: Floats) -> NDArray[np.float32]:
+    def _observe(self, error: Floats, velocity: Floats, current: Floats) -> Singles:
         ahead = np.array([0, self._cycles])
         _, speeds, accelerations = self._programme.rows(self._now * self._cycles, ahead, self.reach)
         scaled = error / self._error_scale
@@ -554,7 +535,7 @@ class GainScheduling(VectorEnvironment):
             terms["tracking"] *= self._margins.share(self._in_force)
         return terms | {"trip": -1.0 * terminated}
 
-    def _faults(self, tripped: Mask) -> NDArray[np.object_]:
+    def _faults(self, tripped: Mask) -> Texts:
         """Return the emergency or other cause that ended each environment, "" for those that go on."""
         names = np.full(self.num_envs, "", object)
         if tripped.any():
@@ -566,7 +547,7 @@ class GainScheduling(VectorEnvironment):
             names[self.drives.machine.diverged] = "diverged"
         return names
 
-    def _tell(self, fault: NDArray[np.object_]) -> Info:
+    def _tell(self, fault: Texts) -> Info:
         info: Info = {"fault": fault}
         if self._machines is not None:
             info["parameters"] = self._parameters

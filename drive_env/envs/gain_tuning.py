@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
@@ -29,7 +29,7 @@ from drive_env.envs.gain_observation import (
     true_entries,
 )
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
+from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.motors import Motor, find_motor
 from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
@@ -38,8 +38,7 @@ from drive_env.trials.load_detection import is_load_detection
 from drive_env.trials.method import check_tried, method_of, new_score
 from drive_env.trials.positioning import TRIAL, reach
 from drive_env.trials.score import RobustScore
-
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers, Mask, Texts
 
 JUDGED = ("incumbent", "trial")
 
@@ -229,7 +228,6 @@ class GainTuning(VectorEnvironment):
         self.motor, self._device = find_motor(self.config.motor), find_device(self.config.device)
         self._machines: RandomMachines | None = None
         self._score: RobustScore | None = None
-        self._pictures: Pictures | None = None
         self._owned = drives is None
         self.drives = self._new_drives(num_envs) if drives is None else drives
         try:
@@ -259,14 +257,6 @@ class GainTuning(VectorEnvironment):
         return int(self.config.trials)
 
     # --- construction ---------------------------------------------------------------------------------------------
-    def _new_drives(self, num_envs: int) -> Any:
-        from drive_env.emulator.emulated_drives import EmulatedDrives
-
-        c = self.config
-        return EmulatedDrives(
-            c.device, c.load, c.motor, max(num_envs, 1), friction=c.friction, num_threads=c.num_threads
-        )
-
     def _make_world(self, num_envs: int) -> None:
         c = self.config
         laws = c.distributions
@@ -502,7 +492,7 @@ class GainTuning(VectorEnvironment):
             info["parameters"] = self._parameters
         return info
 
-    def _faults(self) -> NDArray[np.object_]:
+    def _faults(self) -> Texts:
         found = np.empty(self.num_envs, object)
         found[:] = [()] * self.num_envs
         for message in self.drives.emergencies():
@@ -511,9 +501,6 @@ class GainTuning(VectorEnvironment):
                 found[lane] = (*found[lane], message.name)
         return found
 
-    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        return None if self._pictures is None else self._pictures.draw(lane)
-
     def _dead(self) -> Mask:
         return np.asarray(self._trials.down().reshape(self.num_envs, -1).any(axis=1))
 
@@ -521,9 +508,6 @@ class GainTuning(VectorEnvironment):
         return np.asarray(machine_of(self.drives).supply.reshape(self.num_envs, -1)[:, 0])
 
     def _close_environments(self) -> None:
-        if self._pictures is not None:
-            self._pictures.close()
         if self._score is not None:
             self._score.close()
-        if self._owned:
-            self.drives.close()
+        super()._close_environments()

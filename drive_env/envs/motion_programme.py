@@ -6,13 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.saved_state import Saved
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 EXCITATIONS = ("moves", "sine")
 # Of a move of least jerk, 10 s^3 - 15 s^4 + 6 s^5: peaks of speed and acceleration per distance.

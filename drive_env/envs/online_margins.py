@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.drives.interface import Drives, device_of
 from drive_env.loops.dynamics import HIGHEST, Dynamics
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, loops_around, mean_velocity, window
 from drive_env.loops.true_plant import true_machines
 from drive_env.saved_state import Saved
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 LOWEST, POINTS = 2.0, 100  # frequencies looked at: from [Hz], how many; enough for what moves as one
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drive_env.emulator.emulated_drives import emulated_of
+from mechanics.arrays import Floats, Image, Mask
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
@@ -15,9 +13,6 @@ if TYPE_CHECKING:
     from drive_env.pictures.render import Picture
     from drive_env.pictures.window import Window
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 HUMAN = "human"
 FRAME = 0.02  # s of emulated time between two pictures in a window: one takes a tenth of a second to draw

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import Device, find_device
@@ -27,18 +27,10 @@ from drive_env.envs.configuration import configured
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
-from drive_env.envs.vector_environment import (
-    Floats,
-    Info,
-    Mask,
-    Observation,
-    Reward,
-    Stepped,
-    VectorEnvironment,
-    check_choice,
-)
+from drive_env.envs.vector_environment import Info, Observation, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.motors import Motor, find_motor
 from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
+from mechanics.arrays import Floats, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
 
@@ -344,19 +336,6 @@ class Tracking(VectorEnvironment):
         return int(self.config.steps)
 
     # --- construction ---------------------------------------------------------------------------------------------
-    def _new_drives(self, num_envs: int) -> Any:
-        from drive_env.emulator.emulated_drives import EmulatedDrives
-
-        config = self.config
-        return EmulatedDrives(
-            config.device,
-            config.load,
-            config.motor,
-            max(num_envs, 1),
-            friction=config.friction,
-            num_threads=config.num_threads,
-        )
-
     def _spaces(self, num_envs: int) -> tuple[Box, Box]:
         axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
         if rest or not axes:
@@ -461,7 +440,7 @@ class Tracking(VectorEnvironment):
         return np.asarray(per_rad * 2.0 * np.pi / self._per_turn)
 
     # --- an episode -----------------------------------------------------------------------------------------------
-    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Singles, Info]:
         axes = np.repeat(mask, self._axes)
         self._draw_references(
             mask, options.get("trajectory")
@@ -498,7 +477,7 @@ class Tracking(VectorEnvironment):
         cycle.describe_lanes(own.address, mask)
         return self._present()
 
-    def _present(self) -> tuple[NDArray[np.float32], Info]:
+    def _present(self) -> tuple[Singles, Info]:
         observation = self._episodes.observation.copy()
         if self._machines is None:
             return observation, {}
@@ -650,7 +629,7 @@ class Tracking(VectorEnvironment):
                 if attempt == tries - 1:
                     raise
 
-    def _faults(self, lanes: Mask) -> NDArray[np.object_]:
+    def _faults(self, lanes: Mask) -> Texts:
         """Return the cause of each environment's end: emergencies by name, "diverged", "fell", "not enabled", or ""."""
         self._take_emergencies()
         machine = self.drives.machine
@@ -670,12 +649,3 @@ class Tracking(VectorEnvironment):
         for message in self.drives.emergencies():
             if message.code:
                 self._causes[message.axis // self._axes].append(message.name)
-
-    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        return None if self._pictures is None else self._pictures.draw(lane)
-
-    def _close_environments(self) -> None:
-        if getattr(self, "_pictures", None) is not None:
-            self._pictures.close()  # type: ignore[union-attr]
-        if self._owned:
-            self.drives.close()

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
+
 # Generator, number of samples, their period [s] -> what `draw` returns.
 Trajectory = Callable[[np.random.Generator, int, float], ArrayLike]
 

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -25,9 +25,11 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env.emulator.emulated_drives import EmulatedDrives, emulated_of
 from drive_env.randomisation.random_machines import Curriculum, Distributions
 from drive_env.saved_state import Saved, State, check_alike
+from mechanics.arrays import Floats, Mask, Texts
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+if TYPE_CHECKING:
+    from drive_env.envs.pictures import Pictures
+
 Info = dict[str, Any]
 Observation = Any  # an array with environments first, or a dict of such arrays
 Stepped = tuple[Observation, Floats, Mask, Mask, Info]
@@ -40,9 +42,8 @@ RENDER_MODES = ("rgb_array", "human")
 class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     """Base of the vector environments; `config` is a subclass's configuration.
 
-    A subclass gives `_reset_environments` and `_step_environments`; it may replace `_render_environment` and
-    `_close_environments`. Arrays that it
-    returns are handed out as they are: it must make new ones in each step.
+    A subclass gives `_reset_environments` and `_step_environments`. Arrays that it returns are handed out as they are:
+    it must make new ones in each step.
 
     In next-step mode the reset of an ended environment takes place after the others' step, so that an episode is the
     same in every mode; the environment's action of that step is ignored, its reward is 0.
@@ -67,7 +68,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     STATE: tuple[str, ...] = ("_ended", "_some_ended", "_has_begun", "_stage", "_np_random_seed")
     config: Any
     drives: Any
-    _owned: bool  # whether the drives are its own
+    _owned = False  # whether the drives are its own
+    _pictures: Pictures | None = None
 
     def __init__(
         self,
@@ -141,11 +143,24 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         """Steps after which an episode is truncated; None if there is no such number."""
         return None
 
+    # --- what it may replace --------------------------------------------------------------------------------------
+    def _new_drives(self, num_envs: int) -> Any:
+        """Return the machines of the configuration, of all environments."""
+        from drive_env.emulator.emulated_drives import EmulatedDrives
+
+        c = self.config
+        count = max(num_envs, 1)
+        return EmulatedDrives(c.device, c.load, c.motor, count, friction=c.friction, num_threads=c.num_threads)
+
     def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
-        raise NotImplementedError
+        return None if self._pictures is None else self._pictures.draw(lane)
 
     def _close_environments(self) -> None:
         """Release drives and pictures."""
+        if self._pictures is not None:
+            self._pictures.close()
+        if self._owned:
+            self.drives.close()
 
     # --- the curriculum -------------------------------------------------------------------------------------------
     @property
@@ -196,7 +211,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         super().restore_state(state)
         for rng, saved in zip(self.rngs, state["rngs"], strict=True):
             rng.bit_generator.state = saved
-        if (pictures := getattr(self, "_pictures", None)) is not None:
+        if (pictures := self._pictures) is not None:
             pictures.begin(np.ones(self.num_envs, bool))
 
     def _emulated_drives(self) -> EmulatedDrives:
@@ -520,7 +535,7 @@ def _told(info: Info, key: str, mask: Mask) -> Mask:
     return there
 
 
-def _rows(tree: Observation, mask: Mask) -> NDArray[np.object_]:
+def _rows(tree: Observation, mask: Mask) -> Texts:
     """Return one observation per environment where the mask is true, None elsewhere: Gymnasium's final observations."""
     rows = np.full(len(mask), None, object)
     for lane in np.flatnonzero(mask):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import nullcontext
-from types import TracebackType
 
 from drive_env.bus.lateness import Lateness
 from drive_env.ethercat.ways import EtherCatWay, UdpSocket
@@ -74,9 +73,7 @@ class EtherCatServer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # --- inside -----------------------------------------------------------------------------------------------------

@@ -6,9 +6,9 @@ from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
+
 Given = Mapping[str, float]
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from drive_env.faults.table import FAULTS, GROUPS, FaultRow, emergency_name
+from drive_env.default_device import DEFAULT_DEVICE
+from drive_env.devices import find_device
+from drive_env.faults.table import FAULTS, GROUPS, FaultRow
 
 HEADINGS = {
     "sensor": "Sensors", "motor": "Motor and stage", "supply": "Supply", "load": "Load", "bus": "Bus", "node": "Node",
@@ -77,7 +79,9 @@ def page() -> str:
 def _line(row: FaultRow) -> str:
     if row.emergency is None or row.detection is None:
         return f"| [{row.name}](#{row.name}) | nothing | not by the drive |"
-    said = f"{row.emergency:04X}h, {emergency_name(row.emergency).replace('_', ' ')}"
+    rows = find_device(DEFAULT_DEVICE).emergencies  # whose reactions the table has
+    name = next(name for name, one in rows.items() if one.code == row.emergency)
+    said = f"{row.emergency:04X}h, {name.replace('_', ' ')}"
     return f"| [{row.name}](#{row.name}) | {said} | {row.detection * 1e3:g} ms |"
 
 

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from drive_env.devices import find_device
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
 
 GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
-DRIVE = "tmcm1636"  # whose reactions the table has
 
 
 @dataclass(frozen=True)
@@ -107,9 +105,3 @@ def checked_parameters(row: FaultRow, given: Mapping[str, float]) -> dict[str, f
         if isinstance(limits.default, int) and value != int(value):
             raise ValueError(f"fault {row.name}: {name}={value:g} must be a whole number")
     return {name: float(given.get(name, limits.default)) for name, limits in row.parameters.items()}
-
-
-def emergency_name(code: int) -> str:
-    """Return the drive's name of an emergency code."""
-    found = [name for name, emergency in find_device(DRIVE).emergencies.items() if emergency.code == code]
-    return found[0]

@@ -13,13 +13,12 @@ from typing import Any
 from canopen.objectdictionary import ODVariable, datatypes
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role
-
-Key = tuple[int, int]
 
 CYCLE = 0.001  # communication cycle where the device says nothing else [s]
 
@@ -198,7 +197,7 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
             known.num_axes,
             known,
             known.master,
-            cycle=1.0 / known.communication_rate,
+            cycle=known.cycle,
             _types=read_types(known.eds),
         )
     path = Path(eds)

@@ -11,14 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Key
 from drive_env.fieldbus.errors import BusError, NoAnswerError
-
-Integers = NDArray[np.int64]
+from mechanics.arrays import Integers
 
 
 class NoWatchdogError(BusError):

@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.sampled import STILL, ClosedLoops, closed_loops, open_loops, step_overshoot, window
+from mechanics.arrays import Complex, Floats
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 DEFAULT = "standard"
 # What is demanded of a machine that is not as it was tuned (load inertia at both ends of its range, stiffness x 0.8,

@@ -20,18 +20,16 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices.gains import RawGains, cascade_columns, gain_factors
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, held, response, window
 from drive_env.loops.sampled import mean_velocity as mean_velocity_of
+from mechanics.arrays import Complex, Floats
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
-
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 
 class KnownValue(Protocol):

@@ -6,10 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from mechanics.arrays import Floats, Integers, Mask
 
 
 class Margins(NamedTuple):
@@ -87,12 +86,12 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()), phase_at, gain_at)
 
 
-def _unseen(known: NDArray[np.int64], log_gain: Floats) -> NDArray[np.int64]:
+def _unseen(known: Integers, log_gain: Floats) -> Integers:
     """Return after which of the trusted frequencies others follow among which the gain passes 1."""
     return np.flatnonzero((np.diff(known) > 1) & (np.diff(np.sign(log_gain[known])) != 0.0))
 
 
-def _crossings(f: Floats, value: Floats, where: NDArray[np.bool_]) -> Floats:
+def _crossings(f: Floats, value: Floats, where: Mask) -> Floats:
     """Return where a value passes 0 in the chosen intervals, along a straight line over log f."""
     k = np.flatnonzero(where)
     share = value[k] / (value[k] - value[k + 1])

@@ -12,16 +12,13 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices.gains import cascade_columns, gain_factors
+from mechanics.arrays import Complex, Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Integers = NDArray[np.int64]
 
 RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is rigid motion
 _TERMS = 14  # of Taylor's series of exp(X), |X| <= 1/2: 2e-17 are left

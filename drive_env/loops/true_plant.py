@@ -10,17 +10,15 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.sampled import RIGID, LinearMachines, Windings, linear_machines
+from mechanics.arrays import Floats
 from mechanics.packed import PackedLoad
 
 if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
-
-Floats = NDArray[np.float64]
 
 
 def true_plant(drives: Drives, axis: int = 0) -> Plant:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.margins import margins
 from drive_env.loops.sampled import STILL, CascadeGains, LinearMachines, LoopRates, closed_loops, open_loops, window
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 UNSTABLE_MS = 100.0  # Ms of unstable loops, and the greatest there is
 LOWEST, HIGHEST, POINTS = 0.02, 0.49, 4000  # frequencies: from [Hz], up to of the velocity loop's rate, how many

@@ -10,13 +10,12 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Key
+from mechanics.arrays import Integers
 
-Integers = NDArray[np.int64]
 CAN_BE_ASKED = ((cia402.STATUSWORD, 0),)
 PAUSE = 0.004  # s between two answers and the next question
 

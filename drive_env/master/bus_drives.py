@@ -16,9 +16,10 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices import device_of, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable, checked_values
@@ -30,7 +31,7 @@ from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.limits import Limits
 from drive_env.drives.trace import Trace
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.fieldbus.link import Link, ObjectClient, Timing
 from drive_env.held_signals import held_signals
@@ -39,11 +40,10 @@ from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 from drive_env.safety.envelope import Envelope
 from drive_env.safety.watched_drives import CycleWatch
+from mechanics.arrays import Integers, Mask
 
 logger = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 _DEVICE_TYPE = 0x1000
 _IDENTITY = {(0x1018, 1): "vendor", (0x1018, 2): "product"}

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import can
 
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.limits import Limits
 from drive_env.fieldbus.description import check_timeout, describe
@@ -57,7 +58,7 @@ class CanDrives(BusDrives):
 
     def __init__(
         self,
-        device: str = "tmcm1636",
+        device: str = DEFAULT_DEVICE,
         *,
         eds: str | Path | None = None,
         interface: str | None = None,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import partial
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.errors import BusError
 from drive_env.fieldbus.link import NoWatchdogError, ObjectClient
 from drive_env.fieldbus.tidying import Tidying

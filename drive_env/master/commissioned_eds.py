@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.eds_file import EdsFile, object_section
 from drive_env.dictionary.eds_values import number_of
 from drive_env.dictionary.entries import EdsText, ObjectDictionary, eds_file
 from drive_env.drives.interface import Drives, device_of
 from drive_env.master.parameters import command, read_parameters
 
-Key = tuple[int, int]
 CAN_KBIT = 1000  # kbit/s, unless another bit rate is given
 
 

@@ -9,24 +9,25 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.link import Link, Outputs, Samples
 from drive_env.master.asked_rows import CAN_BE_ASKED, AskedRows
 from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
+from mechanics.arrays import Integers
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import CycleWatch
 
 logger = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
 MOST_CALLS = 64  # that are remembered
 NOTHING: Sequence[Entry] = ()
 CONTROLWORD = (cia402.CONTROLWORD, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.master.bus_drives import BusDrives
 
 ETHERCAT = ("ethercat", "ethercat-udp")  # interfaces; all others are python-can's
@@ -21,7 +22,7 @@ def default_nodes(interface: str | None) -> tuple[int, ...]:
     return (0,) if is_ethercat(interface) else (1,)
 
 
-def open_drives(device: str = "tmcm1636", **options: Any) -> BusDrives:
+def open_drives(device: str = DEFAULT_DEVICE, **options: Any) -> BusDrives:
     """Open drives on CAN or EtherCAT, as `interface` says.
 
     Args:
@@ -44,7 +45,7 @@ def open_drives(device: str = "tmcm1636", **options: Any) -> BusDrives:
     return CanDrives(device, **options)
 
 
-def check_answers(device: str = "tmcm1636", **options: Any) -> None:
+def check_answers(device: str = DEFAULT_DEVICE, **options: Any) -> None:
     """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command.
 
     Args:

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Key
+from mechanics.arrays import Integers
 
-Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 

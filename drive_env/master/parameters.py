@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env import cia402
 from drive_env.canopen.frames import INVALID
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.fieldbus.errors import BusError
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from drive_env.devices import MasterHints
     from drive_env.drives.interface import DescribedAxes
 
-Key = tuple[int, int]
 
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 

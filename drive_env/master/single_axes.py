@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.drives.interface import Drives
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description

@@ -12,14 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from drive_env.cia402 import Key
 from drive_env.devices import Device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
 from drive_env.emulator.live_dictionary import check_supported
 from drive_env.node.axis import ObjectPort
-
-Key = tuple[int, int]
 
 ERROR_REGISTER = 0x1001
 ERROR_HISTORY = 0x1003

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from drive_env.cia402 import Key
 from mechanics.untrusted import read_json
 
-Key = tuple[int, int]
 Section = dict[Key, int]
 FORMAT = 1
 

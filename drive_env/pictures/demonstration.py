@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives import motion
+from mechanics.arrays import Floats
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from drive_env.emulator.inside import Inside
     from drive_env.pictures.recording import Recorder, Recording
 
-Floats = NDArray[np.float64]
 
 DEFAULT = Path(__file__).parent / "demonstration.toml"
 TARGETS = {
@@ -61,7 +61,7 @@ class PictureFormat:
 class Demonstration:
     """A run: see demonstration.toml for units; None is chosen to suit load and motor."""
 
-    device: str = "tmcm1636"
+    device: str = DEFAULT_DEVICE
     motor: str = "qbl4208"
     load: str = "two_mass"
     seed: int = 0

@@ -8,20 +8,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (
     (cia402.POSITION_DEMAND, 0),
@@ -43,7 +42,7 @@ class Recording(NamedTuple):
     load: Load
     title: str
     gears: Floats  # (A,) rotor angle per unit of each axis's position [1 or rad/m]
-    linear: NDArray[np.bool_]  # (A,) whether that position is in m, not an angle in rad
+    linear: Mask  # (A,) whether that position is in m, not an angle in rad
     t: Floats  # (n,) [s]
     joints: Floats  # (n, D) [rad or m], in the order of the MJCF
     position_demand: Floats  # (n, A) [rad]
@@ -92,7 +91,7 @@ class Recorder:
         """Recorded time [s]."""
         return len(self._rows) * self._period
 
-    def read(self, name: ObjectName) -> NDArray[np.int64]:
+    def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis, as the drives do."""
         return self.drives.read(name)
 
@@ -188,7 +187,7 @@ def from_raw(drives: EmulatedDrives, name: tuple[int, int], raw: ArrayLike, axes
     return decode(code, values, code.factor(_context(drives, axes)))
 
 
-def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> NDArray[np.int64]:
+def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> Integers:
     """Return an SI value, one or one per axis, as an object's integers [drive units], saturated at its range."""
     code = drives.codes[name]
     values = np.broadcast_to(np.asarray(value, np.float64), (drives.num_axes,))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.pictures.demonstration import PictureFormat
 from drive_env.pictures.opengl import OpenGLError, has_display, import_mujoco
@@ -23,12 +23,12 @@ from drive_env.pictures.picture_files import check_out, write_film
 from drive_env.pictures.recording import CYCLE
 from drive_env.pictures.scene import Scene
 from drive_env.pictures.scope_picture import ScopePicture
+from mechanics.arrays import Floats, Image
 
 if TYPE_CHECKING:
     from drive_env.pictures.recording import Recording
     from mechanics.load import Load
 
-Image = NDArray[np.uint8]
 Progress = Callable[[float], None]
 
 FILM_LENGTH = 8.0  # s, about what one watches
@@ -216,7 +216,7 @@ def _samples(recording: Recording, cycles: int) -> range:
     return range(0, len(recording.t), cycles)
 
 
-def reachable_poses(load: Load) -> NDArray[np.float64]:
+def reachable_poses(load: Load) -> Floats:
     """Return the rest position, and one pose for either end of each axis that has one, shape (n, D)."""
     from mechanics.shaft import one, way
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.pictures.opengl import OpenGLError, import_mujoco, new_context
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from mechanics.arrays import Floats, Image, Integers
 
 FIELD_OF_VIEW = 30.0  # degrees, vertical: a long lens, so that parallel edges look parallel
 ELEVATION = -28.0  # degrees: seen from above
@@ -122,9 +119,7 @@ class Scene:
     def __enter__(self) -> Scene:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _with_surroundings(self, mjcf: str | Path, bare: Any, low: Floats, high: Floats) -> Any:
@@ -199,7 +194,7 @@ def _joint_limits(mujoco: Any, model: Any) -> Floats:
     return np.array(poses)
 
 
-def _spread(count: int, wanted: int) -> NDArray[np.int64]:
+def _spread(count: int, wanted: int) -> Integers:
     return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))
 
 

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+
+from mechanics.arrays import Floats, Image
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
     from drive_env.pictures.recording import Recording
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 MAX_AXES = 6  # traces that can still be told apart
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")

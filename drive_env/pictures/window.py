@@ -8,11 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.pictures.opengl import OpenGLError, choose_library, has_display, import_mujoco
-
-Image = NDArray[np.uint8]
+from mechanics.arrays import Image
 
 OFF_SCREEN = ("egl", "osmesa")  # libraries whose contexts do not share a thread with a window's
 

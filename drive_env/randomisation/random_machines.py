@@ -25,14 +25,13 @@ from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS, names_of
 from drive_env.randomisation.random_faults import RandomFaults, check_ranges
 from drive_env.saved_state import Saved
+from mechanics.arrays import Floats, Mask
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SHIPPED = Path(__file__).parent / "distributions"
 

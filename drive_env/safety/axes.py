@@ -9,20 +9,17 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.fieldbus.description import Key
+from drive_env.cia402 import Key
 from drive_env.safety.bounds import COUNTED
 from drive_env.safety.objects import CURRENT, DEMAND, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BASELINE = 0.008  # s at least between two positions that tell a speed
 # Rev, though so many counts at least, and of the way that the speed explains: more is a new zero, not a movement.

@@ -7,25 +7,22 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices.gains import PI, gain_factors
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context, find_unit, split_unit
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
-from drive_env.fieldbus.description import Key
 from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.objects import CURRENT, VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.safety.watched_drives import WatchedDrives
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW = (
     (cia402.POSITION_LIMITS, 1),

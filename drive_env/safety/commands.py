@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, given
-from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
 from drive_env.safety.errors import SafetyError
@@ -45,12 +45,11 @@ from drive_env.safety.objects import (
 )
 from drive_env.safety.rotor import scale_objects
 from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Objects whose magnitude is a command, and which limit holds it.
 _MAGNITUDES = {
@@ -158,7 +157,7 @@ class Commands:
             else:
                 self._axes.asked_current = np.where(where, asked, self._axes.asked_current)
 
-    def _speed_count(self) -> NDArray[np.float64]:
+    def _speed_count(self) -> Floats:
         """Return the increments a second of a count of 60FFh; 0 where its unit tells none."""
         return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
 
@@ -329,7 +328,7 @@ class Commands:
                 f"smaller steps, or raise {self._velocity_origin(axis)}"
             )
 
-    def _interpolation_period(self) -> NDArray[np.float64]:
+    def _interpolation_period(self) -> Floats:
         """Return the time that a set-point of csp takes [s]; 0 where the drive does not say."""
         value, index = (read_own(self._drives, (cia402.INTERPOLATION_PERIOD, sub), 0) for sub in (1, 2))
         return np.asarray(value * 10.0 ** index.astype(float), float)
@@ -518,16 +517,16 @@ class Commands:
                         f"nothing was sent. Write less there first, or raise {self._velocity_origin(axis)}"
                     )
 
-    def _unramped_ramp(self) -> NDArray[np.float64]:
+    def _unramped_ramp(self) -> Floats:
         """Return the slowest ramp of a quick stop that modes without a limit of speed may have [inc/s^2]."""
         scale = self._axes.rotor.scale
         return np.where(scale > 1.0, DEFAULT_SPEED * scale / STOP_WITHIN, 0.0)
 
-    def _ramp_count(self) -> NDArray[np.float64]:
+    def _ramp_count(self) -> Floats:
         """Return the increments per second squared of a count of 6085h; nan where its unit tells none."""
         return increments_per_count(self._known.find(QUICK_STOP_DECELERATION).unit, self._axes.rotor)
 
-    def _refuse_mode(self, wrong: Mask, ramp: Integers | NDArray[np.float64]) -> None:
+    def _refuse_mode(self, wrong: Mask, ramp: Integers | Floats) -> None:
         for axis in np.flatnonzero(wrong).tolist():
             count = self._ramp_count()[axis]
             raise SafetyError(

@@ -22,14 +22,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.limits import Limits
-from drive_env.fieldbus.description import Key
 from drive_env.safety import signals
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
@@ -59,14 +58,13 @@ from drive_env.safety.stop_runner import RAMPS, SLOW_DOWN_RAMPS, StopRunner
 from drive_env.safety.stopping import Stop
 from drive_env.safety.watch import Watch
 from drive_env.safety.watchdogs import Watchdogs
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 DEVICE_OBJECTS = 0x2000  # below are those of communication
 # Limits of the drives themselves, and what tells their stopping distance.

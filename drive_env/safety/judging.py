@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.drives.limits import NO_LIMIT
-from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import LimitsInForce, bound_text
@@ -19,10 +18,7 @@ from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, P
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
 from drive_env.safety.rotor import wrapped
 from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, is_led, sees_demand
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 # A current above its limit is no accident until it lasts: noise and overshoot are within this.
 CURRENT_MARGIN, CURRENT_CYCLES = 1.25, 10

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, NamedTuple
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Key
 from drive_env.fieldbus.errors import BusError
 from drive_env.fieldbus.tidying import Tidying
 

@@ -6,11 +6,10 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import NO_LIMIT, Limits
-from drive_env.fieldbus.description import Key
 from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
@@ -28,12 +27,11 @@ from drive_env.safety.bounds import (
 from drive_env.safety.lending import Lending
 from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
+from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 STOP_WITHIN = 1.0  # s from the highest speed allowed by the quick stop's ramp; what ramps slower may turn no faster
 

@@ -7,21 +7,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.drives.limits import NO_LIMIT
-from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 UNSAMPLED = 0.010  # s between two looks at what no PDO carries
 ASK, ASK_AGAIN = 0.015, 0.010  # s for an answer to a look, where time passes, and of one that was silent before

@@ -5,18 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.errors import RefusedError
+from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 HOME_OFFSET = (cia402.HOME_OFFSET, 0)
 

@@ -19,18 +19,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.drives.limits import NO_LIMIT
-from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import STOP_WITHIN
 from drive_env.safety.objects import CSP, CSV, CURRENT, HM, IP, PP, TORQUE_MODES
-
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 LATENCY = 0.010  # s from a sample to the drive's ramp
 DEMAND_AGE = 0.05  # s

@@ -9,12 +9,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import NO_LIMIT
-from drive_env.fieldbus.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import increments_per_count, read_own
 from drive_env.safety.errors import SafetyError, logged
@@ -34,15 +33,13 @@ from drive_env.safety.objects import (
 )
 from drive_env.safety.stop_ends import LATENCY, ends_by_itself, outside, stop_way
 from drive_env.safety.stopping import GRACE, REPEAT, SHARE, AxisStop, Phase, Sample, Stop
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 WEIGHT_LOOK, WEIGHT_SHARE = 0.06, 0.03  # s at rest; of the current limit, above which it may be a weight
 WAKE_PERIOD = 0.2  # s

@@ -10,11 +10,10 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
-from drive_env.fieldbus.description import Key
 from drive_env.fieldbus.errors import BusError
 from drive_env.safety.axes import Axes
 from drive_env.safety.errors import SafetyError, logged
@@ -27,14 +26,13 @@ from drive_env.safety.stopping import BLIND as BLIND_TIMEOUT
 from drive_env.safety.stopping import LONGEST_FOLLOWING, LOST, RAMP_TIMEOUT
 from drive_env.safety.supervisor import Supervisor
 from drive_env.safety.watchdogs import Watchdogs
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 logger = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 STALE, STALE_OFF = 0.008, 0.015  # s after which drives that are live, or off, are looked at
 BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, until it is stopped

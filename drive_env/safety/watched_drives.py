@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+from drive_env.cia402 import Key
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.dictionary.entries import Entry
-    from drive_env.fieldbus.description import Description, Key
+    from drive_env.fieldbus.description import Description
     from drive_env.fieldbus.link import Link, ObjectClient
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 class CycleWatch(Protocol):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from drive_env import cia402
-from drive_env.cia402 import State
+from drive_env.cia402 import Key, State
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.quantities import SHOWN, UNITS, Scale, find_unit, scales_of
@@ -17,7 +17,7 @@ from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
 from drive_env.drives.limit_at_rest import SAYS, LimitAtRest
 from drive_env.studio.fault_texts import FaultText, fault_text
-from drive_env.studio.recorder import Key, ScopeRecorder
+from drive_env.studio.recorder import ScopeRecorder
 
 if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description

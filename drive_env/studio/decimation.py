@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Integers
+
 
 class Columns(NamedTuple):
     """Columns of samples.
@@ -15,7 +17,7 @@ class Columns(NamedTuple):
     low, high: Least and greatest of each column, shape (columns, ...).
     """
 
-    starts: NDArray[np.int64]
+    starts: Integers
     low: NDArray[Any]
     high: NDArray[Any]
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary import quantities
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits, check_writable
@@ -35,7 +36,6 @@ from drive_env.whole_file import sealed
 if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
 
-Key = tuple[int, int]
 # Targets by which an axis turns without an end.
 ON_AND_ON = (
     cia402.TARGET_VELOCITY, cia402.VL_TARGET_VELOCITY, cia402.TARGET_TORQUE, cia402.VELOCITY_OFFSET,

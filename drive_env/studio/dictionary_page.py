@@ -10,6 +10,7 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments, UploadEventArguments
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.master.parameters import Difference
 from drive_env.studio import dictionary_jobs as jobs
@@ -24,7 +25,6 @@ READ = 0.5  # s between two readings of what is visible
 MOST_READ = 16  # objects in one reading, so that nothing else waits for long
 FAVOURITES = "favourites"
 ALL = "all"
-Key = tuple[int, int]
 
 
 def build(session: Session, visitor: Visitor) -> None:

@@ -12,12 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mechanics.arrays import Floats
 
 if TYPE_CHECKING:
     from drive_env.studio.session import Session
 
-Floats = NDArray[np.float64]
 
 PERIOD = 0.1  # s between two pictures, at least
 SHARE = 0.15  # of a core that drawing may take

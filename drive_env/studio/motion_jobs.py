@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary import quantities
@@ -16,13 +15,13 @@ from drive_env.dictionary.access import check_limits
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives
 from drive_env.drives.lent_object import lent
+from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
     from drive_env.fieldbus.description import Description
     from drive_env.studio.session import Session
 
-Mask = NDArray[np.bool_]
 MotionJob = Callable[[Drives], None]
 
 LONGEST_MOVE = 600.0  # s

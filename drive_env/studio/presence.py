@@ -13,9 +13,8 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Mask
 
 HOLD = 0.5  # s without a beat after which what a page holds is stopped
 ASLEEP = 2.0  # s without a beat after which a page's motions that last as long as it is there are stopped

@@ -6,13 +6,10 @@ import threading
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.drives.trace import Trace
-
-Key = tuple[int, int]
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats, Integers
 
 CAPACITY = 120_000  # samples: two minutes at 1 kHz
 GAP = 1.5  # of the time between two samples: more is a gap

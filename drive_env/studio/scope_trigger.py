@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.studio.recorder import Key
-
-Integers = NDArray[np.int64]
+from drive_env.cia402 import Key
+from mechanics.arrays import Integers
 
 EDGES = {"rising": "rising edge", "falling": "falling edge", "state": "change of state", "fault": "fault"}
 # State by the low seven bits of a statusword; -1 for none.

@@ -11,15 +11,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.quantities import SHOWN, UNITS, Scale, find_unit
 from drive_env.studio.decimation import min_max, stride_of
-from drive_env.studio.recorder import GAP, Key, RingSamples, ScopeRecorder
+from drive_env.studio.recorder import GAP, RingSamples, ScopeRecorder
 from drive_env.studio.scope_trigger import ScopeTrigger, first_fired
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 MOST_CHANNELS = 8
 WINDOWS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0)  # s

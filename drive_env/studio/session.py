@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.quantities import Scale
 from drive_env.drives import motion
@@ -33,9 +33,10 @@ from drive_env.safety.errors import SafetyError
 from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
 from drive_env.studio.presence import Presence
-from drive_env.studio.recorder import Key, ScopeRecorder
+from drive_env.studio.recorder import ScopeRecorder
 from drive_env.studio.sentences import sentence
 from drive_env.studio.shared_drives import PIECE, SharedDrives
+from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-Mask = NDArray[np.bool_]
 
 BUS_IDLE = 0.05  # s of a bus that are sampled at once between two looks for jobs
 RETRY = 0.5  # s after which a bus that failed is asked again

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.dictionary.axis_objects import Integers, Mask
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import object_names, whole_cycles
 from drive_env.drives.drives_proxy import DrivesProxy
@@ -26,6 +26,7 @@ from drive_env.drives.trace import Trace
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.errors import JobStoppedError
 from drive_env.studio.recorder import ScopeRecorder
+from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
@@ -36,7 +37,6 @@ BUS_PIECE = 0.1  # s of a recording on a bus, where nothing is played
 SEAMLESS = 0.004  # s between two recordings of a bus, whose SYNCs follow one another
 MOST_BEHIND = 0.1  # s; a computer that was slower does not catch up
 
-Key = tuple[int, int]
 
 T = TypeVar("T")
 

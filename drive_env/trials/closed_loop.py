@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import Device
@@ -23,7 +23,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
-from drive_env.trials.gain_trial import PHASES, Identified, Mask, Trials
+from drive_env.trials.gain_trial import PHASES, Identified, Trials
 from drive_env.trials.open_loop import OPEN, TOOTH, OpenLoopTrials, with_run_current
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import (
@@ -37,9 +37,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import Terms, cost
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers, Mask
 
 BEHIND = 3.0  # full steps, by which the ramp leaves the axis behind; up to one the field holds it
 OVERLOAD = 4.0  # acceleration of the ramp over what the run current of the trial gives

@@ -7,36 +7,20 @@ The variant of the gains is a run current of 0.8 times, as in open loop.
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.raw_gains import write_gains
-from drive_env.phase_current import swing_period
 from drive_env.trials.closed_loop import CLOSING, OVERLOAD, full_step, held_in_trial
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW, with_run_current
-from drive_env.trials.positioning import (
-    CYCLE,
-    SETTLED,
-    TRIAL,
-    Move,
-    move_terms,
-    power_up,
-    start,
-    wrapped,
-    write_profile,
-)
-from drive_env.trials.score import LOAD_SHARE, CurrentSwings, StepperScore, Terms, swings
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, Move, power_up
+from drive_env.trials.score import LOAD_SHARE, StepperScore
+from mechanics.arrays import Floats, Integers, Mask
 
 PUSH = 1.3  # torque over what the trial's run current holds
 AWAY = 4.0  # full steps
@@ -55,9 +39,6 @@ class ClosedLoopScore(StepperScore):
         share = self._spread(np.broadcast_to(np.asarray(move.share, float), move.distance.shape))
         self._move = self._move._replace(share=np.where(each, share, before))
 
-    def _settling_scale(self, filters: Floats) -> Floats:
-        return np.full(np.shape(filters), swing_period(self._drives.motor))
-
     def _pushes(self) -> tuple[Floats, Integers]:
         """Return the torque of every machine [N m], signed as `machine.load_torque`, and for how many ms it acts."""
         drives, move = self._drives, self._move
@@ -71,8 +52,11 @@ class ClosedLoopScore(StepperScore):
         lasts = np.clip(np.rint(time.reshape(machines).max(axis=1) / CYCLE), 1, LONGEST_PUSH).astype(np.int64)
         return torque, lasts
 
-    def _close(self) -> Mask:
-        """Enable the drives at rest and close their loops; return of which axes they are closed."""
+    def _varied(self, gains: Integers) -> Integers:
+        return with_run_current(self._drives.device, gains, self._factors * np.asarray(self._move.share, float))
+
+    def _get_ready(self) -> tuple[Integers, Mask]:
+        """Enable the drives at rest and close their loops; return where they go, and of which axes none is closed."""
         drives = self._drives
         closed = drives.device.gains.loop_of_kind(LOAD_ANGLE)
         assert closed is not None, "a drive that closes such a loop"
@@ -81,42 +65,16 @@ class ClosedLoopScore(StepperScore):
         power_up(drives)
         drives.write(Role.LOOP_MODE, closed.mode)
         drives.advance(CLOSING)
-        return np.asarray(drives.read(Role.LOOP_INITIALISED) != 0)
+        is_open = np.asarray(drives.read(Role.LOOP_INITIALISED) == 0)
+        return drives.read(cia402.POSITION_ACTUAL) + self._move.distance, is_open
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swings, (machines, variants, axes) each."""
-        drives, move = self._drives, self._move
-        drives.machine.load_torque = self._constant
-        drives.machine.reset()
-        share = self._factors * np.asarray(move.share, float)
-        write_gains(drives, with_run_current(drives.device, self._spread(np.asarray(gains, np.int64)), share))
-        write_profile(drives, move)
-        objects: list[ObjectName] = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
+    def _load_step(self, objects: list[ObjectName]) -> Mapping[Any, Integers]:
+        """Push the axes away, and let them come back; return what was recorded meanwhile."""
+        drives, pushed = self._drives, []
         torque, lasts = self._pushes()
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
-            is_closed = self._close()
-            target = drives.read(cia402.POSITION_ACTUAL) + move.distance
-            start(drives, target)
-            free = drives.record(objects, SETTLED * CYCLE)
-            pushed = []
-            for k in range(LONGEST_PUSH):
-                drives.machine.load_torque = self._constant + np.where(k < lasts, torque, 0.0)
-                pushed.append(drives.record(objects, CYCLE))
-            drives.machine.load_torque = self._constant
-            pushed.append(drives.record(objects, (TRIAL - SETTLED - LONGEST_PUSH) * CYCLE))
-        position = np.concatenate([part[cia402.POSITION_ACTUAL] for part in pushed])
-        current = free[cia402.TORQUE_ACTUAL] * ampere_per_count(drives)
-        settling, noise, overshoot = move_terms(
-            free[cia402.POSITION_ACTUAL].astype(float), np.asarray(current, float), move, self._t_0,
-            drives.motor.rated_current, target, np.where(move.distance < 0, -1, 1),
-        )  # fmt: skip
-        enabled = cia402.matches(pushed[-1][cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
-        tripped = ~enabled | ~is_closed | np.repeat(drives.machine.diverged, self._axes[2])
-        error = np.abs(wrapped(target - position)).sum(axis=0) * CYCLE / move.increments
-        terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
-        return (
-            terms.each(lambda value: value.reshape(self._axes)),
-            np.maximum(error, move.least_error).reshape(self._axes),
-            swings(np.asarray(current, float), drives.motor.rated_current, self._axes),
-        )
+        for k in range(LONGEST_PUSH):
+            drives.machine.load_torque = self._constant + np.where(k < lasts, torque, 0.0)
+            pushed.append(drives.record(objects, CYCLE))
+        drives.machine.load_torque = self._constant
+        pushed.append(drives.record(objects, (TRIAL - SETTLED - LONGEST_PUSH) * CYCLE))
+        return {name: np.concatenate([part[name] for part in pushed]) for name in objects}

@@ -7,14 +7,11 @@ is that of the drive to about a millisecond: the moment at which a set-point wri
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.drives.interface import Drives
 from drive_env.trials.positioning import CYCLE, Move
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers
 
 COMPUTED = (
     "the position demand (6062h) is in no process data of this drive: that of a move is computed from target, profile "

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gain_set import GainSet
@@ -38,10 +37,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import Terms, cost
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial

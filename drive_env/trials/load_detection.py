@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device
@@ -26,7 +25,7 @@ from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
 from drive_env.phase_current import holding_torque, run_and_standby
-from drive_env.trials.gain_trial import PHASES, Identified, Mask
+from drive_env.trials.gain_trial import PHASES, Identified
 from drive_env.trials.load_reading import (
     FULL_READING,
     LIFT,
@@ -49,9 +48,7 @@ from drive_env.trials.open_loop import (
 )
 from drive_env.trials.positioning import TRIAL, Move
 from drive_env.trials.working_moves import Steady, WorkingMoves
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from mechanics.arrays import Floats, Integers, Mask
 
 WORKING_SHARE, RAMP_SHARE = 0.5, 0.15  # of the motor's corner speed; of the holding torque at the run current
 REACH_SHARE, LONGEST = 0.9, 100.0  # of the travel, and at most [rad]

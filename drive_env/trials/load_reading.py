@@ -12,13 +12,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import Device
 from drive_env.dictionary.roles import Role
 from drive_env.motors import Motor
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 THRESHOLD = ("load detection", "threshold")  # loop and part of the gain
 LOWER, WIDTH, LEAST, DOWN, UP = (("CoolStep", part) for part in ("lower", "width", "least", "down", "up"))

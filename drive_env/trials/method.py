@@ -6,10 +6,11 @@ Which of them a device has is an answer of its gain set. Whatever tries gains as
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.devices.gain_set import LOAD_DETECTION, PID_ALONE
 from drive_env.devices.gains import (
@@ -27,6 +28,7 @@ from drive_env.trials.open_loop import OpenLoopTrials, acceleration_share, open_
 from drive_env.trials.position_pid import PID_I, PID_P, PidTrials, load_step_error, pid_time, plan_pid
 from drive_env.trials.positioning import SPEED_SHARE, highest_ramp, plan_move
 from drive_env.trials.score import RobustScore, Terms, cost
+from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -35,8 +37,6 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
     from drive_env.trials.positioning import Move
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
 FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
@@ -51,7 +51,8 @@ SLOW = 1.0 / 3.0  # of the gains of a stepper's closed loop, where a safe search
 SLOW_I = SLOW**2  # of the integral gain of a PID: as slow in time as its P
 
 
-class Cascade(NamedTuple):
+@dataclass(frozen=True)
+class Cascade:
     """Loops of which a rule knows gains from the motor's data.
 
     What tries gains asks this of a kind of gain set; gains are raw, (n, count). `measures_current` is whether the drive
@@ -61,16 +62,8 @@ class Cascade(NamedTuple):
 
     device: Device
     motor: Motor
-
-    @property
-    def measures_current(self) -> bool:
-        """It does."""
-        return True
-
-    @property
-    def caution(self) -> int:
-        """Higher gains oscillate."""
-        return 1
+    measures_current: ClassVar[bool] = True
+    caution: ClassVar[int] = 1
 
     def t_0(self) -> float:
         """Return four times the sum of the small time constants [s]."""
@@ -119,29 +112,21 @@ class Cascade(NamedTuple):
         return terms.noise
 
     def _rule(self, rule: Any, found: Identified, supply: Floats) -> Integers:
-        return np.concatenate(
-            [
-                rule_gains(self.device, self.motor, J, rule, supply=float(volts))
-                for J, volts in zip(found.inertia, supply, strict=True)
-            ]
-        )
+        each = zip(found.inertia, supply, strict=True)
+        return np.concatenate([rule_gains(self.device, self.motor, J, rule, supply=float(volts)) for J, volts in each])
 
 
-class OpenLoop(NamedTuple):
-    """Currents of a stepper that follows its field."""
+@dataclass(frozen=True)
+class OpenLoop:
+    """Currents of a stepper that follows its field: in open loop no drive tells a torque current.
+
+    Lower currents lose steps. What is said of `Cascade` holds for its members.
+    """
 
     device: Device
     motor: Motor
-
-    @property
-    def measures_current(self) -> bool:
-        """It does not: in open loop no drive tells a torque current."""
-        return False
-
-    @property
-    def caution(self) -> int:
-        """Lower currents lose steps."""
-        return -1
+    measures_current: ClassVar[bool] = False
+    caution: ClassVar[int] = -1
 
     def t_0(self) -> float:
         """Return the period of the rotor's swing in its field at rated current [s]."""
@@ -156,7 +141,7 @@ class OpenLoop(NamedTuple):
         return most
 
     def first(self, supply: Floats) -> Integers:
-        """Return the rated current, moving and at rest."""
+        """Return the rated current, moving and at rest; the threshold is 0, and CoolStep off."""
         most = rated_setting(self.device, self.motor)
         return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
 
@@ -181,10 +166,9 @@ class OpenLoop(NamedTuple):
         return self.first(supply)
 
     def keep(self, gains: Integers, present: Integers) -> Integers:
-        """Return gains with the settings of the load detection that drives have at present: they are no currents."""
-        currents = self.device.gains.columns(self.device.gains.outer)
-        kept = present.copy()
-        kept[:, currents] = gains[:, currents]
+        """Return gains with those of other loops, and of the load detection, that drives have at present."""
+        kept, own = present.copy(), self._columns()
+        kept[:, own] = gains[:, own]
         return kept
 
     def trials(self, drives: Drives, axes: int) -> OpenLoopTrials:
@@ -200,42 +184,35 @@ class OpenLoop(NamedTuple):
         return np.asarray(open_loop_cost(terms))
 
     def current(self, terms: Any) -> Floats:
-        """Return the RMS of the currents that are set."""
+        """Return the RMS of the currents that are set, or of what CoolStep leaves of them."""
         return np.asarray(np.sqrt(terms.effort))
 
+    def _columns(self) -> list[int]:
+        """Return which gains are its own."""
+        return list(self.device.gains.columns(self.device.gains.outer))
 
-class ClosedStepper(NamedTuple):
-    """A stepper whose drive closes a loop around it: the gains that act there alone, at the motor's rated current."""
 
-    device: Device
-    motor: Motor
+@dataclass(frozen=True)
+class ClosedStepper(OpenLoop):
+    """A stepper whose drive closes a loop around it: the gains that act there alone, at the motor's rated current.
+
+    It is identified in open loop; its trials look at the torque current by themselves. Higher gains oscillate.
+    """
+
     loop: ClosedLoop
-
-    @property
-    def measures_current(self) -> bool:
-        """It is identified in open loop, where it does not; its trials look at the torque current by themselves."""
-        return False
-
-    @property
-    def caution(self) -> int:
-        """Higher gains oscillate."""
-        return 1
+    caution: ClassVar[int] = 1
 
     def t_0(self) -> float:
         """Return the period of the rotor's swing in its field at rated current; of a PID alone its own time [s]."""
-        return pid_time(self.loop) if self.loop.kind == PID_ALONE else swing_period(self.motor)
-
-    def highest(self) -> Integers:
-        """Return the greatest integers."""
-        return OpenLoop(self.device, self.motor).highest()
+        return pid_time(self.loop) if self.loop.kind == PID_ALONE else super().t_0()
 
     def first(self, supply: Floats) -> Integers:
         """Return the rated current with the loop's first values, or the commissioned values for it."""
-        gains = OpenLoop(self.device, self.motor).first(supply)
+        gains = super().first(supply)
         dictionary = self.device.new_dictionary()
         entries = [(dictionary.find(name), value) for name, value in self.device.preset(self.motor).items()]
         preset = {(entry.index, entry.sub): value for entry, value in entries}
-        for name, column in zip(self.loop.gains, self._columns(), strict=True):
+        for name, column in zip(self.loop.gains, self._loop_columns(), strict=True):
             row = self.device.gains.rows[column]
             gains[:, column] = self.loop.first.get(name, preset.get(row.key, row.lowest))
         return gains
@@ -254,16 +231,10 @@ class ClosedStepper(NamedTuple):
         """Return a third of that: slower to catch up."""
         gains, known = self.first(supply), self.device.gains
         if not self.loop.is_pid:
-            return known.scaled(gains, SLOW, self._columns())
+            return known.scaled(gains, SLOW, self._loop_columns())
         p, i = (known.column(*part) for part in (PID_P, PID_I))
         assert p is not None and i is not None, "a PID has both"
         return known.scaled(known.scaled(gains, SLOW, [p]), SLOW_I, [i])
-
-    def keep(self, gains: Integers, present: Integers) -> Integers:
-        """Return gains with the load detection's settings that drives have at present."""
-        kept = OpenLoop(self.device, self.motor).keep(gains, present)
-        kept[:, self._columns()] = gains[:, self._columns()]
-        return kept
 
     def trials(self, drives: Drives, axes: int) -> ClosedLoopTrials:
         """Return the trials of these drives."""
@@ -284,61 +255,29 @@ class ClosedStepper(NamedTuple):
         """Return the ripple of the torque current; of a PID, where none is measured, the vibration as J counts it."""
         return terms.noise
 
-    def _columns(self) -> list[int]:
+    def _loop_columns(self) -> list[int]:
         return self.device.gains.columns_of_loop(self.loop)
 
+    def _columns(self) -> list[int]:
+        return [*super()._columns(), *self._loop_columns()]
 
-class LoadSettings(NamedTuple):
-    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or that of a load."""
 
-    device: Device
-    motor: Motor
+@dataclass(frozen=True)
+class LoadSettings(OpenLoop):
+    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or what a load needs.
 
-    @property
-    def measures_current(self) -> bool:
-        """No torque current is measured in open loop."""
-        return False
-
-    @property
-    def caution(self) -> int:
-        """Higher thresholds of CoolStep leave more current; a threshold too low stops an axis that is not blocked."""
-        return -1
-
-    def t_0(self) -> float:
-        """Return that of the open loop."""
-        return self._open.t_0()
-
-    def highest(self) -> Integers:
-        """Return the greatest integers."""
-        return self._open.highest()
-
-    def first(self, supply: Floats) -> Integers:
-        """Return the rated current, the threshold 0, and CoolStep off."""
-        return self._open.first(supply)
-
-    def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return the move of an open loop: that of these trials follows from the working speed."""
-        return self._open.plan(found, scaler, reach)
+    Higher thresholds of CoolStep leave more current; a threshold too low stops an axis that is not blocked. The move of
+    these trials follows from the working speed, whatever `plan` says.
+    """
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return the currents for the load, the threshold 0, and a CoolStep that takes little away."""
-        gains = self._open.rule(found, move, supply)
+        gains = super().rule(found, move, supply)
         for part, value in FIRST_COOLSTEP.items():
             column = self.device.gains.column(*part)
             if column is not None:
                 gains[:, column] = value
         return gains
-
-    def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return the rated current, the threshold 0, and CoolStep off."""
-        return self.first(supply)
-
-    def keep(self, gains: Integers, present: Integers) -> Integers:
-        """Return gains with those of loops that drives may close as they have them at present."""
-        kept = self._open.keep(gains, present)
-        columns = self.device.gains.columns_of(*LOAD_DETECTION)
-        kept[:, columns] = gains[:, columns]
-        return kept
 
     def trials(self, drives: Drives, axes: int) -> LoadDetectionTrials:
         """Return the trials of these drives."""
@@ -348,20 +287,11 @@ class LoadSettings(NamedTuple):
         """Return 1: no load step is part of it."""
         return np.ones(len(gains))
 
-    def cost(self, terms: Any) -> Floats:
-        """Return J."""
-        return np.asarray(open_loop_cost(terms))
-
-    def current(self, terms: Any) -> Floats:
-        """Return the share of the rated current that CoolStep leaves."""
-        return np.asarray(np.sqrt(terms.effort))
-
-    @property
-    def _open(self) -> OpenLoop:
-        return OpenLoop(self.device, self.motor)
+    def _columns(self) -> list[int]:
+        return [*super()._columns(), *self.device.gains.columns_of(*LOAD_DETECTION)]
 
 
-Method = Cascade | OpenLoop | ClosedStepper | LoadSettings
+Method = Cascade | OpenLoop
 
 
 def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Method:

@@ -44,10 +44,7 @@ from drive_env.trials.positioning import (
 )
 from drive_env.trials.rotor_swing import EXPLAINED, LENGTH, FreeSwing, inertia_of_swings
 from drive_env.trials.score import below_trip
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 PROBE = 0.8  # run current of the probe over that of the trial
 LOST = 2.0  # full steps between field and rotor: beyond the unstable balance, from where it falls to the next tooth
@@ -117,15 +114,7 @@ class OpenLoopTerms(NamedTuple):
 
     def each(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> OpenLoopTerms:
         """Return the terms with a function applied to each."""
-        return OpenLoopTerms(
-            function(self.settling),
-            function(self.disturbance),
-            function(self.noise),
-            function(self.overshoot),
-            function(self.tripped),
-            function(self.load_angle),
-            function(self.effort),
-        )
+        return OpenLoopTerms(*map(function, self))
 
 
 def open_loop_cost(terms: OpenLoopTerms) -> Floats:

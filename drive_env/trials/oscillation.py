@@ -9,11 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.arrays import Floats, Mask
+
 OSCILLATION = 0.4
 NEAR = 10.0  # Hz
 
 
-def shakes(current: NDArray[np.floating], rated_current: float) -> NDArray[np.bool_]:
+def shakes(current: NDArray[np.floating], rated_current: float) -> Mask:
     """Return which axes oscillate.
 
     Args:
@@ -24,7 +26,7 @@ def shakes(current: NDArray[np.floating], rated_current: float) -> NDArray[np.bo
     return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated_current)
 
 
-def strongest_frequency(current: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def strongest_frequency(current: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """Return at which frequency each axis' current swings most [Hz], and the share of its power within 10 Hz of that.
 
     To 1 over the samples' duration; what swings faster than 500 Hz is seen below it.

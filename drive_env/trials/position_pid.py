@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import Device
@@ -38,10 +38,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import LOAD_SHARE, NOISE
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 PID_P, PID_I = ("correction", "velocity"), ("correction", "velocity, integral")  # of the gain set: loop and part
 P_UNIT, I_UNIT, PRESCALER = 256.0, 65536.0, 128.0  # of 202Bh: 1/s; of 202Ch, 202Dh; of the clock

@@ -6,25 +6,20 @@ variant of the gains is P x 1.5, as the trial's probe has it.
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gain_set import PID_ALONE, ClosedLoop
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.drives.raw_gains import write_gains
-from drive_env.phase_current import swing_period
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW
 from drive_env.trials.position_pid import PID_P, pid_terms, pid_time, steps_of
-from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, power_up, start, wrapped, write_profile
-from drive_env.trials.score import CurrentSwings, StepperScore, Terms
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from drive_env.trials.positioning import power_up
+from drive_env.trials.score import StepperScore, Terms
+from mechanics.arrays import Floats, Integers, Mask
 
 CLOSING = 0.01  # s: a PID has no initialisation
 
@@ -46,44 +41,34 @@ class PidScore(StepperScore):
         return False
 
     def _settling_scale(self, filters: Floats) -> Floats:
-        alone = self._loop.kind == PID_ALONE
-        return np.full(np.shape(filters), pid_time(self._loop) if alone else swing_period(self._drives.motor))
+        if self._loop.kind == PID_ALONE:
+            return np.full(np.shape(filters), pid_time(self._loop))
+        return super()._settling_scale(filters)
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
-        """Return the terms of every axis without E_d/E_0, E_d [rad s], no swings, (machines, runs, axes) each."""
-        drives, move = self._drives, self._move
-        drives.machine.load_torque = self._constant
-        drives.machine.reset()
-        column = drives.device.gains.column(*PID_P)
+    def _objects(self) -> list[ObjectName]:
+        return [cia402.POSITION_ACTUAL, cia402.STATUSWORD]
+
+    def _varied(self, gains: Integers) -> Integers:
+        known = self._drives.device.gains
+        column = known.column(*PID_P)
         assert column is not None, "a PID has a P part"
-        used = drives.device.gains.scaled(self._spread(np.asarray(gains, np.int64)), self._factors[:, None], [column])
-        write_gains(drives, used)
-        write_profile(drives, move)
-        objects: list[ObjectName] = [cia402.POSITION_ACTUAL, cia402.STATUSWORD]
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
-            drives.write(cia402.SENSOR_SELECTION, ENCODER)
-            drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
-            power_up(drives)
-            drives.write(Role.LOOP_MODE, self._loop.mode)
-            drives.advance(CLOSING)
-            target = drives.read(cia402.POSITION_ACTUAL) + move.distance
-            start(drives, target)
-            free = drives.record(objects, SETTLED * CYCLE)
-            drives.machine.load_torque = self._constant + self._load_torque
-            loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
-        position = free[cia402.POSITION_ACTUAL].astype(float)
+        return known.scaled(gains, self._factors[:, None], [column])
+
+    def _get_ready(self) -> tuple[Integers, Mask]:
+        drives = self._drives
+        drives.write(cia402.SENSOR_SELECTION, ENCODER)
+        drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
+        power_up(drives)
+        drives.write(Role.LOOP_MODE, self._loop.mode)
+        drives.advance(CLOSING)
+        return drives.read(cia402.POSITION_ACTUAL) + self._move.distance, np.zeros(drives.num_axes, bool)
+
+    def _terms(
+        self, free: Mapping[Any, Integers], loaded: Mapping[Any, Integers], target: Integers, used: Integers
+    ) -> Any:
+        move, position = self._move, free[cia402.POSITION_ACTUAL].astype(float)
         settling, noise, overshoot = pid_terms(
             position, np.zeros_like(position), move, self._t_0, target, np.where(move.distance < 0, -1, 1),
-            steps_of(move, drives.motor),
+            steps_of(move, self._drives.motor),
         )  # fmt: skip
-        enabled = cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
-        tripped = ~enabled | np.repeat(drives.machine.diverged, self._axes[2])
-        error = np.abs(wrapped(target - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
-        terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
-        nothing = np.full(self._axes, np.nan)
-        return (
-            terms.each(lambda value: value.reshape(self._axes)),
-            np.maximum(error, move.least_error).reshape(self._axes),
-            CurrentSwings(nothing, nothing),
-        )
+        return Terms(settling, np.ones_like(settling), noise, overshoot, np.zeros(len(settling), bool))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import Device
@@ -19,13 +19,11 @@ from drive_env.drives import motion
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 CYCLE = 0.001  # s
 # In communication cycles: the profile, the end of the window in which it settles, and the trial.

@@ -15,22 +15,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.drives import motion
 from drive_env.randomisation.random_machines import BESIDE, Distributions, Law
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_rows
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Key = tuple[int, int]
 
-CYCLE = 0.001  # s
 # What the drive was told, in the order in which it is looked for: object, mode in which it is played, and played as.
 # A position demand comes first: it is what a profile in the drive (pp) made of its target.
 COMMANDS: tuple[tuple[Key, str, Key], ...] = (
@@ -338,7 +336,7 @@ def _candidates(
     return np.asarray(np.where(folded > 1.0, 2.0 - folded, folded))
 
 
-def _give(drives: EmulatedDrives, values: Mapping[str, Floats]) -> NDArray[np.bool_]:
+def _give(drives: EmulatedDrives, values: Mapping[str, Floats]) -> Mask:
     """Set parameters; return which machines can have them."""
     machine, possible = drives.machine, np.ones(drives.num_machines, bool)
     try:

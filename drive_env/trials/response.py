@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats, Integers, Mask
 
 ROUNDING = 1e-9  # of the record: t = k * dt may miss a given time by this without costing a sample
 
@@ -36,7 +36,7 @@ class StepMetrics:
     steady_state_error: Floats  # unit of y, reference - y
     iae: Floats  # unit of y * s
     itae: Floats  # unit of y * s^2
-    oscillating: NDArray[np.bool_]
+    oscillating: Mask
     oscillation_frequency: Floats  # Hz
 
 
@@ -243,7 +243,7 @@ def rms(x: Floats) -> Floats:
     return np.asarray(np.sqrt(_weighted_sum(np.full(len(x), 1.0 / len(x)), x * x)))
 
 
-def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[NDArray[np.bool_], Floats]:
+def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[Mask, Floats]:
     """Return whether x, an error or a current, rings without decaying, and at which frequency [Hz] (nan: it does not).
 
     Nothing is detrended: a ramp, an offset or a creeping tail has no reversal. The first fifth of the record is left
@@ -296,7 +296,7 @@ def _swing(x: Floats) -> Floats:
     return np.asarray(np.minimum(fall, rise))
 
 
-def _reversals(x: Floats, swing: Floats) -> NDArray[np.int64]:
+def _reversals(x: Floats, swing: Floats) -> Integers:
     """Return how often each column of x turns around and then moves by `swing` the other way."""
     high, low = x[0], x[0]
     direction, count = np.zeros((2, *high.shape), dtype=np.int64)
@@ -346,7 +346,7 @@ def _time_to_stay(t: Floats, x: Floats, limit: ArrayLike) -> Floats:
     return np.where(_pick(outside, last), entry, 0.0)
 
 
-def _pick(x: NDArray[Any], k: NDArray[np.int64]) -> NDArray[Any]:
+def _pick(x: NDArray[Any], k: Integers) -> NDArray[Any]:
     """Return x[k] per axis."""
     return np.asarray(np.take_along_axis(x, np.asarray(k)[None], axis=0)[0])
 
@@ -370,12 +370,12 @@ def _trapezoid_weights(t: Floats) -> Floats:
     return np.asarray(np.append(half, 0.0) + np.append(0.0, half))
 
 
-def _diverged(x: Floats) -> NDArray[np.bool_]:
+def _diverged(x: Floats) -> Mask:
     """Return which axes hold a sample that is not finite."""
     return np.asarray(~np.isfinite(x).all(axis=0))
 
 
-def _or_nan(figure: Floats, diverged: NDArray[np.bool_]) -> Floats:
+def _or_nan(figure: Floats, diverged: Mask) -> Floats:
     """Return the figure, nan where the axis diverged or the arithmetic overflowed."""
     return np.where(diverged | ~np.isfinite(figure), np.nan, figure)
 

@@ -16,11 +16,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.motors import Motor
-
-Floats = NDArray[np.float64]
+from mechanics.arrays import Floats
 
 LENGTH = 100  # samples of a swing, one per ms
 SUBSTEPS = 10  # of the integration, in a ms

@@ -50,6 +50,7 @@ from drive_env.emulator.parameters import WIRING
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics, loop_clearance
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates
 from drive_env.loops.true_plant import elastic_lags, true_machines
+from drive_env.phase_current import swing_period
 from drive_env.saved_state import Saved
 from drive_env.trials.positioning import (
     CYCLE,
@@ -65,6 +66,7 @@ from drive_env.trials.positioning import (
     wrapped,
     write_profile,
 )
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
@@ -72,9 +74,6 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
     from mechanics.load import Load
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TRIP = 30.0
 BENT = TRIP / 2.0  # where J begins to bend towards it
@@ -140,13 +139,7 @@ class Terms(NamedTuple):
 
     def each(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Terms:
         """Return the terms with a function applied to each."""
-        return Terms(
-            function(self.settling),
-            function(self.disturbance),
-            function(self.noise),
-            function(self.overshoot),
-            function(self.tripped),
-        )
+        return Terms(*map(function, self))
 
 
 def cost(terms: Terms) -> Floats:
@@ -411,52 +404,74 @@ class RobustScore(Saved):
         full = (machines, runs, axes, *values.shape[1:])
         return np.broadcast_to(values.reshape(shape), full).reshape(-1, *values.shape[1:])
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats, CurrentSwings]:
+    def _run(self, gains: Integers) -> tuple[Any, Floats, CurrentSwings]:
         """Return the terms of every axis without E_d/E_0, E_d [rad s] and swings, (machines, runs, axes) each."""
-        drives, move = self._drives, self._move
+        drives, move, shape = self._drives, self._move, self._axes
         drives.machine.load_torque = self._constant
         drives.machine.reset()
-        write_gains(
-            drives, drives.device.gains.with_velocity_p(self._spread(np.asarray(gains, np.int64)), self._factors)
-        )
+        used = self._varied(self._spread(np.asarray(gains, np.int64)))
+        write_gains(drives, used)
         write_profile(drives, move)
+        objects = self._objects()
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
-            power_up(drives)
-            target = move.distance + np.rint(self._place * move.increments / move.counts).astype(np.int64)
+            target, failed = self._get_ready()
             start(drives, target)
-            demanded = [name for name in _DEMANDED if not isinstance(name, Role) or name in drives.device.roles]
-            objects: list[ObjectName] = [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
-            free = drives.record(objects, SETTLED * CYCLE)
-            drives.machine.load_torque = self._constant + self._load_torque
-            loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
-        current = sum(free[name] for name in demanded) * ampere_per_count(drives)
-        direction = np.where(move.distance < 0, -1, 1)
-        settling, noise, overshoot = move_terms(
-            free[cia402.POSITION_ACTUAL].astype(float),
-            np.asarray(current, float),
-            move,
-            self._t_0,
-            drives.motor.rated_current,
-            target,
-            direction,
-        )
-        tripped = ~cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED) | np.repeat(
-            drives.machine.diverged, self._axes[2]
-        )
+            before = drives.record(objects, SETTLED * CYCLE)
+            free = {name: before[name] for name in objects}
+            loaded = self._load_step(objects)
+        failed = failed | ~cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
+        terms = self._terms(free, loaded, target, used)
+        terms = terms._replace(tripped=terms.tripped | failed | np.repeat(drives.machine.diverged, shape[2]))
         error = np.abs(wrapped(target - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
-        shape = self._axes
-        terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
-        measured = free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives)
-        return (
-            terms.each(lambda value: value.reshape(shape)),
-            np.maximum(error, move.least_error).reshape(shape),
-            swings(measured, drives.motor.rated_current, shape),
-        )
+        if cia402.TORQUE_ACTUAL in objects:
+            measured = free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives)
+            seen = swings(measured, drives.motor.rated_current, shape)
+        else:
+            seen = CurrentSwings(np.full(shape, np.nan), np.full(shape, np.nan))
+        return terms.each(lambda value: value.reshape(shape)), np.maximum(error, move.least_error).reshape(shape), seen
 
-    def _scores(self, terms: Terms, disturbance: Floats, swings: CurrentSwings) -> Scores:
+    # What kinds of drives differ in.
+    _cost: Callable[[Any], Floats] = staticmethod(cost)
+
+    def _objects(self) -> list[ObjectName]:
+        """Return what is recorded: position and statusword, and between them the parts of the demanded current."""
+        roles = self._drives.device.roles
+        demanded = [name for name in _DEMANDED if not isinstance(name, Role) or name in roles]
+        return [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
+
+    def _varied(self, gains: Integers) -> Integers:
+        """Return the gains of all axes of all variants with what the variants change of them."""
+        return self._drives.device.gains.with_velocity_p(gains, self._factors)
+
+    def _get_ready(self) -> tuple[Integers, Mask]:
+        """Enable the drives at rest; return where they go [inc], and which axes cannot be scored."""
+        move = self._move
+        power_up(self._drives)
+        place = np.rint(self._place * move.increments / move.counts).astype(np.int64)
+        return move.distance + place, np.zeros(self._drives.num_axes, bool)
+
+    def _load_step(self, objects: list[ObjectName]) -> Mapping[Any, Integers]:
+        """Load the machines until the trial ends; return what was recorded meanwhile."""
+        self._drives.machine.load_torque = self._constant + self._load_torque
+        trace = self._drives.record(objects, (TRIAL - SETTLED) * CYCLE)
+        return {name: trace[name] for name in objects}
+
+    def _terms(
+        self, free: Mapping[Any, Integers], loaded: Mapping[Any, Integers], target: Integers, used: Integers
+    ) -> Any:
+        """Return the terms of every axis by what was recorded before and after the load step, with E_d/E_0 1."""
+        drives, move = self._drives, self._move
+        current = sum(free[name] for name in self._objects()[1:-1]) * ampere_per_count(drives)
+        settling, noise, overshoot = move_terms(
+            free[cia402.POSITION_ACTUAL].astype(float), np.asarray(current, float), move, self._t_0,
+            drives.motor.rated_current, target, np.where(move.distance < 0, -1, 1),
+        )  # fmt: skip
+        return Terms(settling, np.ones_like(settling), noise, overshoot, np.zeros(len(settling), bool))
+
+    def _scores(self, terms: Any, disturbance: Floats, swings: CurrentSwings) -> Scores:
         terms = terms._replace(disturbance=disturbance / self._reference[:, None])
-        return self._averaged(terms, cost(terms), swings)
+        return self._averaged(terms, self._cost(terms), swings)
 
     def _averaged(self, terms: Any, j: Floats, swings: CurrentSwings) -> Scores:
         """Return the scores by terms, J and swings of every axis in all runs, (machines, runs, axes)."""
@@ -488,6 +503,9 @@ class StepperScore(RobustScore):
 
     def _disturbance_scale(self) -> Floats:
         return self._reference
+
+    def _settling_scale(self, filters: Floats) -> Floats:
+        return np.full(np.shape(filters), swing_period(self._drives.motor))
 
 
 def swings(current: Floats, rated_current: float, shape: tuple[int, ...]) -> CurrentSwings:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
@@ -21,10 +20,7 @@ from drive_env.drives.interface import Drives
 from drive_env.motors import Motor
 from drive_env.trials.open_loop import LOST, TOOTH, OpenLoopTrials
 from drive_env.trials.positioning import CYCLE, Move, wrapped, write_profile
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from mechanics.arrays import Floats, Integers, Mask
 
 SAMPLE = 4 * CYCLE  # s between two samples
 SETTLE = 0.06  # s after the ramp, until the rotor's swing has died away

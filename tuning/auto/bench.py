@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.drives.raw_gains import read_gains
 from drive_env.trials.positioning import wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.certificate.certificate import TAKEN, Correction
-from tuning.identify.wiring import Key, write_wiring
+from tuning.identify.wiring import write_wiring
 from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.proving import ProvingGround
     from tuning.target import DriveTime, Target
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
+from mechanics.arrays import Floats
 from tuning.auto.load_step import NOISE, SWING
 from tuning.auto.loop_margins import OVERSHOOT_ERROR, AskedMargin, asked_margins
 from tuning.auto.measured_margins import LOOPS
@@ -35,7 +36,6 @@ from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
-    from tuning.arrays import Floats
     from tuning.auto.proving import Shown
     from tuning.auto.result import AxisResult, Result
     from tuning.target import Target

@@ -12,6 +12,7 @@ from drive_env.devices.gains import cascade_columns
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
@@ -21,7 +22,6 @@ from tuning.auto.stages import RecordedGains
 from tuning.auto.trying import between
 
 if TYPE_CHECKING:
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
     from tuning.target import Target

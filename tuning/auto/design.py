@@ -21,6 +21,7 @@ import numpy as np
 from drive_env.devices.gains import Part, cascade_columns, integers_per_si, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.trials.score import robust_cost
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.loop_margins import measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models, model_of
 from tuning.auto.proving import RESTLESS
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.loop_model import LinkedAxis, LoopModel
     from tuning.auto.measured_margins import MeasuredAxis

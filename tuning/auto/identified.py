@@ -12,7 +12,7 @@ from drive_env.devices.gains import bandwidth_gains, rule_gains
 from drive_env.fieldbus.errors import BusError
 from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import SafetyError, swinging_allowed
-from tuning.arrays import Integers, Mask
+from mechanics.arrays import Integers, Mask
 from tuning.auto.checks import identified_plant, unsafe_gains
 from tuning.auto.stages import Basis, IdentifiedAxes
 from tuning.identify.identified_axis import TITLES

@@ -17,10 +17,10 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import machine_of
 from drive_env.trials import response
 from drive_env.trials.positioning import CYCLE, wrapped
+from mechanics.arrays import Mask
 from tuning.certificate.certificate import StepResponse
 
 if TYPE_CHECKING:
-    from tuning.arrays import Mask
     from tuning.target import Target
 
 NAME = "load step of 0.3 rated torque at standstill"

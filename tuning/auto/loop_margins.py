@@ -15,6 +15,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.safety.envelope import SafetyError
+from mechanics.arrays import Integers, Mask
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.model_bounds import at_least_by_model, why_unbounded
@@ -25,7 +26,6 @@ from tuning.response.measured_loop import merged
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.margins import Margins
-    from tuning.arrays import Integers, Mask
     from tuning.auto.bench import AutoBench, Journal
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.response.measured_loop import AtLeast, MeasuredLoop

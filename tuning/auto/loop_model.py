@@ -18,6 +18,7 @@ from drive_env.loops.margins import margins
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, Windings, linear_machines, open_loops
 from drive_env.loops.worst_margins import HIGHEST, LOWEST, POINTS
 from drive_env.trials.score import servo_variants
+from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from drive_env.loops.margins import Margins
     from drive_env.loops.sampled import OuterLoops
     from drive_env.motors import Motor
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.stages import IdentifiedAxes, RecordedGains
     from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import MeasuredLoop

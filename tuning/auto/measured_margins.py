@@ -11,11 +11,11 @@ from drive_env.loops.dynamics import OFF_NOMINAL
 from drive_env.loops.linear_model import controllers, velocity_filter_response, velocity_plant
 from drive_env.loops.margins import Margins, margins
 from drive_env.trials.score import VARIANTS
+from mechanics.arrays import Complex, Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
-    from tuning.arrays import Complex, Floats, Integers
     from tuning.response.measured_loop import MeasuredLoop
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once

@@ -9,6 +9,7 @@ import numpy as np
 
 from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import SafetyError
+from mechanics.arrays import Mask
 from tuning.auto.bench import LOOK_BACK_TIME
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.loop_margins import measured_axis
@@ -16,7 +17,6 @@ from tuning.auto.loop_model import loop_models
 from tuning.auto.proving import RESTLESS, without_noise
 
 if TYPE_CHECKING:
-    from tuning.arrays import Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.target import Target

@@ -40,6 +40,7 @@ from drive_env.trials.positioning import (
     write_profile,
 )
 from drive_env.trials.score import TRIP, Terms, cost
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.fallback_gains import FallbackGains
 from tuning.link_energy import bearable_speed, trial_reach
 from tuning.oscillation_watch import SOFTER
@@ -47,7 +48,6 @@ from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.target import Target
 
 ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does not pass

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.certificate.certificate import TAKEN, verdict
 from tuning.lateness import late_first
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.auto.stages import IdentifiedAxes, RecordedGains

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402, motion
+from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import write_gains
-from tuning.identify.wiring import Key, changes, corrected, findings
+from mechanics.arrays import Integers, Mask
+from tuning.identify.wiring import changes, corrected, findings
 from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
-    from tuning.arrays import Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import IdentifiedAxes
     from tuning.target import Target

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drive_env.trials.positioning import longer_way
+from mechanics.arrays import Floats, Integers, Mask, Texts
 from tuning.link_energy import trial_reach
 
 if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
-    from tuning.arrays import Floats, Integers, Mask, Texts
     from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
     from tuning.certificate.certificate import StepResponse

@@ -10,13 +10,13 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import write_gains
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.bench import TRIAL_TIME
 from tuning.auto.proving import ProvingGround
 from tuning.auto.stages import RecordedGains
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
-    from tuning.arrays import Floats, Integers, Mask
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
 

@@ -21,13 +21,13 @@ from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
 from drive_env.trials.score import TRIPPED, RobustScore
+from mechanics.arrays import Floats, Integers
 from tuning.auto.loop_model import corner
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
-    from tuning.arrays import Floats, Integers
     from tuning.identify.identified_axis import Identification
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the

@@ -14,11 +14,12 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.whole_file import content_hash
+from mechanics.arrays import Floats
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 FORMAT = 3
 STEPPER_FORMAT = "stepper 1"  # of stepper-certificate.json, which tuning/stepper/result.py writes
 HASH = "sha256"
-
-Floats = NDArray[np.float64]
 
 
 VERDICTS = ("accepted", "accepted with reservations", "rejected")

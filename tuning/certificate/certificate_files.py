@@ -12,8 +12,9 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from drive_env.whole_file import content_hash, files_to_be
+from mechanics.arrays import Floats
 from mechanics.untrusted import parse_json, read_text
-from tuning.certificate.certificate import FORMAT, HASH, STEPPER_FORMAT, Certificate, CertificateError, Floats
+from tuning.certificate.certificate import FORMAT, HASH, STEPPER_FORMAT, Certificate, CertificateError
 from tuning.certificate.report import html_is_unchanged, to_html
 from tuning.runs.inputs import Input, write_inputs
 

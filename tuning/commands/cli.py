@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import typer
-
-from drive_env.commands.program import CONTEXT, Quiet, Verbose, Version, say_as_much
+from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 from tuning.commands.auto import auto
 from tuning.commands.identify import identify
 from tuning.commands.optimise import optimise
-from tuning.commands.options import interrupted
 from tuning.commands.rank import rank
 from tuning.commands.response import response
 from tuning.commands.rules import rules
@@ -16,13 +13,7 @@ from tuning.commands.sweep import sweep
 from tuning.commands.undo import undo
 from tuning.commands.verify import verify
 
-app = typer.Typer(
-    name="drive-tune",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
-    pretty_exceptions_enable=False,
-    context_settings=CONTEXT,
-)
+app = Program("drive-tune", "interrupted; nothing was written")
 
 PANELS = {
     "A drive, emulated or on a bus": (identify, response, rules, optimise, auto),
@@ -44,12 +35,7 @@ def drive_tune(version: Version = False, quiet: Quiet = False, verbose: Verbose 
     say_as_much(quiet, verbose)
 
 
-def main() -> None:
-    """Run the command; Ctrl-C ends it with 130."""
-    try:
-        app()
-    except KeyboardInterrupt:
-        interrupted()
+main = app.run
 
 
 if __name__ == "__main__":

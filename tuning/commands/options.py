@@ -7,10 +7,10 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
 
 import typer
 
@@ -25,9 +25,10 @@ from drive_env.commands.options import Json as Json
 from drive_env.commands.options import Nodes as Nodes
 from drive_env.commands.options import Yes as Yes
 from drive_env.commands.options import ask as ask
-from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus
+from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus, options_of, with_options
 from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
+from drive_env.default_device import DEFAULT_DEVICE
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
@@ -131,7 +132,7 @@ class DriveOptions:
     """The options that name a drive, emulated or on a bus; `takes` gives them to a command."""
 
     bus: Bus = False
-    device: DeviceName = "tmcm1636"
+    device: DeviceName = DEFAULT_DEVICE
     eds: ForeignEds = None
     motor: MotorName = None
     load: LoadName = "two_mass"
@@ -233,11 +234,7 @@ def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callab
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        hints = get_type_hints(options, include_extras=True)
-        shared = [
-            inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
-            for f in fields(options)
-        ]
+        shared = options_of(options)
         own = inspect.signature(command, eval_str=True).parameters
         mine = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, p in own.items() if name != "drive"]
 
@@ -250,10 +247,7 @@ def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callab
             command(drive=chosen, **given)
 
         context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        taken = [context, *mine, *shared]
-        run.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]  # what typer reads
-        run.__annotations__ = {p.name: p.annotation for p in taken}
-        return run
+        return with_options(run, [context, *mine, *shared])
 
     return decorate
 
@@ -457,9 +451,3 @@ def what_an_interrupt_leaves(folder: Path) -> str:
     if unfinished.unfinished_folder(folder).exists():
         return f"interrupted; the completed part is kept; continue with --out {folder} --resume"
     return "interrupted; nothing was written"
-
-
-def interrupted() -> NoReturn:
-    """End the command as Ctrl-C does while nothing has been written yet."""
-    print("drive-tune: interrupted; nothing was written", file=sys.stderr)
-    sys.exit(INTERRUPTED)

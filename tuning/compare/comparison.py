@@ -19,6 +19,7 @@ import numpy as np
 
 from drive_env.drives.observed import ObservedDrives
 from drive_env.loops.dynamics import DEFAULT
+from mechanics.arrays import Integers
 from mechanics.untrusted import parse_json
 from tuning.compare.oracle import Oracle, find_oracles
 from tuning.compare.suite import SuiteMachine, groups, open_group
@@ -32,7 +33,6 @@ from tuning.search.trial_bench import read_gains
 from tuning.target import Target
 
 if TYPE_CHECKING:
-    from tuning.arrays import Integers
     from tuning.identify.identified_axis import Identification
     from tuning.runs.pools import Pool
 

@@ -25,8 +25,8 @@ import numpy as np
 from drive_env.devices.gains import has_linear_model, integers_per_si
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.whole_file import write_table
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.untrusted import read_rows
-from tuning.arrays import Floats, Integers, Mask
 from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG, LEAST_TORQUE
 from tuning.compare.suite import SuiteMachine, groups
 from tuning.compare.yardstick import Yardstick

@@ -16,6 +16,7 @@ import numpy as np
 
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import DEFAULT
+from mechanics.arrays import Integers
 from tuning.outcome import Outcome, Tuner
 from tuning.search.optimise import Settings, optimise
 from tuning.search.samplers import check_installed
@@ -24,7 +25,6 @@ from tuning.target import Target, timed
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
-    from tuning.arrays import Integers
     from tuning.identify.identified_axis import Identification
     from tuning.rules.proposal import Proposal
 

@@ -17,7 +17,7 @@ from drive_env.loops.true_plant import true_machines
 from drive_env.loops.worst_margins import WorstMargins, worst_margins
 from drive_env.trials.positioning import highest_ramp, longer_way, plan_move
 from drive_env.trials.score import RobustScore, Scores
-from tuning.arrays import Floats, Integers
+from mechanics.arrays import Floats, Integers
 from tuning.compare.suite import SuiteMachine, open_group
 from tuning.identify.moved_inertia import true_inertia
 

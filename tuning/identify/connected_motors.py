@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.drives.interface import Drives, device_of
+from mechanics.arrays import Mask
 
 OPEN_LOAD = "open_load"  # how the names of emergencies begin that tell of a phase without current
 HELD = 0.2  # s at rest with current: a driver tells of an open phase within a quarter of it
@@ -42,7 +42,7 @@ def check_motors(drives: Drives) -> None:
     _name(drives, without)
 
 
-def _name(drives: Drives, without: NDArray[np.bool_]) -> None:
+def _name(drives: Drives, without: Mask) -> None:
     count = drives.bus.description.num_axes if drives.bus is not None else drives.num_axes
     numbers = [drives.axis_numbers[int(k)] for k in np.flatnonzero(without)]
     others = {drives.axis_numbers[int(k)] % count for k in np.flatnonzero(~without)} - {k % count for k in numbers}

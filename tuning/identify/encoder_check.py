@@ -15,20 +15,18 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import to_counts
 from drive_env.safety.envelope import swinging_allowed
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.wiring import Halls, judge_halls
-from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, read_role, still_enabled, switch_off
+from tuning.identify.working_state import BY_FIELD, Working, enable, read_role, still_enabled, switch_off
 from tuning.oscillation_watch import shaken
 from tuning.stop_causes import stop_causes
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # 1/65536 electrical turn
 RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gains import bandwidth_gains, check_linear_model
@@ -16,6 +15,8 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import swinging_allowed
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.identify.identified_axis import NAMES, Identification, Progress
@@ -27,7 +28,6 @@ from tuning.identify.working_state import (
     ALIGNED_BY_HALLS,
     BY_ENCODER,
     BY_HALLS,
-    CYCLE,
     GUESS,
     Working,
     cautious_bandwidth,
@@ -48,8 +48,6 @@ from tuning.target import Target, timed
 if TYPE_CHECKING:
     from tuning.response.plant_fit import PlantFit
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HOLD, STEADY = 160, 80  # cycles at rest before anything moves, and how many of them count
 FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # of the loops in which the response is measured
@@ -309,7 +307,7 @@ class Experiments:
                         "noise (backlash, or several resonances)"
                     ))  # fmt: skip
 
-    def response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
+    def response_gains(self, working: Working, inertia: Floats) -> Integers:
         """Return raw gains for measuring a response, (num_axes, count), for total inertias [kg*m^2]."""
         target, motor = working.target, working.target.motor
         rows = []

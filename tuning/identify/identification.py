@@ -9,15 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Mask
 from tuning.identify.experiments import Experiments
 from tuning.identify.identified_axis import Identification, Progress
 
 if TYPE_CHECKING:
     from tuning.target import Target
-
-Mask = NDArray[np.bool_]
 
 
 def identify(target: Target, where: Mask | None = None, *, progress: Progress | None = None) -> list[Identification]:

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gains import as_chip
@@ -27,20 +26,18 @@ from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.motors import Motor
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.momentum_balance import BalanceRows, Motion, Solved, balance_rows, motion, solve, step
 from tuning.identify.transmission_loss import find_losses, friction_of_whole_ways
-from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
+from tuning.identify.working_state import GUESS, Working, cautious_gains, go_back, still_enabled
 from tuning.lateness import late_first
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import SOFTER, OscillationError, watch_of
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MOST_RATIO = 30.0  # over the rotor's: beyond, a cautious excitation hardly moves the load (Yaskawa: 15 to 30)
 SPEED_SHARE, CURRENT_SHARE, ROOM_SHARE = 0.7, 0.5, 0.75  # of the limits

@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tuning.identify.working_state import CYCLE
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Integers
 
 SMOOTHED = 9  # samples over which a signal is averaged
 STANDS, SLOWEST = 0.02, 0.5  # share of the greatest speed, and rad/s: about standstill the sign of friction changes

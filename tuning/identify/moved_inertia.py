@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.drives.interface import machine_of
 from drive_env.emulator.emulated_drives import emulated_of
+from mechanics.arrays import Floats
 from mechanics.shaft import way
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 LEAST_SHARE = 0.2  # of the inertia of an axis that turns alone: what others take off it is taken for no more than that
 
 
-def moved_inertia(load: PackedLoad) -> NDArray[np.float64]:
+def moved_inertia(load: PackedLoad) -> Floats:
     """Return total inertia, rotors and load [kg*m^2], of every copy's axes where the load starts, (copies, axes).
 
     With B the ways of the axes and M the joints' mass matrix, tau = B M B^T alpha: for accelerations that are alike,
@@ -33,7 +33,7 @@ def moved_inertia(load: PackedLoad) -> NDArray[np.float64]:
     return np.asarray(np.maximum(at_axes.sum(axis=2), LEAST_SHARE * alone))
 
 
-def true_inertia(target: Target) -> NDArray[np.float64]:
+def true_inertia(target: Target) -> Floats:
     """Return the inertia of emulated axes as a perfect identification finds it: over the true K_t, times the nominal.
 
     The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.

@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
@@ -22,6 +21,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
 from drive_env.trials.method import method_of
 from drive_env.trials.positioning import longer_way
+from mechanics.arrays import Floats, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.encoder_check import PULSED
 from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
@@ -65,7 +65,7 @@ NO_DELAY = (
 
 
 def identify_briefly(
-    target: Target, where: NDArray[np.bool_] | None = None, progress: Progress | None = None
+    target: Target, where: Mask | None = None, progress: Progress | None = None
 ) -> list[Identification]:
     """Identify axes, all by default, in about four seconds for each of a machine.
 
@@ -85,7 +85,7 @@ class _Brief(Experiments):
     thorough = False
     corrects = True  # a tuner is to leave a drive that turns
 
-    def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
+    def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         super().__init__(target, where, progress)
         # The estimates of each axis by measurement, where `found` has a guess.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
@@ -130,7 +130,7 @@ class _Brief(Experiments):
         switch_off(drives, working.where)
         self.respond(working, inertia)
 
-    def _move_together(self, working: Working, trials: Trials, holding: NDArray[np.float64]) -> Working:
+    def _move_together(self, working: Working, trials: Trials, holding: Floats) -> Working:
         """Find the inertia that axes of one machine push while all of them move; return those without oscillation."""
         target, lanes = working.target, working.target.axes_per_machine
         whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
@@ -157,7 +157,7 @@ class _Brief(Experiments):
             self._pushed[machine * lanes : (machine + 1) * lanes] = map(tuple, rows.tolist())
         return self.calm(working)
 
-    def _take_moved(self, found: Identified, where: NDArray[np.bool_]) -> None:
+    def _take_moved(self, found: Identified, where: Mask) -> None:
         for k in map(int, np.flatnonzero(where)):
             self.found[k] |= {
                 "inertia": _about(found.inertia[k], INERTIA_ERROR, "kg*m^2"),
@@ -167,7 +167,7 @@ class _Brief(Experiments):
             }
             self._told[k] = {name: refused(UNITS[name], reason) for name, reason in NOT_TOLD.items()}
 
-    def respond(self, working: Working, inertia: NDArray[np.float64]) -> None:
+    def respond(self, working: Working, inertia: Floats) -> None:
         target, drives = working.target, working.target.drives
         fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         able = working.where & ~fault
@@ -213,7 +213,7 @@ class _Brief(Experiments):
         ))  # fmt: skip
 
 
-def pushed_inertia(ways: NDArray[np.float64], inertia: NDArray[np.float64]) -> NDArray[np.float64]:
+def pushed_inertia(ways: Floats, inertia: Floats) -> Floats:
     """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), from the inertias pushed while all moved.
 
     Args:
@@ -240,7 +240,7 @@ def loose(ratio: float) -> str:
     )
 
 
-def _turns(working: Working) -> list[NDArray[np.bool_]]:
+def _turns(working: Working) -> list[Mask]:
     """Return which axes move when: those of a machine one after the other, since each pulls at the next; or linked."""
     lanes = working.target.axes_per_machine
     if working.target.linked:

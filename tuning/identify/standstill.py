@@ -11,20 +11,19 @@ and between two currents that are large enough for dead time to lose the same fr
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats
 from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.encoder_check import able, stay_inside
 from tuning.identify.winding import SUPPLY_IDLE, WIDEST
-from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, still_enabled, switch_off
+from tuning.identify.working_state import BY_FIELD, Working, enable, still_enabled, switch_off
 from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
-
-Floats = NDArray[np.float64]
 
 LEVELS = (0.9, 0.7, 0.5)  # over what may be asked for
 ROUNDS = 3  # there and back, and there again

@@ -19,15 +19,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats
 from tuning.identify.momentum_balance import Motion, Solved, balance_rows, smoothed, solve, step
-from tuning.identify.working_state import CYCLE
 
 if TYPE_CHECKING:
     from drive_env.motors import Motor
 
-Floats = NDArray[np.float64]
 Cruises = tuple[tuple[int, int, int], ...]
 
 CLEAR = 3.0  # times its deviation: from here on it is taken out; below, the interval becomes wider

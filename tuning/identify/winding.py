@@ -18,21 +18,19 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.devices.gains import cascade_columns, per_chip
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile
-from tuning.identify.working_state import CYCLE, Working, still_enabled
+from tuning.identify.working_state import Working, still_enabled
 from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Amplitude of a pulse over what may be asked for, and the cycles that a level lasts; a pulse is +, -, -, +, so that
 # speed and way end at 0. Short ones hold as many changes of the current in a third of the time: they say the
@@ -72,7 +70,7 @@ class Pulses(NamedTuple):
     current: Floats  # A, n + 1: the last tick's
     angle: Floats  # rad, n + 1
     duty_sum: Floats  # n + 1
-    block: NDArray[np.int64]  # n: which pulse
+    block: Integers  # n: which pulse
     alive: Mask  # num_axes: enabled to the end
     step: float = CYCLE  # s from row to row; more if the reads were out of step with the drive
 
@@ -192,7 +190,7 @@ class _AxisWinding(NamedTuple):
     current: Floats
     angle: Floats
     duty_sum: Floats
-    block: NDArray[np.int64]
+    block: Integers
 
 
 def _of_axis(pulses: Pulses, k: int) -> _AxisWinding:
@@ -201,7 +199,7 @@ def _of_axis(pulses: Pulses, k: int) -> _AxisWinding:
     )
 
 
-def _levels(repeats: int) -> tuple[Floats, NDArray[np.int64]]:
+def _levels(repeats: int) -> tuple[Floats, Integers]:
     levels: list[float] = []
     blocks: list[int] = []
     for repeat in range(repeats):
@@ -352,9 +350,7 @@ class _Solved(NamedTuple):
     penalty: float  # what the priors say against it
 
 
-def _fit(
-    working: Working, window: _Window, blocks: NDArray[np.int64], supply: float, emf: float, saturation: float
-) -> _Solved:
+def _fit(working: Working, window: _Window, blocks: Integers, supply: float, emf: float, saturation: float) -> _Solved:
     stage, rate = working.target.device.stage, working.target.device.current_rate
     low, high = stage["dead_time"].low, stage["dead_time"].high
     R = working.target.motor.R_s
@@ -373,7 +369,7 @@ def _fit(
     return _solve(X[keep], Z[keep], window.flux[keep], blocks[keep], prior, deviation, count)
 
 
-def _average(results: list[_Solved], blocks: NDArray[np.int64]) -> _Fit:
+def _average(results: list[_Solved], blocks: Integers) -> _Fit:
     """Average over the saturation currents by their likelihood."""
     rest, penalty = np.array([result.rest for result in results]), np.array([result.penalty for result in results])
     # Chi square over degrees of freedom that pulses, not milliseconds, have; and what the priors say.
@@ -391,7 +387,7 @@ def _solve(
     X: Floats,
     Z: Floats,
     y: Floats,
-    blocks: NDArray[np.int64],
+    blocks: Integers,
     prior: Floats,
     deviation: Floats,
     count: float,

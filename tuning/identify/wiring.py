@@ -11,20 +11,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
 from drive_env.safety.rotor import wrapped
+from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Key = tuple[int, int]
 
 # What is wrong with a cable where the drive is set otherwise than it is wired.
 FINDINGS = {

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
 from drive_env.devices.gains import bandwidth_gains
@@ -24,6 +24,8 @@ from drive_env.drives.interface import Drives, axis_number
 from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.identify.wiring import FINDINGS
 from tuning.stop_causes import told_causes
 from tuning.target import Target
@@ -31,11 +33,7 @@ from tuning.target import Target
 if TYPE_CHECKING:
     from drive_env.devices import Device
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
-CYCLE = 0.001  # s
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 

@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.linear_model import Plant, position_open_loop, velocity_open_loop
 from drive_env.whole_file import write_picture
+from mechanics.arrays import Complex, Floats
 from tuning.response.measured_loop import COHERENT, MeasuredLoop
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 MEASURED, TRACED, MODEL, GREY = "#0b5cad", "#c2560c", "#222222", "#b5b5b5"
 PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, which leads, does not wrap

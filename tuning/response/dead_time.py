@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mechanics.arrays import Floats
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
 
-Floats = NDArray[np.float64]
 
 SQRT3 = 3.0**0.5
 ANGLES = 24  # of a turn, over which a resistance is averaged

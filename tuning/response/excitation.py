@@ -9,11 +9,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from mechanics.arrays import Complex, Floats, Integers
 
 KINDS = ("multisine", "chirp")
 CREST = 2.5  # peak over RMS that is counted with before the wave is known
@@ -31,7 +29,7 @@ class Lines(NamedTuple):
     rate: float
 
     @property
-    def bins(self) -> NDArray[np.int64]:
+    def bins(self) -> Integers:
         """Which bins of a period's Fourier transform the lines are."""
         return np.rint(self.f * self.samples / self.rate).astype(np.int64)
 

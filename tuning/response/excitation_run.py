@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
@@ -21,13 +21,10 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-from drive_env.trials.positioning import wrapped
+from drive_env.trials.positioning import CYCLE, wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.response.excitation import Lines, periodic
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 SET_POINT = {"velocity": (cia402.TARGET_VELOCITY, 0), "position": (cia402.TARGET_POSITION, 0)}
 OFFSET = {
@@ -37,7 +34,6 @@ OFFSET = {
 SEEN = {"velocity": cia402.VELOCITY_ACTUAL, "position": cia402.POSITION_ACTUAL}
 MODE = {"velocity": "csv", "position": "csp"}
 INTERPOLATION = ((cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2))
-CYCLE = 0.001  # s
 RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until what it left has died away
 FADE = 20  # cycles
 IN_RAMPS = 0.3  # share of the shaking while the speed changes
@@ -168,7 +164,7 @@ class Shaker:
         trace = self._drives.record([cia402.TORQUE_ACTUAL], (REST + LOOK) * CYCLE)
         return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
 
-    def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, NDArray[np.bool_]]:
+    def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, Mask]:
         """Return the steady velocity of every cycle, (cycles, axes), and which cycles are looked at."""
         rows, inside, before = [], [], np.zeros_like(speed)
         long = SETTLING + periods * self._lines.samples

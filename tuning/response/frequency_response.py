@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gains import check_linear_model
@@ -23,12 +22,14 @@ from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency
+from drive_env.trials.positioning import CYCLE
+from mechanics.arrays import Complex, Floats, Integers, Mask
 from tuning.lateness import told_lateness
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy
 from tuning.oscillation_watch import OscillationError, shaken, watch_of
 from tuning.response.dead_time import dead_time_resistance
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
-from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
+from tuning.response.excitation_run import MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.response.held_samples import split, unhold
 from tuning.response.measured_loop import COHERENT, MeasuredLoop, merged
 from tuning.response.plant_fit import PlantFit, Seen, fit_plant
@@ -41,10 +42,6 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 LOOPS = ("velocity", "position")
 RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz

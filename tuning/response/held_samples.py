@@ -17,12 +17,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import Device
+from mechanics.arrays import Complex, Floats
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Response = Callable[[Floats], Complex]  # of frequencies above 0 and below half the velocity loop's rate [Hz], (n,)
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops import margins as margins_
 from drive_env.loops.linear_model import controllers, outer_loop, velocity_open_loop
+from mechanics.arrays import Complex, Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -19,10 +19,6 @@ if TYPE_CHECKING:
     from tuning.estimate import Estimate
     from tuning.response.plant_fit import PlantFit
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 COHERENT = 0.95  # from which on a line is trusted
 FINE = 10  # points between two lines, where margins are looked for

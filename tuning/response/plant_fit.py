@@ -14,21 +14,18 @@ from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from drive_env.loops.linear_model import Plant, controllers, velocity_open_loop, velocity_plant
+from mechanics.arrays import Complex, Floats, Integers
 from tuning.response.held_samples import seen_by_bus
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.estimate import Estimate
 
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
 
 LINEAR = 0.01  # share by which the linear model may be off at a line for reasons that repeat: friction, cogging
 VALLEY, NEIGHBOURS = 0.02, 5  # the same, of the greatest among so many neighbours
@@ -101,7 +98,7 @@ class PlantFit(NamedTuple):
         """Whether there is a fit that is good enough to read margins between lines by."""
         return not self.reason and self.misfit <= GOOD_MISFIT
 
-    def open_loop(self, device: Device, gains: NDArray[np.int64], f: Floats) -> Complex:
+    def open_loop(self, device: Device, gains: Integers, f: Floats) -> Complex:
         """Return the velocity loop's open loop at frequencies [Hz], shape (n,)."""
         return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
 
@@ -131,14 +128,14 @@ class _Solution(NamedTuple):
     jacobian: Floats  # their derivatives by the parameters, as `_unpack` takes them
 
 
-def _open_loop(device: Device, model: _Model, gains: NDArray[np.int64], f: Floats, lost: float) -> Complex:
+def _open_loop(device: Device, model: _Model, gains: Integers, f: Floats, lost: float) -> Complex:
     # The winding of a model is the data sheet's: what dead time adds to it comes here.
     L = velocity_open_loop(device, replace(model.plant, R=model.plant.R + lost), gains, f)
     return L if model.second is None else L * model.second.response(f)
 
 
 def fit_plant(
-    device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, spread: Floats, start: Plant,
+    device: Device, gains: Integers, f: Floats, seen: Complex, spread: Floats, start: Plant,
     parts: Sequence[Complex] = (), distortion: float = 0.0, lost: float = 0.0, less: Seen | None = None,
 ) -> PlantFit:  # fmt: skip
     """Fit the plant of one axis to its closed velocity loop as a bus sees it.
@@ -282,7 +279,7 @@ class _Loop(NamedTuple):
     """A closed velocity loop as the bus sees it, and the weight of each line."""
 
     device: Device
-    gains: NDArray[np.int64]
+    gains: Integers
     f: Floats
     seen: Complex
     weight: Floats
@@ -370,7 +367,7 @@ def _criterion(solution: _Solution) -> float:
 
 
 # --- where to begin ---------------------------------------------------------------------------------------------------
-def _rough_loop(device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex) -> Complex:
+def _rough_loop(device: Device, gains: Integers, f: Floats, seen: Complex) -> Complex:
     """Return velocity per demanded current with the images still in it."""
     from tuning.response.held_samples import unhold
 
@@ -379,7 +376,7 @@ def _rough_loop(device: Device, gains: NDArray[np.int64], f: Floats, seen: Compl
     return np.asarray(closed / (1.0 - closed) / controllers(device, gains).velocity(z))
 
 
-def _with_inertia(plant: Plant, device: Device, gains: NDArray[np.int64], f: Floats, rough: Complex) -> Plant:
+def _with_inertia(plant: Plant, device: Device, gains: Integers, f: Floats, rough: Complex) -> Plant:
     ratio = np.abs(velocity_plant(device, plant, gains, f)) / np.abs(rough)
     return replace(plant, inertia=plant.inertia * float(np.median(ratio[: max(4, len(f) // 4)])))
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal, stats
 
+from mechanics.arrays import Complex, Floats
 from tuning.response.excitation import Lines
-
-Floats = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 STANDS = 1e-9  # of the set-point: an axis that answers less was not shaken
 DISTORTION_HIGH, TRIMMED = 200.0, 0.1  # Hz up to which passes are compared, and the share of lines left out at each end

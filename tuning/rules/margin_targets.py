@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.loops.linear_model import controllers, current_open_loop, mean_velocity, velocity_plant
 from drive_env.loops.margins import Margins, margins
+from mechanics.arrays import Complex
 from tuning.rules.proposal import Proposal, Rule, Workbench
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
 
-Complex = NDArray[np.complex128]
 
 TARGETS = {"margin_45": (45.0, 8.0), "margin_55": (55.0, 12.0), "margin_60": (60.0, 20.0), "margin_65": (65.0, 35.0)}
 

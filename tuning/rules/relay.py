@@ -13,12 +13,12 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.trials.positioning import CYCLE, wrapped
+from mechanics.arrays import Floats, Mask
 from tuning.rules.lags import slow_enough, velocity_lag
 from tuning.rules.optima import take_current
 from tuning.rules.proposal import Proposal, Workbench
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
     from tuning.target import Target
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 TIME, TRANSIENT = 0.3, 0.1  # of the experiment, and of it what is left out at its beginning [s]
 SHARE = 0.4  # of the rated current, at least: the relay's height

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device, find_device
@@ -23,6 +22,7 @@ from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
 from drive_env.drives.speeds import per_increment_of
 from drive_env.motors import find_motor
+from mechanics.arrays import Integers
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
 from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, taken
@@ -56,7 +56,7 @@ class SweptObject:
     count: int
     spacing: str
 
-    def values(self) -> NDArray[np.int64]:
+    def values(self) -> Integers:
         """Return the raw values in rising order; values that are equal after rounding count once."""
         spaced = np.geomspace if self.spacing == "log" else np.linspace
         raw = np.rint(spaced(self.low, self.high, self.count)).astype(np.int64)
@@ -107,7 +107,7 @@ class Experiment:
     metric: MetricChoice
     versions: Mapping[str, str] = field(default_factory=dict)
 
-    def points(self, first: int = 0, last: int | None = None) -> NDArray[np.int64]:
+    def points(self, first: int = 0, last: int | None = None) -> Integers:
         """Return the grid, or its points from the first to before the last, shape (points, objects).
 
         The last object changes fastest.

@@ -328,7 +328,7 @@ def _of_device(path: Path) -> list[Path]:
     from drive_env.devices.own_folder import own_data
 
     named = ("device.toml", str(own_data(path)["eds"]), "bindings.toml", "roles.toml", "gains.toml")
-    return [*(path / name for name in named), *(path / "presets").glob("*.toml")]
+    return [*(path / name for name in named), *path.glob("commissioning.toml"), *(path / "presets").glob("*.toml")]
 
 
 _FILES = {"motor": _alone, "distributions": _alone, "load": _of_load, "device": _of_device, "suite": _alone}

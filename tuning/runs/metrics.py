@@ -10,16 +10,14 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.trials import response
+from mechanics.arrays import Floats, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.devices.gain_set import ClosedLoop
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # A current that swings by this share of the limit without decaying is a limit cycle; noise at usable gains stays below
 # 0.03.

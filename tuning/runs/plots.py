@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from mechanics.loads import find_load
 from tuning.runs import metrics
 from tuning.runs.experiment import SweptObject
@@ -23,7 +23,6 @@ from tuning.runs.metrics import MoveRecording
 if TYPE_CHECKING:
     from tuning.runs.sweep import SweepResult
 
-Floats = NDArray[np.float64]
 UNUSABLE, NO_FIGURE = "#d0d0d0", "#f8ddc4"
 BEST: dict[str, Any] = {
     "marker": "*",

@@ -25,6 +25,7 @@ from drive_env.drives.trace import Trace
 from drive_env.phase_current import run_and_standby
 from drive_env.trials.open_loop import ENCODER, LOST, NO_WINDOW, TOOTH
 from drive_env.trials.positioning import wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
 from tuning.runs import metrics
@@ -63,7 +64,7 @@ class SweepResult:
     objects: tuple[str, ...]
     names: tuple[str, ...]
     columns: dict[str, NDArray[Any]]
-    order: NDArray[np.int64]
+    order: Integers
     response: MoveRecording
     simulated: float
     wall: float
@@ -74,12 +75,12 @@ class SweepResult:
         return f"score [{metrics.unit_of(self.experiment.metric.name)}]"
 
     @property
-    def score(self) -> NDArray[np.float64]:
+    def score(self) -> Floats:
         """The metric of the ranking, shape (points,)."""
         return np.asarray(self.columns[self.score_column])
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> Mask:
         """Which points neither oscillate nor tripped nor diverged, shape (points,)."""
         return np.asarray(~np.any([self.columns[flag] for flag in FLAGS], axis=0))
 
@@ -297,9 +298,9 @@ def _record(
     drives: EmulatedDrives,
     experiment: Experiment,
     resolved: Resolved,
-    points: NDArray[np.int64],
+    points: Integers,
     report: Callable[[float], None],
-) -> tuple[MoveRecording, NDArray[np.bool_]]:
+) -> tuple[MoveRecording, Mask]:
     """Return the recording of every point, and which ended in fault."""
     excitation, is_open_loop = experiment.excitation, resolved.device.gains.is_open_loop
     unclosed = np.zeros(drives.num_axes, bool)
@@ -352,7 +353,7 @@ def _record(
     return recording, tripped
 
 
-def _close_loop(drives: EmulatedDrives, loop: ClosedLoop) -> NDArray[np.bool_]:
+def _close_loop(drives: EmulatedDrives, loop: ClosedLoop) -> Mask:
     """Close the loops of enabled axes with the first gains, or the preset's; return of which axes they stay open.
 
     The following error window is off: an axis that is overloaded falls behind, and shows by what it catches up with.
@@ -368,7 +369,7 @@ def _close_loop(drives: EmulatedDrives, loop: ClosedLoop) -> NDArray[np.bool_]:
 
 def _stepper_signals(
     drives: EmulatedDrives, traces: list[Trace], period: float, loop: ClosedLoop | None
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Floats]:
     """Return speed by the encoder, lag and effort of the points, and nan for a current that nothing measures.
 
     Where the encoder commutates the torque current is measured, and its limit is the run current.
@@ -427,7 +428,7 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
     return columns
 
 
-def _score(columns: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+def _score(columns: dict[str, NDArray[Any]]) -> Floats:
     """Return the key of the ranking: inf for a point with a flag, or without the figure."""
     flagged = np.any([columns[flag] for flag in FLAGS], axis=0) | np.isnan(columns["score"])
     return np.where(flagged, np.inf, columns["score"])

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.drives.interface import axis_number
@@ -14,6 +13,7 @@ from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.checks import identified_plant
 from tuning.auto.loop_model import loop_models
 from tuning.auto.stages import IdentifiedAxes
@@ -22,10 +22,6 @@ from tuning.identify.quick_identification import identify_briefly
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 class ModelMargins:

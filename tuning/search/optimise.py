@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices.gains import RAW_MAX, check_linear_model
@@ -27,15 +26,13 @@ from drive_env.trials.method import check_tried
 from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
 from drive_env.trials.positioning import wrapped
 from drive_env.trials.score import TRIP, robust_cost
+from mechanics.arrays import Floats, Integers
 from tuning.runs.shard_log import ShardLog
 from tuning.search.model_margins import ModelMargins, here
 from tuning.search.samplers import SAMPLERS, Proposer, Study, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
 from tuning.search.trial_log import LoggedTrials
 from tuning.target import Target, timed
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 COST = "cost"
 WIDTH = math.log(6.0)  # the search reaches from a sixth to six times the rule's gains

@@ -17,11 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mechanics.arrays import Floats
 from tuning.runs.provenance import check_study
-
-Floats = NDArray[np.float64]
 
 SAMPLERS = ("random", "grid", "tpe", "cmaes", "gp")
 _NEEDS = {"cmaes": ("cmaes", "cmaes"), "gp": ("torch", "torch")}  # sampler -> module, what pip installs

@@ -25,6 +25,7 @@ from drive_env.trials.gain_trial import Identified, Trial, measured_cost
 from drive_env.trials.method import method_of
 from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, longer_way, wrapped, write_profile
 from drive_env.trials.score import TRIP
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.fallback_gains import FallbackGains
 from tuning.identify.connected_motors import check_motors
 from tuning.identify.working_state import GUESS
@@ -32,10 +33,6 @@ from tuning.link_energy import trial_reach
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
 from tuning.stop_causes import told_causes
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
 CALM = 0.1  # s until what an axis did before has died away

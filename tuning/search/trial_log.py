@@ -7,15 +7,12 @@ without moving anything, until it comes to the trial at which it ended, and on f
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.drives.raw_gains import write_gains
+from mechanics.arrays import Integers, Mask
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.search.trial_bench import TrialBench, Tried, read_gains
 from tuning.target import DriveTime
-
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 class LoggedTrials:

@@ -7,20 +7,16 @@ change the overload. The loop is left open; who closes it finds the gains.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import write_gains
 from drive_env.trials.load_reading import LOWER
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.search.optimise import Optimised, Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.stepper.load_detection import LoadDetection
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 TRIALS = 24
 REPEATS = 4  # of the commissioned gains and of what the search found, by which it is decided

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.devices.gain_set import LOAD_ANGLE
@@ -25,6 +24,7 @@ from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.load_reading import LOWER, STALL_ANGLE, has_coolstep, lacks_load_detection
 from drive_env.trials.open_loop import encoder_age
 from drive_env.trials.working_moves import WorkingMoves
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.lateness import told_lateness
 from tuning.search.optimise import Settings
 from tuning.search.samplers import load
@@ -36,9 +36,6 @@ from tuning.stepper.obstacle import OBSTACLE_RISE, REACTION, RISE, can_load, pro
 from tuning.stepper.result import StepperAxis, StepperResult, figure
 from tuning.target import Target, timed
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 Files = Callable[[StepperResult], AbstractContextManager[object]]
 

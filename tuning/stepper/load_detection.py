@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
@@ -42,11 +41,8 @@ from drive_env.trials.load_reading import (
     volts,
 )
 from drive_env.trials.working_moves import Steady, WorkingMoves
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.stop_causes import stop_causes, told_causes
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 COOL_ANGLE = math.radians(30.0)  # down to which CoolStep takes current away
 CLEAR = 3.0  # standard deviations, by which a reading must be above 0

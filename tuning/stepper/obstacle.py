@@ -7,18 +7,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.drives.interface import machine_of
 from drive_env.phase_current import LOAD_SHARE, holding_torque
 from drive_env.trials.working_moves import SETTLE, Steady, WorkingMoves
+from mechanics.arrays import Floats, Mask
 from tuning.linked_axes import are_independent
 from tuning.stop_causes import told_causes
 from tuning.target import Target
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 OBSTACLE = 1.3  # of the holding torque at the run current: more than the motor can move
 # s in which load and obstacle come. Faster is not what it seems: a load of 30 % within 5 ms or less is a stall to the

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.devices import find_device
 from drive_env.trials.open_loop import unmeasured
+from mechanics.arrays import Mask
 from tuning.certificate.certificate import HASH, STEPPER_FORMAT, verdict
 from tuning.runs.inputs import Input, hashes, write_inputs
 from tuning.runs.provenance import versions
@@ -81,7 +81,7 @@ class StepperResult:
     inputs: tuple[Input, ...] = ()
 
     @property
-    def accepted(self) -> NDArray[np.bool_]:
+    def accepted(self) -> Mask:
         """Which axes passed, (num_axes,)."""
         return np.array([axis.accepted for axis in self.axes])
 

@@ -12,12 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drive_env.drives.interface import Drives, device_of
 from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.studio.runs_folder import RUNS
+from mechanics.arrays import Floats, Integers
 from tuning.runs.provenance import run_folder
 from tuning.snapshot import Snapshot, check_place, load_snapshot, take_of
 from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machines
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import MeasuredLoop
 
-Floats = NDArray[np.float64]
 
 LAST = 5  # step responses under the present one
 MOST_STEPS = 1000  # changes of gains that can be taken back one by one
@@ -145,7 +142,7 @@ class TuneDesk:
     def __init__(self, session: Session) -> None:
         self.session = session
         self.entries = MachineEntries()
-        self.gains: NDArray[np.int64] | None = None
+        self.gains: Integers | None = None
         self.changes: list[GainChange] = []
         self.before: Snapshot | None = None
         self.before_file: Path | None = None

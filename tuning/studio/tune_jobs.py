@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.drives import motion
@@ -18,6 +17,7 @@ from drive_env.studio.motion_jobs import disable, only, select_mode
 from drive_env.studio.scope_view import channel_of
 from drive_env.studio.sentences import sentence
 from drive_env.trials.response import step_metrics
+from mechanics.arrays import Floats, Mask
 from tuning.snapshot import restore
 from tuning.studio.tune_desk import AxisVerdict, StepRecording, TuneDesk, TunerSession
 
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
     from tuning.target import Target
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 CYCLE = 0.001  # s
 QUIET, LONGEST = 0.02, 10.0  # s before a step; of a move

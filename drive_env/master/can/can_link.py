@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 
 from drive_env.canopen.frames import SYNC
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.link import ObjectClient, ReceivedEmergency, Wording
 from drive_env.held_signals import held_signals
 from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drive_env.dictionary.aborts import PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.fieldbus.description import Description
@@ -24,8 +21,8 @@ from drive_env.master.can.pdo import (
 from drive_env.master.can.port import Port
 from drive_env.master.can.samples import PdoSamples
 from drive_env.master.packing import Bytes, pack_rows
+from mechanics.arrays import Integers
 
-Integers = NDArray[np.int64]
 Groups = list[list[Entry]]
 
 

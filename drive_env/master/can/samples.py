@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drive_env.canopen.frames import SYNC
-from drive_env.fieldbus.description import Key
+from drive_env.cia402 import Key
 from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can.pdo import RemotePdo
 from drive_env.master.can.port import Port
 from drive_env.master.packing import Bytes, unpack_rows
-
-Integers = NDArray[np.int64]
+from mechanics.arrays import Integers
 
 
 class PdoSamples:

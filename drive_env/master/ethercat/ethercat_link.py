@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.fieldbus.link import ObjectClient, ReceivedEmergency, Wording
 from drive_env.master.ethercat.clocks import FramePhase, check_clocks

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.errors import NoAnswerError
 from drive_env.fieldbus.link import ObjectClient
 from drive_env.master.ethercat.clocks import FramePhase
@@ -30,8 +31,8 @@ from drive_env.master.ethercat.ethercat_master import EtherCatMaster, ImageSizes
 from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS, ImageLayout, ImagePlanner
 from drive_env.master.ethercat.slave_images import SlaveImages
 from drive_env.master.packing import Member, unpack_rows
+from mechanics.arrays import Integers
 
-Integers = NDArray[np.int64]
 FRAME = 0.02  # s for a frame to come back in real time
 LONGEST_STATE = 5.0  # s
 

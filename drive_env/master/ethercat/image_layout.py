@@ -6,10 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices.image_rows import TYPES, fixed_images
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.master.packing import Member
 
 OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry

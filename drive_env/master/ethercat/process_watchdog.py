@@ -7,8 +7,9 @@ import struct
 import time
 from collections.abc import Sequence
 
+from drive_env.cia402 import Key
 from drive_env.ethercat import registers
-from drive_env.fieldbus.description import Description, Key
+from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.link import NoWatchdogError, ObjectClient
 from drive_env.master.changed_objects import REMEDY, ChangedObjects
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster

@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection
 from typing import TypeVar
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.fieldbus.description import Key
 from drive_env.fieldbus.errors import BusError, NoAnswerError, refused
 from drive_env.master.ethercat.ethercat_master import EtherCatMaster
 from drive_env.master.ethercat.image_data import EtherCatProcessData

@@ -1,1 +1,0 @@
-"""The TGZ-S: a TGZ-D whose second axis is not there."""
