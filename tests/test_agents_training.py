@@ -13,6 +13,8 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
+from rigs.trainings import TINY, tiny
+
 from agents.evaluation.evaluation import evaluate
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
@@ -29,24 +31,6 @@ from agents.training.train import DivergedError, train
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, TrainingRun
 from tuning.runs import provenance
 from tuning.runs.pools import PoolError
-
-TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
-        "ServoDrive/GainTuning-v0": {"trials": 1}}  # fmt: skip
-
-
-def tiny(environment="tracking", algorithm="ppo", timesteps=192, **changes):
-    """A run of the shipped hyper-parameters, shrunk."""
-    name = environment_name(environment)
-    given = hyperparameters.load(name, algorithm, "quick")
-    hyperparameters.merge(
-        given, {"n_envs": 4, "n_timesteps": timesteps, "env_kwargs": {**TINY[name], "num_threads": 1}}
-    )
-    given["imitate"] = None  # takes longer than all the rest
-    small = {"learning_starts": 8, "buffer_size": 500, "batch_size": 16, "gradient_steps": 1}
-    if "ppo" in algorithm:
-        small = {"n_steps": 8, "batch_size": 16, "n_epochs": 2}
-    hyperparameters.merge(given, small | changes)
-    return TrainingRun(name, algorithm, given, seed=3, segments=4)
 
 
 def weights(bundle):

@@ -5,18 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
-from typer.testing import CliRunner
+from rigs.commands import drive_tune
 
 from drive_env.gains import RAW_MAX
 from tuning.auto import settings as auto_settings
 from tuning.auto.one_button import BUDGET
 from tuning.certificate.certificate_files import is_unchanged
-from tuning.commands.cli import app
 from tuning.snapshot import load_snapshot
-
-
-def drive_tune(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_rules_show_gains_margins_and_what_a_relay_measured():

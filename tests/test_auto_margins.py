@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from auto_stages import basis, recorded
+from rigs.auto_stages import basis, recorded
 
 from drive_env import cia402, motion
 from drive_env.gains import write_gains

@@ -6,7 +6,7 @@ resonance of 150 Hz and 0.3 % up to 450 Hz.
 
 import numpy as np
 import pytest
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle

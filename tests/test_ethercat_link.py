@@ -7,7 +7,7 @@ import threading
 from types import SimpleNamespace
 
 import pytest
-from small_eds import I16, I32, U16, described, small_eds
+from rigs.small_eds import I16, I32, U16, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.ethercat import datagrams

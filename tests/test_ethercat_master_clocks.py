@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from ethercat_segment import EmulatedSegment
+from rigs.ethercat_segment import EmulatedSegment
 
 from drive_env import EmulatedDrives, Limits, motion
 from drive_env.ethercat.application import AlState

@@ -1,7 +1,7 @@
 """A fault at frame k of a session: the rotor ends at rest, disabled, inside its travel plus the stopping distance.
 
 Every k in the slow run (with FAULT_STRIDE=40 every fortieth), a sample in every run.
-The verdict is the emulator's inside alone (tests/fault_injection.py).
+The verdict is the emulator's inside alone (tests/rigs/fault_injection.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     KINDS,
     SESSIONS,
     WORLD_PATIENCE,

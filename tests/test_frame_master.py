@@ -9,7 +9,7 @@ import struct
 from types import SimpleNamespace
 
 import pytest
-from ethercat_rig import Rig, category
+from rigs.ethercat_rig import Rig, category
 
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode

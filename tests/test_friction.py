@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from mechanics import friction
 from mechanics.loads import LOADS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -218,3 +219,12 @@ def test_nobody_outside_looks_at_the_emulators_privates():
             if isinstance(node, ast.Attribute) and node.attr in private and "drives" in ast.unparse(node.value):
                 found.append(f"{path.relative_to(ROOT)}:{node.lineno} {ast.unparse(node)}")
     assert not found
+
+
+def test_no_test_imports_a_test():
+    """What tests share is in `tests/rigs/`; programs as text count, too."""
+    found = {}
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        names = re.findall(r"^\s*(?:from|import) (test_\w+|conftest)\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+        found |= {path.name: names} if names else {}
+    assert found == {}

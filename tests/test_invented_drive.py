@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_contract import Life
-from test_parity import WorldBus
+from rigs.life import Life
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as agent_app

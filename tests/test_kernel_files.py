@@ -14,7 +14,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 from numba.extending import overload
-from thinning import STRIDE
+from rigs.thinning import STRIDE
 
 from drive_env import EmulatedDrives
 from drive_env.emulator import cyclic_control, prepared_record

@@ -1,7 +1,7 @@
 """No path on which a motor runs on: each one that was found, with the truth from inside the emulator.
 
 Where a master may refuse or stop in time, both will do; what counts is where the rotor was and how it ended. Numbers of
-the verdict are those of tests/fault_injection.py: travel of 3 turns either way, a drive that notices its master's death
+the verdict are those of rigs/fault_injection.py: travel of 3 turns either way, a drive that notices its master's death
 after 0.1 s, half of the commissioned deceleration.
 """
 
@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     DEAD_MASTER,
     EXPECTED,
     LIMITS,

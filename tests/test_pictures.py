@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from test_render import needs_gl
+from rigs.drawing import needs_gl
 
 from drive_env import EmulatedDrives
 from drive_env.devices import device_names

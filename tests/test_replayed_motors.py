@@ -12,9 +12,8 @@ import time
 
 import can
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
-from test_every_change_leaves_a_file import node, wait_until
-from test_serve import environment
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.served_drives import environment, node, wait_until
 from typer.testing import CliRunner
 
 from drive_env.commands import replayed_motors

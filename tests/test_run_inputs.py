@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_agents_training import tiny
-from test_scale import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
+from rigs.shards import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
+from rigs.trainings import tiny
 from typer.testing import CliRunner
 
 from agents.evaluation.evaluation import evaluate

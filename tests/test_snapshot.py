@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import can
 import numpy as np
 import pytest
-from fault_injection import ON, ObservedWorld, WorldBus
+from rigs.fault_injection import ON, ObservedWorld, WorldBus
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, cia402, motion

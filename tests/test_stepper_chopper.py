@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 from numba import njit
+from rigs.stepper_rig import MICROSTEPS, SMOOTH, build, hold, lane
 from scipy.integrate import solve_ivp
-from stepper_rig import MICROSTEPS, SMOOTH, build, hold, lane
 
 from drive_env import motion
 from drive_env.firmware.common.dc_link import derive_link

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from numba import njit
-from stepper_rig import FREE, MICROSTEPS, build, lane
+from rigs.stepper_rig import FREE, MICROSTEPS, build, lane
 
 from drive_env import motion
 from drive_env.emulator.group import rates_of

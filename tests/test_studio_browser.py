@@ -6,8 +6,8 @@ import json
 import time
 
 import pytest
+from rigs.studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
 from selenium.webdriver.common.keys import Keys
-from studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
 
 pytestmark = needs_chromium
 PAGES = ("/axes", "/scope", "/dictionary")

@@ -14,8 +14,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from fault_injection import served
-from studio_rig import Tab, chromium, needs_chromium, studio, until
+from rigs.fault_injection import served
+from rigs.studio_rig import Tab, chromium, needs_chromium, studio, until
 
 from drive_env import EmulatedDrives
 from drive_env.devices import device_names

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_injection import served
-from studio_rig import StudioProcess, Tab, chromium, needs_chromium, until
+from rigs.fault_injection import served
+from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, until
 
 from drive_env import EmulatedDrives
 

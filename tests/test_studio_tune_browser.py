@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_injection import served as on_a_bus
+from rigs.fault_injection import served as on_a_bus
+from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, studio, until
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, studio, until
 
 from drive_env import EmulatedDrives
 from drive_env.gains import read_gains
@@ -325,7 +325,7 @@ def test_a_report_runs_no_script_and_two_runs_are_compared(tab, folder):
 
 
 def test_learning_curves_of_a_training(tab, folder):
-    from test_studio_runs import write_events
+    from rigs.trainings import write_events
 
     run = folder / "runs" / "training"
     run.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device

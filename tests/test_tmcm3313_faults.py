@@ -10,7 +10,7 @@ import random
 
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     KINDS,
     RADIANS,
     eds_read_once,

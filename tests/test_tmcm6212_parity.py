@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_parity import WorldBus, assert_equal
+from rigs.world_bus import WorldBus, assert_equal
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
