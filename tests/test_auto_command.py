@@ -100,7 +100,7 @@ def test_auto_does_not_write_into_a_folder_with_something_in_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypatch):
+def test_auto_leaves_the_way_back_a_certificate_and_a_report(quick_designs, tmp_path):
     out = tmp_path / "run"
     done = drive_tune("auto", "--load", "inertia", "--out", out, "--json")
     assert done.exit_code == 0, done.output

@@ -129,6 +129,7 @@ supply = [24, 26]
 """
 
 
+@pytest.mark.slow
 def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
     suite, out = tmp_path / "suite.toml", tmp_path / "out"
     suite.write_text(SUITE.format(device=json.dumps(INVENTED)), encoding="utf-8")

@@ -80,12 +80,14 @@ def digest(name):
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("name", QUICK)
 def test_what_has_learnt_nothing_scores_less_than_0_6(name):
     scores = unlearnt_scores(name, MACHINES[TASKS[name].environment])
     assert max(scores.values()) < UNLEARNT, scores
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("name", QUICK)
 def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
     scores = {}
@@ -125,7 +127,7 @@ def test_a_policy_acts_on_the_drives_of_a_bus_as_in_process():
     assert found.bus.values == found.inside.values and found.bus.violations == {} and found.missing == {}
 
 
-@pytest.mark.parametrize("name", ["GantryBeam", "ArmPath"])
+@pytest.mark.parametrize("name", ["GantryBeam", pytest.param("ArmPath", marks=pytest.mark.slow)])
 def test_an_expert_in_the_loops_keeps_stiff_margins(name):
     lanes = make_environments(name, 1)
     expert = baseline("expert", name, lanes.config, lanes.single_action_space.shape[0])

@@ -347,6 +347,7 @@ def test_a_search_is_not_resumed_with_a_file_that_was_changed(own, monkeypatch):
     assert "parts/body.xml of arm/arm.xml (load) was changed since the run in out.unfinished" in result.output
 
 
+@pytest.mark.slow
 def test_settings_of_a_search_repeat_it_from_its_folder_alone(own, decoys, monkeypatch):
     assert drive_tune(*OPTIMISE, "--sampler", "grid").exit_code == 0
     found = (own / "out" / "trials.csv").read_bytes()
@@ -383,6 +384,7 @@ def test_a_journal_is_not_gone_on_with_for_something_else(own, other):
     assert added.count(b"\n") == 1 and b"study_name" in added  # no trial
 
 
+@pytest.mark.slow
 def test_a_comparison_is_not_resumed_with_a_file_that_was_changed(own, monkeypatch):
     def stop(*_, log, **__):
         log.append(0, {"rows": np.array("[]")})
@@ -458,6 +460,7 @@ def test_a_search_elsewhere_has_the_files_of_here(own, decoys, tmp_path):
     assert here.cost == there.cost and np.array_equal(here.rule, there.rule)
 
 
+@pytest.mark.slow
 def test_a_comparison_elsewhere_has_the_files_of_here(own, decoys):
     from tuning.compare.tuners import find_tuner
 

@@ -411,6 +411,7 @@ def test_heartbeats_that_stay_away_stop_an_axis_that_takes_no_commands(inside, g
         assert (inside.read(0x6041) & 0x4F == 0x08).all()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("gate", ["stops", "ignores"])
 def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
     """The master may stop before, if the computer is too busy for it to see the drives."""
