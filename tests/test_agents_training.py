@@ -261,7 +261,7 @@ def test_there_are_hyperparameters_for_every_environment_and_algorithm(environme
     env.close()
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
 def test_every_environment_trains(environment, algorithm, tmp_path):

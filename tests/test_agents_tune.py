@@ -29,6 +29,8 @@ from tuning.drive_audit import KINDS, DriveAudit
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
+pytestmark = pytest.mark.usefixtures("quick_designs")  # a run corrects what it tried as auto does
+
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 

@@ -107,6 +107,7 @@ def largest_error(values, oracle):
 EXCITATIONS = ("steps at window starts", "steps within windows", "chirp")
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("kind", EXCITATIONS)
 @pytest.mark.parametrize(("resonance", "gate"), [(130, 0.1), (150, 0.1), (368, 0.3), (450, 0.3)])
 def test_two_mass_follows_rk4(kind, resonance, gate):

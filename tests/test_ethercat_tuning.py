@@ -21,6 +21,8 @@ from drive_env.master.ethercat_drives import EtherCatDrives
 from tuning.search.trial_bench import leave_oscillations_to_trials
 from tuning.stepper.commissioning import commission
 
+pytestmark = pytest.mark.usefixtures("quick_designs")
+
 
 def run(app, command, device, port, out):
     """Return what a command printed as JSON, with its exit code."""

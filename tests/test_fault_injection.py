@@ -73,7 +73,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert np.ptp(truth.theta()) > 0.02 * 2 * np.pi
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind):

@@ -86,6 +86,7 @@ def test_a_free_axis_is_still_free():
         assert target.num_axes == 1
 
 
+@pytest.mark.every(3)
 # --- stamps -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("stamp", ["1e300", "-1e300", "99999999999.0", "nan", "inf"])
 @pytest.mark.parametrize("ending", [".log", ".csv"])

@@ -144,6 +144,7 @@ def framing(inside):
         server.shutdown()
 
 
+@pytest.mark.every(3)
 @needs_chromium
 @pytest.mark.parametrize("path", ["/axes", "/nothing", "/studio/assets/studio.js"])
 def test_a_page_of_another_port_shows_nothing_of_the_studio_in_a_frame(made, path):

@@ -210,6 +210,7 @@ def test_a_move_ends_with_its_page_though_another_one_is_there(driver, bench):
         assert abs(turns) < 5.0 * STOPS
 
 
+@pytest.mark.slow
 def test_a_step_that_is_played_ends_with_its_page_though_another_one_is_there(driver, bench):
     """Its set-points go out in one call, which takes ten seconds."""
     world, made = bench
@@ -268,6 +269,7 @@ def test_the_browser_sleeps(driver, bench):
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_the_studio_is_killed(driver, bench):
     """Nobody is left to command anything: the drive's own watchdog stops it."""
     world, made = bench

@@ -104,7 +104,7 @@ def test_a_page_opens_without_an_error_and_from_this_computer_alone(tab, path):
     assert foreign == []
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):
@@ -190,6 +190,7 @@ def test_a_step_is_recorded_on_the_bus_within_its_travel(driver, bench, emulated
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_quick_stop_in_the_middle_of_auto_on_the_bus(driver, bench, emulated):
     world, made = bench
     before = parameters(emulated)
