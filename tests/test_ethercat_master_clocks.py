@@ -44,8 +44,8 @@ def shown(segment, sub, position=0):
     return segment.slaves[position].application.dictionary.port(SYNC, sub).read()
 
 
-@pytest.mark.every(3)
 # --- virtual time -----------------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("rate", [4000, 1000, 250])
 def test_in_lockstep_outputs_take_effect_at_the_next_pulse(tmp_path, rate):
     """Integers are those without clocks, of which each row acts a cycle later, from 250 us to 4 ms."""

@@ -8,12 +8,11 @@ import shutil
 import socket
 import struct
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from rigs.ethercat_rig import EchoDevice, Rig
-from rigs.namespaces import needs_namespaces
+from rigs.namespaces import inside, needs_namespaces
 from typer.testing import CliRunner
 
 from drive_env.commands.cli import app
@@ -146,10 +145,6 @@ def spaces():
     spaces.make()
     yield spaces
     spaces.remove()
-
-
-def inside(space, *arguments):
-    return ["ip", "netns", "exec", space, sys.executable, *map(str, arguments)]
 
 
 @pytest.mark.slow

@@ -419,8 +419,8 @@ def test_a_silence_that_rounds_to_none(emulated):
         ended_well(world)
 
 
-@pytest.mark.every(3)
 # --- signals of a script that has no handlers -----------------------------------------------------------------------
+@pytest.mark.every(3)
 @linux_only
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_a_signal_stops_a_script_at_once(emulated, programs, number):
@@ -582,8 +582,8 @@ def test_the_current_keeps_its_limit(emulated):
         assert above <= 30, f"above the limit for {above} ms, up to {world.truth.current().max():.2f} A"
 
 
-@pytest.mark.every(4)
 # --- stops ---------------------------------------------------------------------------------------------------------
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     "settings",
     [{0x6085: 1}, {0x6085: 1, 0x605A: 6}],

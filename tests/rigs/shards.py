@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
 
-from rigs import ROOT
+from rigs.served_drives import environment
 from tuning.runs.unfinished import SHARDS, unfinished_folder
 
 PATIENCE = 300.0  # s, for a computer that stands still for minutes
@@ -67,10 +66,6 @@ def arguments(config, out, *more):
         str(out),
         *map(str, more),
     ]
-
-
-def environment():
-    return os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"}
 
 
 def run_command(config, out, *more):
