@@ -134,8 +134,6 @@ def close_loop(drives, mode=1, *, operation="pp"):
 
 
 NAME = "qsh4218_51"
-
-
 MOTOR = MOTORS[NAME]
 
 

@@ -15,6 +15,4 @@ def why_nothing_can_be_drawn():
 
 
 NO_GL = why_nothing_can_be_drawn()
-
-
 needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL or "there is OpenGL")

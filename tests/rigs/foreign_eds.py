@@ -25,8 +25,6 @@ AccessType=rw
 DefaultValue=1
 PDOMapping=0
 """
-
-
 ENCODER_RESOLUTION = """
 [608F]
 ParameterName=Position encoder resolution
@@ -54,8 +52,6 @@ AccessType=rw
 DefaultValue=1
 PDOMapping=0
 """
-
-
 MAX_PROFILE_VELOCITY = """
 [607F]
 ParameterName=Max profile velocity

@@ -25,11 +25,7 @@ from mechanics.packed import PackedLoad
 from mechanics.shaft import shaft_load
 
 SPEED = 4  # rev/s: slow for all of these motors, short ways for a load with end stops
-
-
 ENABLED, FAULT, DISABLED = (0x6F, 0x27), (0x4F, 0x08), (0x4F, 0x40)
-
-
 BEFORE_SWITCH = 0.1  # where a life begins before the left switch of an axis, if there is one [m]
 
 

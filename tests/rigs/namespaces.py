@@ -31,11 +31,7 @@ def why_no_namespace():
 
 
 NO_NAMESPACE = why_no_namespace()
-
-
 needs_namespaces = pytest.mark.skipif(NO_NAMESPACE is not None, reason=str(NO_NAMESPACE))
-
-
 PATIENCE = 240.0  # s; kernels may have to be compiled
 
 

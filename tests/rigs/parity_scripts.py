@@ -7,8 +7,6 @@ import numpy as np
 from drive_env import EmulatedDrives, motion
 
 WATCHED = [0x6041, 0x6061, 0x6062, 0x6064, 0x606C, 0x6077]
-
-
 TURN = 65536  # increments
 
 
@@ -100,8 +98,6 @@ def run(script, drives):
 
 
 SCRIPTS = {script.__name__: script for script in (pp, pv, csp, csv, cst, handshake_in_pdos, homing)}
-
-
 _emulated = {}
 
 

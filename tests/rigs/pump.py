@@ -11,8 +11,6 @@ from drive_env.canopen.frames import Frame
 from drive_env.canopen.node import Node
 
 NODE = 5
-
-
 PATIENCE = 30.0  # s; what comes, comes in milliseconds, but a busy computer may stand still for seconds
 
 

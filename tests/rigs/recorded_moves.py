@@ -8,14 +8,8 @@ from drive_env.dictionary.entries import Entry
 from drive_env.trials.replay import Log
 
 TURN = 65536  # increments
-
-
 TRUTH = {"load.inertia": 2.4e-5, "load.coulomb": 4e-3}
-
-
 DEMAND, POSITION, VELOCITY, CURRENT = (0x6062, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0)
-
-
 TARGET, SPEED, TORQUE = (0x607A, 0), (0x60FF, 0), (0x6071, 0)
 
 

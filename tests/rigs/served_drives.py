@@ -50,8 +50,6 @@ def served(*arguments, cwd):
 
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
-
-
 PATIENCE = 120.0  # s until a run has come so far; it is never this long
 
 

@@ -45,8 +45,6 @@ sampling_period = 0.001
 [metric]
 name = "iae"
 """
-
-
 FILES = ("results.csv", "settings.toml", "heatmap.png", "best_response.png")
 
 

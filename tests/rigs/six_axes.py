@@ -10,12 +10,6 @@ from rigs.fault_injection import (
 )
 
 AXES = 6
-
-
 TURN = 200 * 256  # microsteps
-
-
 LIMITS = Limits(position=(-3 * TURN, 3 * TURN), velocity=6 * TURN)
-
-
 TRAVEL = tuple(3 * sign * 2.0 * np.pi / RADIANS for sign in (-1, 1))  # as `problems` counts

@@ -23,8 +23,6 @@ STRUCTURES = """
 1B21 int64 33C0 int64 34C0 uint32 333E uint32 3325 uint32 3425 uint16 4002:1 uint16 4002:2
 1B21 int16 6077 int16 6877 uint32 @ uint32 @
 """
-
-
 SIZES = {0x1701: 40, 0x1702: 40, 0x1703: 40, 0x1B01: 40, 0x1721: 44, 0x1B21: 44}
 
 
