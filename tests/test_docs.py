@@ -69,10 +69,8 @@ def recipes() -> dict[str, str]:
     return {section.partition("\n")[0]: f"# {section}" for section in sections}
 
 
-# Of Stable-Baselines3 much is on the README, too.
-@pytest.mark.parametrize(
-    "recipe", [pytest.param(one, marks=[pytest.mark.slow] * (one == "Stable-Baselines3")) for one in recipes()]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", recipes())
 def test_a_recipe_can_be_followed(recipe, tmp_path):
     text = recipes()[recipe]
     pytest.importorskip("stable_baselines3")
