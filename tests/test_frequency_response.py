@@ -331,7 +331,6 @@ def test_a_resonance_that_a_weaker_shaking_confirms_is_told(looked_at):
     assert found.low < plant.resonance < found.high
 
 
-@pytest.mark.every(3)
 @pytest.mark.parametrize("factor", [0.85, 0.95, 1.1])
 def test_a_resonance_that_moves_with_the_strength_of_the_shaking_is_refused(looked_at, factor):
     """As with backlash: neither of the two is the axis's."""
