@@ -33,7 +33,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from fault_injection import (
+from rigs.fault_injection import (
     ANSWER,
     EXPECTED,
     ON,

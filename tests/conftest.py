@@ -5,13 +5,14 @@ from collections import Counter
 import numpy as np
 import pytest
 import typer.testing
-from thinning import STRIDE
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.fieldbus.description import Description
 
 ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
+
+pytest.register_assert_rewrite("rigs")  # what they judge fails as a test's own assertion does
 
 # Typer makes a program's commands anew for each call, which takes longer than most commands.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
@@ -26,8 +27,10 @@ if hasattr(signal, "SIGHUP"):
 def pytest_collection_modifyitems(config, items):
     """Of the rows of a test that is marked `every(n)` and are not slow each n-th is in each run; the others are slow.
 
-    SLOW_STRIDE=n takes of each test's slow rows the first of n alone (and see thinning.py).
+    SLOW_STRIDE=n takes of each test's slow rows the first of n alone (and see rigs/thinning.py).
     """
+    from rigs.thinning import STRIDE
+
     rows, slow, left_out = Counter(), Counter(), []
     for item in items:
         test = item.nodeid.partition("[")[0]
@@ -76,6 +79,14 @@ def running(axis):
     axis.advance(0.3)
     assert abs(int(axis.read(0x606C)[0]) - 1_092_267) < 60_000
     return axis
+
+
+@pytest.fixture
+def quick_designs(monkeypatch):
+    """Have auto look at few sets of gains on its twins."""
+    from rigs.auto_stages import short_designs
+
+    short_designs(monkeypatch.setattr)
 
 
 @pytest.fixture(autouse=True)

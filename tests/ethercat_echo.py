@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ethercat_rig import EchoDevice
+from rigs.ethercat_rig import EchoDevice
 
 from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.pcap_log import PcapLog

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from test_envs_on_a_bus import on_a_bus
+from rigs.world_bus import on_a_bus
 
 from drive_env import EmulatedDrives, ObjectAccessError
 from drive_env.envs.gain_scheduling import GainScheduling

@@ -32,8 +32,8 @@ from adversary import (
     run_episode,
     runs,
 )
-from fault_injection import eds_read_once
-from thinning import part
+from rigs.fault_injection import eds_read_once
+from rigs.thinning import part
 
 from drive_env import Limits
 from drive_env.cia402 import State

@@ -7,7 +7,7 @@ import re
 
 import pytest
 import yaml
-from test_agents_training import TINY
+from rigs.trainings import TINY
 from typer.testing import CliRunner
 
 pytest.importorskip("stable_baselines3")

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_agents_bundle import ENTRIES, bundle, observations
-from test_parity import WorldBus
+from rigs.agent_files import ENTRIES, bundle, observations
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from agents.commands.cli import app

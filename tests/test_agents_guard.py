@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_parity import WorldBus
+from rigs.world_bus import WorldBus
 
 from agents.evaluation.evaluation import GivenDrives, as_on_a_bus, evaluate
 from agents.policies.deadline import Deadline, DeadlineError

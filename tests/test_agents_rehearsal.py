@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from ethercat_segment import EmulatedSegment
+from rigs.ethercat_segment import EmulatedSegment
 from typer.testing import CliRunner
 
 from agents.commands.cli import app

@@ -307,6 +307,7 @@ def test_training_from_nothing_makes_a_tuner_repeats_and_goes_on_from_kept_trial
     assert training.judge(one, policy_of(first), 2, 5).ratio.shape == (1, 2)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("device", sorted(RECIPES))
 def test_a_recipe_makes_a_tuner_of_its_device_with_figures(device, tmp_path, monkeypatch):
     """From the command line, of its first row's machines."""

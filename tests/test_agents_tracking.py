@@ -46,7 +46,9 @@ def test_the_shipped_controllers_perform_as_their_cards_say(name):
     assert not found.violations
 
 
-@pytest.mark.parametrize("name", OF_TASKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=[pytest.mark.slow] * (one == "arm_path")) for one in OF_TASKS]
+)
 def test_an_agent_of_a_task_keeps_margins_on_other_machines_than_its_card_tells_of(name):
     made = AgentFile.load(shipped(name))
     assert made.card["margins"]["Ms greatest"] <= find_dynamics(made.card["margins"]["dynamics"]).ms

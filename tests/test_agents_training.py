@@ -14,6 +14,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 from agents import hyperparameter_search as search
+from rigs.trainings import TINY, tiny
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.open_policy import open_policy
 from agents.policies.agent_file import AgentFile
@@ -30,24 +31,6 @@ from agents.training.train import DivergedError, train
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, TrainingRun
 from tuning.runs import provenance
 from tuning.runs.pools import PoolError
-
-TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
-        "ServoDrive/GainTuning-v0": {"trials": 1}}  # fmt: skip
-
-
-def tiny(environment="tracking", algorithm="ppo", timesteps=192, **changes):
-    """A run of the shipped hyper-parameters, shrunk."""
-    name = environment_name(environment)
-    given = hyperparameters.load(name, algorithm, "quick")
-    hyperparameters.merge(
-        given, {"n_envs": 4, "n_timesteps": timesteps, "env_kwargs": {**TINY[name], "num_threads": 1}}
-    )
-    given["imitate"] = None  # takes longer than all the rest
-    small = {"learning_starts": 8, "buffer_size": 500, "batch_size": 16, "gradient_steps": 1}
-    if "ppo" in algorithm:
-        small = {"n_steps": 8, "batch_size": 16, "n_epochs": 2}
-    hyperparameters.merge(given, small | changes)
-    return TrainingRun(name, algorithm, given, seed=3, segments=4)
 
 
 def weights(bundle):
@@ -278,7 +261,7 @@ def test_there_are_hyperparameters_for_every_environment_and_algorithm(environme
     env.close()
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
 def test_every_environment_trains(environment, algorithm, tmp_path):

@@ -29,6 +29,8 @@ from tuning.drive_audit import KINDS, DriveAudit
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
+pytestmark = pytest.mark.usefixtures("quick_designs")  # a run corrects what it tried as auto does
+
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 
@@ -316,6 +318,7 @@ def test_what_shakes_on_with_the_incumbent_is_calmed(monkeypatch):
     assert audit.violations[KINDS.index("oscillated")].tolist() == [0]  # never for 100 ms
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_trial_that_a_fault_ends_names_the_emergency(tmp_path, monkeypatch, number):
     """The rule's trial as well as one of the agent's."""

@@ -11,39 +11,38 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from numba import njit
 
 from drive_env.firmware.common import arithmetic
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 ROUNDING = 1.2e-16  # of the reference, relative to a value of 1
 
 
-@njit(**OPTIONS)
+@cached()
 def sine_cosine(x, sine, cosine):
     for k in range(x.shape[0]):
         sine[k], cosine[k] = arithmetic.sine_cosine(x[k])
 
 
-@njit(**OPTIONS)
+@cached()
 def exponential(x, y):
     for k in range(x.shape[0]):
         y[k] = arithmetic.exponential(x[k])
 
 
-@njit(**OPTIONS)
+@cached()
 def cosine_series(x, y):
     for k in range(x.shape[0]):
         y[k] = arithmetic.cosine_series(x[k])
 
 
-@njit(**OPTIONS)
+@cached()
 def sine_series(x, y):
     for k in range(x.shape[0]):
         y[k] = arithmetic.sine_series(x[k])
 
 
-@njit(**OPTIONS)
+@cached()
 def clip(x, limit, y):
     for k in range(x.shape[0]):
         y[k] = arithmetic.clip(x[k], limit)

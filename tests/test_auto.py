@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from auto_stages import designs, short_designs
-from test_parity import served
-from test_suite import open_machines
-from thinning import part
+from rigs.auto_stages import designs
+from rigs.known_machines import gains, open_machines, standing_in
+from rigs.thinning import part
+from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
@@ -47,15 +47,10 @@ from tuning.snapshot import load_snapshot, restore
 from tuning.target import Target, emulated
 
 POSITION_P = Gains._fields.index("position_p")
-GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 NORMAL, EMPTY, WILD, REVERSED, SHORT = range(5)  # axes of `five`
 ENCODER_DIRECTION = (0x2080, 1)
 RPM = 2.0 * math.pi / 60.0
-
-
-def gains(drives):
-    return np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=1)
 
 
 def settings(drives):
@@ -128,7 +123,7 @@ def test_what_it_ends_with_keeps_the_dynamics_of_the_true_machine(load, tmp_path
 
 
 @pytest.mark.slow
-def test_softer_dynamics_are_slower_and_farther_from_instability(quick, tmp_path):
+def test_softer_dynamics_are_slower_and_farther_from_instability(quick_designs, tmp_path):
     found = []
     for dynamics in ("soft", "stiff"):
         with emulated(load="inertia", num_threads=1) as target:
@@ -242,40 +237,17 @@ def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before,
 
 
 # --- rolling back -----------------------------------------------------------------------------------------------------
-def standing_in(target, where=None):
-    """Return the identification of drives whose truth is known: what the search needs, at no cost."""
-    from tuning.estimate import Estimate, refused
-    from tuning.identify.identified_axis import Identification
-
-    found = []
-    for axis in range(target.num_axes):
-        plant = true_plant(target.drives, axis)
-        values = {
-            "resistance": plant.R, "inductance": plant.L, "inertia": plant.inertia, "coulomb": 0.1, "viscous": 1e-4,
-            "offset": 0.0, "velocity_filter": plant.velocity_filter, "pole_pairs": 4.0, "encoder_direction": 1.0,
-            "loop_delay": plant.delay,
-        }  # fmt: skip
-        estimates = {name: Estimate(value, 0.97 * value, 1.03 * value, "") for name, value in values.items()}
-        blank = {name: refused("Hz", "rigid") for name in ("anti_resonance", "resonance")}
-        found.append(Identification(estimates | blank, 0.0))
-    return found
 
 
 # Of `inertia`: a step in csp overshoots by a third with the first ones.
 LIVELY, SLOWER = [8009, 9699, 1000, 1600, 1700], [8009, 9699, 900, 900, 700]
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Make the designs on twins short ones."""
-    short_designs(monkeypatch.setattr)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "stage", ["on_twins", "try_gains", "show", "step", "measure", "load", "_corrected", "_try", "look_back"]
 )
-def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path, stage):
+def test_whatever_ends_it_the_gains_before_are_back(quick_designs, monkeypatch, tmp_path, stage):
     def interrupted(bench, *handed):
         write_gains(bench.target.drives, np.full((1, 5), 77))
         raise KeyboardInterrupt
@@ -292,7 +264,7 @@ def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path
 
 
 @pytest.mark.slow
-def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick, monkeypatch, tmp_path):
+def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick_designs, monkeypatch, tmp_path):
     designs(monkeypatch.setattr, [4021, 1573, 32767, 32767, 32767])
     monkeypatch.setattr(auto_identified, "calm_gains", lambda target, plant: np.full(5, 32767))
     monkeypatch.setattr(auto_trying, "faster", lambda known, gains, factor: np.full_like(gains, 32767))
@@ -344,7 +316,7 @@ def answers(monkeypatch, change):
 
 
 @pytest.mark.slow
-def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, monkeypatch, tmp_path):
+def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick_designs, monkeypatch, tmp_path):
     answers(monkeypatch, lambda response: replace(response, coherence=0.1 * response.coherence))
     with emulated(load="inertia", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
@@ -363,7 +335,7 @@ def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, mo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stays", [False, True])
-def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick, monkeypatch, tmp_path, stays):
+def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick_designs, monkeypatch, tmp_path, stays):
     """Shaking brakes, and a supply may not take that back."""
     with emulated(load="inertia", num_threads=1) as target:
         machine = target.drives.machine

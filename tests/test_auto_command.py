@@ -5,18 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
-from typer.testing import CliRunner
+from rigs.commands import drive_tune
 
 from drive_env.devices.gains import RAW_MAX
 from tuning.auto import settings as auto_settings
 from tuning.auto.one_button import BUDGET
 from tuning.certificate.certificate_files import is_unchanged
-from tuning.commands.cli import app
 from tuning.snapshot import load_snapshot
-
-
-def drive_tune(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_rules_show_gains_margins_and_what_a_relay_measured():
@@ -105,7 +100,7 @@ def test_auto_does_not_write_into_a_folder_with_something_in_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypatch):
+def test_auto_leaves_the_way_back_a_certificate_and_a_report(quick_designs, tmp_path):
     out = tmp_path / "run"
     done = drive_tune("auto", "--load", "inertia", "--out", out, "--json")
     assert done.exit_code == 0, done.output

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from auto_stages import basis, recorded
+from rigs.auto_stages import basis, recorded
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import cascade_columns, rule_gains

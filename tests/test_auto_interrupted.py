@@ -9,10 +9,10 @@ import time
 
 import numpy as np
 import pytest
-from test_auto import gains, quick, standing_in  # noqa: F401
-from test_parity import served
-from test_serve import environment
-from test_serve import served as served_process
+from rigs.known_machines import gains, standing_in
+from rigs.served_drives import environment
+from rigs.served_drives import served as served_process
+from rigs.world_bus import served
 
 from drive_env import CanDrives, motion
 from drive_env.devices import find_device
@@ -60,7 +60,7 @@ def known(target, where):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("quick_designs")
 @pytest.mark.parametrize("how", ["in process", "calls", "hub"])
 def test_the_gains_before_are_back_and_the_drive_is_off(monkeypatch, tmp_path, how):
     while_it_moves(monkeypatch)
@@ -80,7 +80,7 @@ def test_the_gains_before_are_back_and_the_drive_is_off(monkeypatch, tmp_path, h
         assert is_off(drives)
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("quick_designs")
 def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
     roll_back = Transaction.roll_back
 

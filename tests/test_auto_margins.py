@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from auto_stages import basis, recorded
 from tuning.identify.estimate import Identification
+from rigs.auto_stages import basis, recorded
 
 from drive_env import cia402, motion
 from drive_env.drives.raw_gains import write_gains

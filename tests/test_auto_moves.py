@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from auto_stages import basis, designs, recorded, short_designs
-from test_auto import gains, standing_in
+from rigs.auto_stages import basis, designs, recorded, short_designs
+from rigs.known_machines import gains, standing_in
 
 from drive_env import cia402, motion
 from drive_env.devices.gains import Gains, Rule, rule_gains

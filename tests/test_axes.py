@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from held_objects import HeldObjects
+from rigs.held_objects import HeldObjects
 
 from drive_env.safety.axes import BASELINE, Axes
 from drive_env.safety.rotor import RotorAngle, read_scale, scale_objects, wrapped

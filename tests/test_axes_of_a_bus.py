@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from test_auto_command import drive_tune
+from rigs.commands import drive_tune
 
 from drive_env import EmulatedDrives, SafetyError, motion
 from drive_env.bus.hub import Hub

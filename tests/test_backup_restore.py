@@ -6,7 +6,7 @@ import json
 import re
 
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
 
 from drive_env import CanDrives

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -147,24 +148,36 @@ def run(*arguments):
     return CliRunner().invoke(app, ["benchmark", *(str(one) for one in arguments)])
 
 
+def shrink(monkeypatch, folder):
+    """Set a few episodes, hyper-parameters for a training of a moment, and the present folder."""
+    (folder / "yaml").mkdir()
+    for algorithm in ("ppo", "sac"):
+        (folder / f"yaml/tracking_{algorithm}.yaml").write_text(TINY)
+    monkeypatch.setattr(hyperparameters, "FOLDER", folder / "yaml")
+    monkeypatch.setattr(runs, "EPISODES", EPISODES)
+    monkeypatch.chdir(folder)
+
+
 @pytest.fixture(autouse=True)
 def small(tmp_path, monkeypatch):
-    """A few episodes, and hyper-parameters for a training of a moment."""
-    (tmp_path / "yaml").mkdir()
-    for algorithm in ("ppo", "sac"):
-        (tmp_path / f"yaml/tracking_{algorithm}.yaml").write_text(TINY)
-    monkeypatch.setattr(hyperparameters, "FOLDER", tmp_path / "yaml")
-    monkeypatch.setattr(runs, "EPISODES", EPISODES)
-    monkeypatch.chdir(tmp_path)
+    shrink(monkeypatch, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A benchmark of two seeds, made once."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        shrink(monkeypatch, folder)
+        found = run("--task", "TorqueTracking", "--seeds", 2, "--out", folder / "bench")
+    assert found.exit_code == 0, found.output
+    return folder / "bench"
 
 
 @pytest.fixture
-def benchmark(tmp_path):
-    """A benchmark of two seeds and its folder."""
-    out = tmp_path / "bench"
-    found = run("--task", "TorqueTracking", "--seeds", 2, "--out", out)
-    assert found.exit_code == 0, found.output
-    return out
+def benchmark(made, tmp_path):
+    """A copy of the benchmark, in a folder that a test may change."""
+    return Path(shutil.copytree(made, tmp_path / "bench"))
 
 
 def rows_of(folder):

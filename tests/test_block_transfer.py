@@ -10,7 +10,7 @@ from pathlib import Path
 
 import canopen
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_description import TYPES, eds_of
+from rigs.small_eds import TYPES, eds_of
 
 from drive_env import Limits
 from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_parity import WorldBus
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError
 from drive_env.bus.bits import frame_bits

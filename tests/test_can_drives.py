@@ -13,7 +13,7 @@ import time
 import can
 import numpy as np
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, ObjectAccessError, motion
 from drive_env.devices import find_device

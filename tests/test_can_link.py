@@ -6,7 +6,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
-from small_eds import U16, U32, described, small_eds
+from rigs.small_eds import U16, U32, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.fieldbus.errors import BusError

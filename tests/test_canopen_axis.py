@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.canopen.frames import Frame

@@ -7,10 +7,10 @@ import struct
 from itertools import pairwise
 
 import pytest
-from can_devices import DEVICES
-from canopen_wire import Wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs.can_devices import DEVICES
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives, ObjectAccessError
 from drive_env.canopen.frames import Frame

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame

@@ -7,7 +7,7 @@ import sys
 import tomllib
 
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from auto_stages import recorded
+from rigs.auto_stages import recorded
 
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics

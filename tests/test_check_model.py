@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from test_replay import CURRENT, POSITION, TARGET, TORQUE, TRUTH, VELOCITY, a_move, machines, recorded, written
+from rigs.recorded_moves import CURRENT, POSITION, TARGET, TORQUE, TRUTH, VELOCITY, a_move, machines, recorded, written
 from typer.testing import CliRunner
 
 from drive_env import motion

@@ -9,10 +9,11 @@ import json
 
 import numpy as np
 import pytest
-from test_auto_command import drive_tune
-from test_parity import WorldBus
+from rigs.commands import drive_tune
+from rigs.several_axes import AXES, WIRED, partly_wired
+from rigs.world_bus import WorldBus
 
-from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
+from drive_env import CanDrives, Limits, cia402, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -20,16 +21,8 @@ from drive_env.drives.chosen_axes import ChosenAxes
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
-AXES, WIRED = 6, (1, 3)
 FULL_STEPS = np.radians(2 * 1.8)  # rad: how far a rotor goes to the field when its axis gets current
 LEFT_OUT = [axis for axis in range(AXES) if axis not in WIRED]
-
-
-def partly_wired(**options):
-    """Return the six axes of a TMCM-6212 of which two have a motor."""
-    no_motor = np.array([float(axis not in WIRED) for axis in range(AXES)])
-    parameters = {"motor.open_a": no_motor, "motor.open_b": no_motor}
-    return EmulatedDrives("tmcm6212", "inertia", num_machines=AXES, num_threads=1, parameters=parameters, **options)
 
 
 class Enabled:

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 import pytest
-from closed_loop_rig import RECIPE, build, close_loop
-from stepper_rig import MICROSTEPS, SMOOTH, holding_torque, lane
+from rigs.closed_loop_rig import RECIPE, build, close_loop
+from rigs.stepper_rig import MICROSTEPS, SMOOTH, holding_torque, lane
 
 from drive_env import motion
 from drive_env.emulator.loop_trace import trace_loops

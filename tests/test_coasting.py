@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_injection import LIMITS, ON, RADIANS, TURN, problems, run_lockstep
+from rigs.fault_injection import LIMITS, ON, RADIANS, TURN, problems, run_lockstep
 
 from drive_env import EmulatedDrives, SafetyError, motion
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from held_objects import CURRENT_LIMIT, HeldObjects
+from rigs.held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits, SafetyError
 from drive_env.safety.axes import Axes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from can_devices import (
+from rigs.can_devices import (
     DEVICES,
     LOAD,
     NO_REMOTE,

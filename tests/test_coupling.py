@@ -6,7 +6,7 @@ resonance of 150 Hz and 0.3 % up to 450 Hz.
 
 import numpy as np
 import pytest
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle
@@ -107,6 +107,7 @@ def largest_error(values, oracle):
 EXCITATIONS = ("steps at window starts", "steps within windows", "chirp")
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("kind", EXCITATIONS)
 @pytest.mark.parametrize(("resonance", "gate"), [(130, 0.1), (150, 0.1), (368, 0.3), (450, 0.3)])
 def test_two_mass_follows_rk4(kind, resonance, gate):

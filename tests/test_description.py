@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
+from rigs.small_eds import eds_of
 
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
@@ -13,41 +14,6 @@ from drive_env.fieldbus.description import CIA_402, LONGEST_TIMEOUT, NODE_CODES,
 
 SERVO = describe("tmcm1636", None)
 SERVO_EDS = find_device("tmcm1636").eds
-
-EDS = """
-[FileInfo]
-FileName=some.eds
-[DeviceInfo]
-VendorName=somebody
-[MandatoryObjects]
-SupportedObjects=1
-1=0x1000
-[OptionalObjects]
-SupportedObjects={count}
-{numbers}
-[1000]
-ParameterName=Device type
-ObjectType=0x7
-DataType=0x0007
-AccessType=ro
-{objects}
-"""
-TYPES = {"u8": "0x0005", "u16": "0x0006", "u32": "0x0007", "i8": "0x0002", "i16": "0x0003", "i32": "0x0004",
-         "f32": "0x0008", "text": "0x0009", "u24": "0x0016", "bool": "0x0001", "i64": "0x0015",
-         "octets": "0x000A"}  # fmt: skip
-
-
-def eds_of(folder, *rows):
-    """An EDS with objects: index, type, access."""
-    numbers = "\n".join(f"{k}=0x{index:04X}" for k, (index, *_) in enumerate(rows, 1))
-    objects = "\n".join(
-        f"[{index:04X}]\nParameterName=object {index:04X}\nObjectType=0x7\n"
-        f"DataType={TYPES[kind]}\nAccessType={access}\n"
-        for index, kind, access in rows
-    )
-    path = folder / "some.eds"
-    path.write_text(EDS.format(count=len(rows), numbers=numbers, objects=objects), encoding="utf-8")
-    return path
 
 
 STATUS = (0x6041, "u16", "ro")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_injection import ANSWER, LIMITS, RADIANS, TURN, ObservedWorld, WorldBus, problems, run_lockstep
+from rigs.fault_injection import ANSWER, LIMITS, RADIANS, TURN, ObservedWorld, WorldBus, problems, run_lockstep
 
 from drive_env import CanDrives, EmulatedDrives, SafetyError, motion
 from drive_env.canopen.frames import Frame

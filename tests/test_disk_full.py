@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from auto_stages import skip_stages
-from test_every_change_leaves_a_file import node, status_is
-from test_serve import environment
+from rigs.auto_stages import skip_stages
+from rigs.served_drives import environment, node, status_is
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as drive_agent
@@ -141,7 +140,7 @@ KILLED = f"""
 import os, signal, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
-from auto_stages import skip_stages
+from rigs.auto_stages import skip_stages
 from drive_env.programs import drive_tune
 from tuning.auto import one_button as auto
 skip_stages(setattr, np.array({NEW.tolist()}))

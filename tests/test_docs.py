@@ -69,6 +69,7 @@ def recipes() -> dict[str, str]:
     return {section.partition("\n")[0]: f"# {section}" for section in sections}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", recipes())
 def test_a_recipe_can_be_followed(recipe, tmp_path):
     text = recipes()[recipe]

@@ -6,13 +6,12 @@ that knows the EDS alone, as it knows a drive of another maker.
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-from test_parity import WorldBus
+from rigs.quirks import build, variant
+from rigs.world_bus import WorldBus
 
-from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env import CanDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.devices.drive_quirks import DriveQuirks
@@ -37,17 +36,6 @@ QUIRKS = {
         "pv_starts_and_stops": True,
     },
 }
-
-
-def variant(tmp_path, quirks):
-    path = tmp_path / "quirky.toml"
-    rows = "".join(f"{key} = {json.dumps(value)}\n" for key, value in quirks.items())
-    path.write_text(f'title = "Quirky"\nvariant_of = "tmcm1636"\n[quirks]\n{rows}', encoding="utf-8")
-    return str(path)
-
-
-def build(tmp_path, **quirks):
-    return EmulatedDrives(variant(tmp_path, {"refuses_same_mode": False} | quirks), "inertia", num_threads=1, seed=1)
 
 
 def one(drives, name):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_description import eds_of
+from rigs.small_eds import eds_of
 
 from drive_env.fieldbus.description import describe
 from drive_env.master.can.dry_run import DryPort, DrySdoClient, show_frame

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from rigs.known_machines import machine_of
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
@@ -17,7 +18,7 @@ from drive_env.loops.dynamics import DEFAULT, OFF_NOMINAL, Dynamics, find_dynami
 from drive_env.loops.linear_model import position_open_loop, velocity_open_loop
 from drive_env.loops.margins import margins
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, open_loops, step_overshoot, window
-from drive_env.loops.true_plant import linear_load, true_machines, true_plant
+from drive_env.loops.true_plant import true_machines
 from drive_env.motors import find_motor
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -147,6 +148,7 @@ def three_margins(L):
     return min(phase), min(gains), float((1.0 / np.abs(1.0 + L)).max())
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("name", ["soft", "standard", "stiff", "50/9/1.7", "30/10/3"])
 def test_the_clearance_is_at_least_1_exactly_when_all_margins_are_kept(name):
     """Where it is within 0.5 % of 1 both may differ by how they interpolate."""
@@ -243,18 +245,6 @@ def gains_for(inertia, velocity, position, integration=5.0):
     return bandwidth_gains(
         DEVICE, MOTOR, inertia, current_hz=1000.0, velocity_hz=velocity, position_hz=position, integration=integration
     )
-
-
-def machine_of(load, axes=1, **options):
-    """Return the linear machine, an axis's inertia [kg*m^2], and the emulated one's plant, None of several axes."""
-    with EmulatedDrives(load=load, num_threads=1, **options) as drives:
-        machines = true_machines(drives)
-        if axes == 1:
-            plant = true_plant(drives)
-            return machines, plant.inertia, plant
-        found = linear_load(drives.inside.groups[0].load)
-        # An axis moves as if the others' motors were loose: 1 / (rotors M^-1 rotors).
-        return machines, float(1.0 / (found.rotors @ np.linalg.solve(found.M[0], found.rotors.T))[0, 0]), None
 
 
 def of_raw(raw, axes=1):

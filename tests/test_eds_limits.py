@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 from canopen.objectdictionary import ODVariable
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device

@@ -9,6 +9,7 @@ from pathlib import Path
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
+from rigs.small_eds import FOLDER, entry
 
 from drive_env.dictionary.eds_file import parse_eds
 from drive_env.dictionary.eds_values import node_id_sum, number_of
@@ -16,15 +17,8 @@ from drive_env.dictionary.entries import ObjectDictionary, eds_file, read_eds
 from drive_env.fieldbus.description import describe
 from mechanics.untrusted import UntrustedFileError
 
-FOLDER = Path(__file__).parent / "data" / "eds"
 SHIPPED = sorted((Path(__file__).parents[1] / "drive_env" / "devices").glob("*/*.eds"))
 HEAD = "[FileInfo]\nFileName=a.eds\n"
-
-
-def entry(index="6081", name="Profile velocity", kind="0x7", data_type="0x0007", access="rw", **more):
-    """Return the section of an object."""
-    rows = {"ParameterName": name, "ObjectType": kind, "DataType": data_type, "AccessType": access} | more
-    return f"[{index}]\n" + "".join(f"{key}={value}\n" for key, value in rows.items() if value is not None) + "\n"
 
 
 def read(tmp_path, text, encoding="utf-8"):

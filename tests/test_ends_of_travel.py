@@ -8,9 +8,9 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 import pytest
 import travel_sequences
-from fault_injection import TURN, eds_read_once, run_lockstep
-from in_memory_link import MemoryBus, MemoryDrives
-from thinning import part
+from rigs.fault_injection import TURN, eds_read_once, run_lockstep
+from rigs.in_memory_link import MemoryBus, MemoryDrives
+from rigs.thinning import part
 from travel_sequences import compare
 
 from drive_env import EmulatedDrives, Limits, SafetyError, motion

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numba import njit
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.group import rates_of
@@ -21,7 +20,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.firmware.servo.thermal import warm
 from drive_env.motors import MOTORS, motors_of
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 
@@ -30,7 +29,7 @@ COPPER = 0.00393  # 1/K at 25 degC
 BRIDGE, COPPER_LOSS, SHAFT, SOURCE, CHOPPER, IDLE = range(6)
 
 
-@njit(**OPTIONS)
+@cached()
 def run_axes(records, plant, rates, scratch, num_axes, cycles, sums):
     """Run whole communication cycles; sums (6, axes) [J]: bridge, copper, shaft, source, chopper, idle."""
     dt = rates.tick
@@ -203,7 +202,7 @@ def test_what_braking_feeds_back_goes_into_the_chopper(energies):
 
 
 # --- temperature --------------------------------------------------------------------------------------------------
-@njit(**OPTIONS)
+@cached()
 def run_warm(drive, dt, steps):
     for _ in range(steps):
         warm(drive, dt)

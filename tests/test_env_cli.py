@@ -539,6 +539,7 @@ def mappings(channel):
         network.disconnect()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("what", FOREIGN)
 def test_scope_is_refused_where_another_master_commands_the_drive(run, shared, tmp_path, what):
     before = mappings(shared[0])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
-from test_envelope_limits import ABORT_CONNECTION, ENCODER_RESOLUTION, MAX_PROFILE_VELOCITY, foreign
+from rigs.foreign_eds import ABORT_CONNECTION, ENCODER_RESOLUTION, MAX_PROFILE_VELOCITY, foreign
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, Limits, SafetyError, motion
 from drive_env.devices import find_device

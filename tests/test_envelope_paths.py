@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
-from test_parity import served
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.world_bus import served
 
 from drive_env import CanDrives, Limits, SafetyError, motion
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
-from test_envelope_limits import ENCODER_RESOLUTION, foreign
+from rigs.foreign_eds import ENCODER_RESOLUTION, foreign
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, Limits, SafetyError, motion
 from drive_env.dictionary.entries import Entry

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from held_objects import CURRENT_LIMIT, HeldObjects
+from rigs.held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits, SafetyError, cia402
 from drive_env.dictionary.roles import Role

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import copy
 import pickle
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_parity import WorldBus
+from rigs.world_bus import on_a_bus
 
-from drive_env import CanDrives, EmulatedDrives
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.tracking import TASKS, Tracking
@@ -21,21 +19,6 @@ NOMINAL = {"parameters": {}}
 EVERY_LOAD = pytest.mark.parametrize(
     "load", [load if load in TASKS else pytest.param(load, marks=pytest.mark.slow) for load in LOADS]
 )
-
-
-@contextmanager
-def on_a_bus(emulated):
-    """Emulated drives as CanDrives, one node per axis."""
-    world = World(lockstep=True)
-    nodes = list(range(1, emulated.num_axes + 1))
-    world.add(emulated, nodes)
-    bus = WorldBus(world)
-    try:
-        with CanDrives(bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives:
-            yield drives
-    finally:
-        bus.shutdown()
-        world.close()
 
 
 def twin(emulated):

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from ethercat_rig import STATION, Rig
+from rigs.ethercat_rig import STATION, Rig
 
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.datagrams import DatagramCommand, at_station

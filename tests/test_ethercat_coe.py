@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from coe_rig import CoeRig
+from rigs.coe_rig import CoeRig
 
 from drive_env import EmulatedDrives
 from drive_env.cia402 import State

@@ -6,8 +6,8 @@ import struct
 
 import numpy as np
 import pytest
-from ethercat_rig import STATION, Rig
-from thinning import part
+from rigs.ethercat_rig import STATION, Rig
+from rigs.thinning import part
 
 from drive_env.ethercat import datagrams, fmmu, registers
 from drive_env.ethercat.application import AlState

@@ -2,77 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import os
-import select
 import struct
-import subprocess
-import sys
-import time
-from contextlib import contextmanager
-from pathlib import Path
 
 import ethercat_cable
 import numpy as np
 import pytest
-from test_ethercat_ways import needs_namespaces
+from rigs.namespaces import needs_namespaces, seen_by
 
 from drive_env import EmulatedDrives, motion
-from drive_env.ethercat.namespaces import Namespaces
 
-HERE = Path(__file__).parent
-PATIENCE = 240.0  # s; kernels may have to be compiled
 CYCLES = 400
-
-
-@pytest.fixture
-def spaces():
-    number = os.getpid() % 100_000
-    spaces = Namespaces(f"drive-{number}", f"master-{number}", "veth1", "veth0")
-    spaces.make()
-    yield spaces
-    spaces.remove()
-
-
-def inside(space, *arguments):
-    return ["ip", "netns", "exec", space, sys.executable, *map(str, arguments)]
-
-
-def first_line(process):
-    """Return what a process prints first; it may compile before."""
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end and process.poll() is None:
-        if select.select((process.stdout,), (), (), 1.0)[0]:
-            return process.stdout.readline()
-    raise AssertionError(f"it did not begin: {process.poll()}")
-
-
-@contextmanager
-def served(spaces, pace, device="tmcm3313", load="portal"):
-    """Serve a drive in its namespace."""
-    program = "from drive_env.programs import drive_env; drive_env()"
-    serve = ("-c", program, "serve", device, "--load", load, pace)
-    process = subprocess.Popen(
-        inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface),
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert f"1 slave ({device}" in first_line(process)
-        yield
-    finally:
-        process.terminate()
-        process.wait(PATIENCE)
-        process.stdout.close()
-
-
-def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal", library="pysoem"):
-    """Return what a master saw of a drive that is served."""
-    pytest.importorskip(library, reason=f"{library} is not installed: pip install -e '.[test]'")
-    with served(spaces, pace, device, load):
-        master = inside(spaces.master, HERE / program_of_master, spaces.master_interface, *arguments)
-        done = subprocess.run(master, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.mark.slow

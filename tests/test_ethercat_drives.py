@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ethercat_segment import EmulatedSegment, linked
+from rigs.ethercat_segment import EmulatedSegment, linked
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, Limits, ObjectAccessError, SafetyError, cia402, motion

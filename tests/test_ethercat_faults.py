@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from ethercat_segment import EmulatedSegment
+from rigs.ethercat_segment import EmulatedSegment
 
 from drive_env import motion
 from drive_env.drives.limits import Limits

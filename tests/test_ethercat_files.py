@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 
 import pytest
+from rigs.eeproms import categories, pdos
 from typer.testing import CliRunner
 
 from drive_env.commands.cli import app
@@ -19,32 +20,11 @@ from drive_env.ethercat.sii_content import sii_content
 DEVICE = find_device("tmcm3313")
 
 
-def categories(content):
-    """Return the content of each category of an EEPROM, by number."""
-    found, at = {}, 0x80
-    while (number := int.from_bytes(content[at : at + 2], "little")) != 0xFFFF:
-        size = 2 * int.from_bytes(content[at + 2 : at + 4], "little")
-        found[number] = content[at + 4 : at + 4 + size]
-        at += 4 + size
-    return found
-
-
 def strings(content):
     found, at = [""], 1
     for _ in range(content[0]):
         found.append(content[at + 1 : at + 1 + content[at]].decode())
         at += 1 + content[at]
-    return found
-
-
-def pdos(content):
-    """Return index, sync manager and entries (index, sub-index, bits) of each PDO of a category."""
-    found, at = [], 0
-    while at < len(content):
-        index, number, manager = struct.unpack_from("<HBB", content, at)
-        rows = [struct.unpack_from("<HBBBBH", content, at + 8 * k) for k in range(1, number + 1)]
-        found.append((index, manager, [(one[0], one[1], one[4]) for one in rows]))
-        at += 8 * (number + 1)
     return found
 
 

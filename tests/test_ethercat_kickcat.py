@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_ethercat_drive import seen_by, spaces  # noqa: F401
-from test_ethercat_ways import needs_namespaces
+from rigs.namespaces import needs_namespaces, seen_by, spaces  # noqa: F401
 
 CYCLES = 400
 STEP = 4  # increments in a cycle of the first axis; the others k times as many

@@ -7,7 +7,8 @@ import threading
 from types import SimpleNamespace
 
 import pytest
-from small_eds import I16, I32, U16, described, small_eds
+from rigs.clock import Clock
+from rigs.small_eds import I16, I32, U16, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.ethercat import datagrams
@@ -33,20 +34,6 @@ def drive():
     further = [(index + 0x800, f"{name} 2", *rest) for index, name, *rest in rows]
     pdos = [(0x1600, "rw", 4, None), (0x1A00, "rw", 4, None)]
     return described(small_eds([*rows, *further], pdos), 2)
-
-
-class Clock:
-    """Time that passes by sleeping alone."""
-
-    def __init__(self):
-        self.now, self.slept = 1000.0, []
-
-    def monotonic(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.slept.append(seconds)
-        self.now += seconds
 
 
 @pytest.fixture

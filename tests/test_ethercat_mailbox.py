@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from ethercat_rig import STATION, Rig
+from rigs.ethercat_rig import STATION, Rig
 
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.foe import LARGEST_IMAGE

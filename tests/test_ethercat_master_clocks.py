@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from ethercat_segment import EmulatedSegment
+from rigs.ethercat_segment import EmulatedSegment
 
 from drive_env import EmulatedDrives, Limits, motion
 from drive_env.ethercat.application import AlState
@@ -45,6 +45,7 @@ def shown(segment, sub, position=0):
 
 
 # --- virtual time -----------------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("rate", [4000, 1000, 250])
 def test_in_lockstep_outputs_take_effect_at_the_next_pulse(tmp_path, rate):
     """Integers are those without clocks, of which each row acts a cycle later, from 250 us to 4 ms."""

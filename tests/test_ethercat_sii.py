@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from ethercat_rig import ALIAS, EchoDevice, Rig, sii
+from rigs.ethercat_rig import ALIAS, EchoDevice, Rig, sii
 
 from drive_env.ethercat.sii_interface import READ_TIME, WRITE_TIME, checksum
 from drive_env.ethercat.slave import EtherCatSlave

@@ -18,8 +18,7 @@ import time
 from pathlib import Path
 
 import pytest
-from test_ethercat_drive import served, spaces  # noqa: F401
-from test_ethercat_ways import needs_namespaces
+from rigs.namespaces import needs_namespaces, served, spaces  # noqa: F401
 
 from drive_env.devices import find_device
 from drive_env.ethercat.sii_content import sii_content

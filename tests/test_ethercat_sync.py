@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from coe_rig import CoeRig
+from rigs.coe_rig import CoeRig
 
 from drive_env import EmulatedDrives
 from drive_env.cia402 import State

@@ -7,10 +7,10 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from coe_rig import CoeRig
-from ethercat_segment import EmulatedSegment
-from test_ethercat_files import categories, pdos
-from test_tgz import SIZES, structure
+from rigs.coe_rig import CoeRig
+from rigs.eeproms import categories, pdos
+from rigs.ethercat_segment import EmulatedSegment
+from rigs.tgz_images import SIZES, select, structure
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
@@ -39,13 +39,6 @@ def rig(machine):
     rig = CoeRig(machine)
     rig.bring_to(AlState.PRE_OP)
     return rig
-
-
-def select(rig, number):
-    """Choose an image by the manual's sequence: number of images 0, the image, 1."""
-    assignment = 0x1C12 if number < 0x1A00 else 0x1C13
-    steps = ((0, b"\0"), (1, struct.pack("<H", number)), (0, b"\1"))
-    return [rig.download(assignment, sub, content) for sub, content in steps]
 
 
 def to_op(rig, outputs, inputs):

@@ -6,38 +6,22 @@ import json
 import os
 import shutil
 import subprocess
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_ethercat_drive import HERE, first_line, inside, spaces  # noqa: F401
-from test_ethercat_ways import needs_namespaces
-from test_tmcm3313_loops import target_of
+from rigs import TESTS
+from rigs.closed_loop_rig import target_of
+from rigs.ethercat_served import served
+from rigs.namespaces import first_line, inside, needs_namespaces, spaces  # noqa: F401
 from typer.testing import CliRunner
 
 import agents.commands.cli
 import tuning.commands.cli
-from drive_env import EmulatedDrives
-from drive_env.devices import find_device
-from drive_env.ethercat.coe_node import CoeNode
-from drive_env.ethercat.ethercat_server import EtherCatServer
-from drive_env.ethercat.slave import EtherCatSlave
-from drive_env.ethercat.ways import UdpSocket
-from drive_env.ethercat.world import EtherCatWorld
 from drive_env.master.ethercat_drives import EtherCatDrives
 from tuning.search.trial_bench import leave_oscillations_to_trials
 from tuning.stepper.commissioning import commission
 
-
-@contextmanager
-def served(device):
-    """Serve a drive, a machine on each axis; yields the UDP port and the emulated drives."""
-    world = EtherCatWorld()
-    drives = EmulatedDrives(device, "inertia", num_machines=find_device(device).num_axes, num_threads=1)
-    world.add(EtherCatSlave(CoeNode(drives)), drives)
-    with EtherCatServer(world, UdpSocket(0)) as server:
-        yield str(server.way.port), drives
-    world.close()
+pytestmark = pytest.mark.usefixtures("quick_designs")
 
 
 def run(app, command, device, port, out):
@@ -111,7 +95,7 @@ def tuned_once(spaces, device, program, command, out, *more):  # noqa: F811
     """Tune a drive that is served in one namespace from the other; return exit code and what was printed as JSON."""
     pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
     server = subprocess.Popen(
-        FIRST + inside(spaces.slave, HERE / "ethercat_tuned_drive.py", spaces.slave_interface, device),
+        FIRST + inside(spaces.slave, TESTS / "ethercat_tuned_drive.py", spaces.slave_interface, device),
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

@@ -8,11 +8,11 @@ import shutil
 import socket
 import struct
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from ethercat_rig import EchoDevice, Rig
+from rigs.ethercat_rig import EchoDevice, Rig
+from rigs.namespaces import inside, needs_namespaces
 from typer.testing import CliRunner
 
 from drive_env.commands.cli import app
@@ -29,23 +29,6 @@ from drive_env.ethercat.world import EtherCatWorld
 HERE = Path(__file__).parent
 TSHARK = shutil.which("tshark")
 PATIENCE = 60.0  # s
-
-
-def why_no_namespace():
-    """Return why this machine has no namespaces, None where it has."""
-    if sys.platform != "linux" or shutil.which("ip") is None:
-        return "network namespaces are Linux's, and made by iproute2"
-    if os.geteuid() != 0:
-        return "network namespaces take root (CAP_NET_ADMIN)"
-    done = subprocess.run(["ip", "netns", "add", f"try-{os.getpid()}"], capture_output=True, text=True)
-    if done.returncode:
-        return f"this machine makes no network namespaces: {done.stderr.strip()}"
-    subprocess.run(["ip", "netns", "delete", f"try-{os.getpid()}"], check=True)
-    return None
-
-
-NO_NAMESPACE = why_no_namespace()
-needs_namespaces = pytest.mark.skipif(NO_NAMESPACE is not None, reason=str(NO_NAMESPACE))
 
 
 # --- UDP --------------------------------------------------------------------------------------------------------------
@@ -162,10 +145,6 @@ def spaces():
     spaces.make()
     yield spaces
     spaces.remove()
-
-
-def inside(space, *arguments):
-    return ["ip", "netns", "exec", space, sys.executable, *map(str, arguments)]
 
 
 @pytest.mark.slow

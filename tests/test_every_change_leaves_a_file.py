@@ -7,27 +7,18 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from contextlib import contextmanager
 
 import pytest
-from test_serve import environment
+from rigs.served_drives import GAIN_OBJECTS, PATIENCE, environment, files, node, parameters, status_is, wait_until
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as drive_agent
-from drive_env import CanDrives, EmulatedDrives, cia402
-from drive_env.bus.hub import Hub
-from drive_env.bus.server import Server
-from drive_env.bus.world import World
-from drive_env.devices import find_device
 from drive_env.fieldbus.description import Description
-from drive_env.master.parameters import read_parameters
+from drive_env import cia402
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import load_snapshot
 
-GAIN_OBJECTS = find_device("tmcm1636").gains.keys
-
-PATIENCE = 120.0  # s until a run has come so far; it is never this long
 OFF = ((0x4F, 0x40), (0x4F, 0x08))  # masks and values of 6041h: as it comes up, and in fault
 COMMUTATION, RAMP, CURRENT_LIMIT = (0x2055, 0), (0x6083, 0), (0x2003, 0)
 
@@ -40,52 +31,15 @@ COMMANDS = {
 }
 
 
-@contextmanager
-def node(lockstep=True):
-    """An emulated drive on a hub: its machine, and the options that name it."""
-    world = World(lockstep=lockstep)
-    machine = EmulatedDrives(load="inertia", num_threads=1)
-    machine.advance(0.001)  # compiles: a node that does would not answer in time
-    world.add(machine, [1])
-    hub = Hub()
-    try:
-        with Server(world, hub):
-            yield machine, ["--interface", "slcan", "--channel", hub.channel, *["--lockstep"] * lockstep]
-    finally:
-        world.close()
-
-
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def parameters(bus):
-    """Return what a master reads of the drive, its communication too."""
-    _, interface, _, channel, *lockstep = bus
-    pace = "lockstep" if lockstep else "real-time"
-    with CanDrives(interface=interface, channel=channel, pace=pace, safety=False) as drives:
-        return read_parameters(drives)
 
 
 def differences(machine, file):
     """Return the parameters of a machine that are not what a file says."""
     (before,) = load_snapshot(file).axes
     return {key for key, was in before.items() if key[0] >= 0x2000 and int(machine.read(key)[0]) != was}
-
-
-def status_is(machine, *states):
-    return any(int(machine.read(0x6041)[0]) & mask == value for mask, value in states)
-
-
-def wait_until(condition, process=None):
-    end = time.monotonic() + PATIENCE
-    while not condition() and time.monotonic() < end and (process is None or process.poll() is None):
-        time.sleep(0.01)
-
-
-def files(folder):
-    return [path for path in folder.rglob("*before*.toml") if not path.name.startswith(".")]
 
 
 @contextmanager

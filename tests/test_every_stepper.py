@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from test_auto_command import drive_tune
+from rigs.commands import drive_tune
 
 from drive_env.devices import find_device
 from drive_env.devices.gain_set import LOAD_ANGLE

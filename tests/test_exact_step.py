@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
+from rigs.stepped_load import stepped
 from scipy.linalg import expm
-from stepped_load import stepped
 
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad

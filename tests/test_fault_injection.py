@@ -1,7 +1,7 @@
 """A fault at frame k of a session: the rotor ends at rest, disabled, inside its travel plus the stopping distance.
 
 Every k in the slow run (with FAULT_STRIDE=40 every fortieth), a sample in every run.
-The verdict is the emulator's inside alone (tests/fault_injection.py).
+The verdict is the emulator's inside alone (tests/rigs/fault_injection.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     KINDS,
     SESSIONS,
     WORLD_PATIENCE,
@@ -73,7 +73,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert np.ptp(truth.theta()) > 0.02 * 2 * np.pi
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind):

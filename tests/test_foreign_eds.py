@@ -6,7 +6,7 @@ import re
 import struct
 
 import pytest
-from scripted_drive import ABORT, ScriptedBus, ScriptedDrive
+from rigs.scripted_drive import ABORT, ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, Limits, motion
 from drive_env.devices import find_device

@@ -12,13 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from can_devices import give
-from canopen_wire import Wire
-from coe_rig import CoeRig
-from fault_injection import REST
-from test_ethercat_tgz import select
-from test_invented_drive import INVENTED
-from test_tgz import SIZES, structure
+from rigs import INVENTED
+from rigs.can_devices import give
+from rigs.canopen_wire import Wire
+from rigs.coe_rig import CoeRig
+from rigs.fault_injection import REST
+from rigs.tgz_images import SIZES, select, structure
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame

@@ -9,7 +9,8 @@ import struct
 from types import SimpleNamespace
 
 import pytest
-from ethercat_rig import Rig, category
+from rigs.clock import Clock
+from rigs.ethercat_rig import Rig, category
 
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
@@ -22,20 +23,6 @@ from drive_env.master.ethercat.frame_master import FrameMaster
 SIZES = ImageSizes(4, 6)
 WORDS = 0x0502
 SILENT = "{}: no slave answers on the cable; check cable, power and channel"
-
-
-class Clock:
-    """Time that passes by sleeping alone."""
-
-    def __init__(self):
-        self.now, self.slept = 1000.0, []
-
-    def monotonic(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.slept.append(seconds)
-        self.now += seconds
 
 
 class Way:

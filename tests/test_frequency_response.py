@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_parity import served
+from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from mechanics import friction
+from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 
 
-@njit(error_model="numpy")
+@cached()
 def friction_torque(v, other, inertia, h, coulomb, breakaway, stribeck, viscous, drag):
     """The stage, for Python."""
     return friction.friction_torque(v, other, inertia, h, coulomb, breakaway, stribeck, viscous, drag)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_parity import WorldBus
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from test_parity import served
+from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, Limits, cia402
 from drive_env.devices import find_device

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -222,3 +223,12 @@ def size(node: ast.FunctionDef, is_command: bool) -> dict[str, int]:
         "lines": node.end_lineno - node.lineno + 1 - docstring,
         "arguments": len(names) - (names[:1] in (["self"], ["cls"])),
     }
+
+
+def test_no_test_imports_a_test():
+    """What tests share is in `tests/rigs/`; programs as text count, too."""
+    found = {}
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        names = re.findall(r"^\s*(?:from|import) (test_\w+|conftest)\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+        found |= {path.name: names} if names else {}
+    assert found == {}

@@ -17,6 +17,7 @@ import canopen
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.echo_hub import Echo, serving
 
 from drive_env import EmulatedDrives, motion
 from drive_env.bus.can_port import CanPort
@@ -32,33 +33,6 @@ from drive_env.master.can.port import open_bus
 from drive_env.master.can.slcan_socket import SlcanSocket
 
 HERE = Path(__file__).resolve().parent
-
-
-class Echo:
-    """A node that answers 601h with 581h, and a remote request for 701h with its state."""
-
-    def __init__(self, send):
-        self.send = send
-
-    def power_on(self, now):
-        pass
-
-    def receive(self, frame, now):
-        if frame.rtr and frame.can_id == 0x701:
-            self.send(Frame(0x701, b"\x7f"))
-        elif frame.can_id == 0x601:
-            self.send(Frame(0x581, frame.data))
-
-    before_cycle = after_cycle = power_on
-
-
-@contextmanager
-def serving(token=None, **options):
-    """A hub with an echo as node 1, in a thread; yields the server."""
-    world = World(**options)
-    world.attach(1, Echo)
-    with Server(world, Hub(bit_rate=world.wire.bit_rate, token=token)) as server:
-        yield server
 
 
 @pytest.fixture
@@ -573,7 +547,7 @@ def transfers_per_second(bus, seconds=0.5):
 
 SERVE = """
 import sys
-from test_hub import serving
+from rigs.echo_hub import serving
 with serving(lockstep=sys.argv[1] == "True") as server:
     print(server.transport.channel, flush=True)
     sys.stdin.read()

@@ -14,15 +14,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_parity import served
-from test_suite import open_machines
+from rigs.known_machines import open_machines, truth
+from rigs.world_bus import served
 
 from drive_env import cia402, motion
 from drive_env.devices import find_device
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.loops.true_plant import true_plant
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group
 from tuning.estimate import refused
@@ -42,35 +41,6 @@ ALLOWED = {
     "resistance": 0.05, "inductance": 0.05, "inertia": 0.05, "coulomb": 0.10, "viscous": 0.10, "resonance": 0.02,
     "anti_resonance": 0.04,
 }  # fmt: skip
-
-
-def truth(drives, axis, offset):
-    """Return the true values of an axis, in data sheet units of torque."""
-    plant = true_plant(drives, axis)
-    group = next(g for g in drives.inside.groups if g.machines.start <= axis < g.machines.stop)
-    load, copy = group.load, axis - group.machines.start
-    ratio = np.abs(load.plant.motion[: load.num_frictions] @ way(load).joints.T)[:, 0]
-    each = load.plant.friction[:, 0].T[copy] * ratio
-    dry = each.sum()
-    parameters = drives.machine.parameters
-    if "load.efficiency" in parameters:
-        # What a screw or a gear carries at constant speed: gravity, or the friction behind it.
-        carried = max(each[-1], abs(offset) * plant.torque_constant)
-        dry += (1.0 / parameters["load.efficiency"][axis] - 1.0) * carried
-    viscous = plant.viscous
-    if "load.efficiency" in parameters and abs(offset) * plant.torque_constant < 2.0 * each[-1]:
-        # What lies behind the transmission is dearer by its losses, unless it is gravity that is carried.
-        viscous += (1.0 / parameters["load.efficiency"][axis] - 1.0) * (viscous - parameters["motor.viscous"][axis])
-    K = plant.torque_constant
-    return {
-        "resistance": parameters["motor.R_s"][axis],
-        "inductance": parameters["motor.L_q"][axis],
-        "inertia": plant.inertia * drives.motor.torque_constant / K,
-        "coulomb": dry / K,
-        "viscous": viscous / K,
-        "resonance": plant.resonance,
-        "anti_resonance": plant.anti_resonance,
-    }
 
 
 def compare(target, tally):

@@ -1,4 +1,4 @@
-"""A second link: what drives, envelope and tools do on a fieldbus that is not CAN (tests/in_memory_link.py)."""
+"""A second link: what drives, envelope and tools do on a fieldbus that is not CAN (tests/rigs/in_memory_link.py)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from in_memory_link import (
+from rigs.in_memory_link import (
     FIRST_ADDRESS,
     WATCHDOG_STEP,
     Images,
@@ -26,7 +26,8 @@ from in_memory_link import (
     OutputRows,
     State,
 )  # fmt: skip
-from test_parity import SCRIPTS, TURN, assert_equal, emulated, run, served
+from rigs.parity_scripts import SCRIPTS, TURN, emulated, run
+from rigs.world_bus import assert_equal, served
 
 from drive_env import EmulatedDrives, Limits, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.devices import find_device

@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
-from test_every_change_leaves_a_file import node
-from test_parity import WorldBus
+from rigs.served_drives import node
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion

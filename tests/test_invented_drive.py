@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_contract import Life
-from test_parity import WorldBus
+from rigs.life import Life
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as agent_app
@@ -129,6 +129,7 @@ supply = [24, 26]
 """
 
 
+@pytest.mark.slow
 def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
     suite, out = tmp_path / "suite.toml", tmp_path / "out"
     suite.write_text(SUITE.format(device=json.dumps(INVENTED)), encoding="utf-8")

@@ -14,7 +14,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 from numba.extending import overload
-from thinning import STRIDE
+from rigs.thinning import STRIDE
 
 from drive_env import EmulatedDrives
 from drive_env.emulator import cyclic_control, prepared_record
@@ -221,6 +221,7 @@ def test_the_key_is_that_of_names_and_contents_wherever_they_lie(tmp_path):
     assert source_hash(elsewhere) != source_hash(files)
 
 
+@pytest.mark.slow
 def test_kernels_of_a_copy_of_the_sources_are_those_of_the_original(cache, tmp_path):
     for name in ("mechanics", "drive_env"):
         shutil.copytree(ROOT / name, tmp_path / "copy" / name, ignore=shutil.ignore_patterns("__pycache__"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from held_objects import HeldObjects
+from rigs.held_objects import HeldObjects
 
 from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError
 from drive_env.fieldbus.errors import BusError, NoAnswerError

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from held_objects import CURRENT_LIMIT, HeldObjects
+from rigs.held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits
 from drive_env.drives.limits import NO_LIMIT

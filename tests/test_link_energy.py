@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_identification import truth
+from rigs.known_machines import proving, truth
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
@@ -12,11 +12,9 @@ from drive_env.devices.gains import rule_gains
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import write_gains
 from drive_env.firmware.record import get_lanes
-from drive_env.loops.true_plant import true_plant
+from drive_env.gains import write_gains
 from drive_env.motors import find_motor
-from tuning.auto.identified import calm_gains
 from tuning.auto.one_button import auto
-from tuning.auto.proving import ProvingGround
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy, trial_reach
@@ -108,14 +106,6 @@ def test_a_heavy_axis_on_a_small_link_does_not_fall_while_it_is_identified():
         found = identify(target)[0]
         assert target.drives.emergencies() == [] and found.estimates["inertia"].is_known
         assert abs(target.drives.machine.rotor_angle[0]) < MOST_TURNS * TURN
-
-
-def proving(target, held=(0.0, 0.0)):
-    """Return where gains are tried on a machine that is known, and the rule's gains."""
-    plant = true_plant(target.drives)
-    rule = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)
-    write_gains(target.drives, rule)
-    return ProvingGround(target, [plant], (target.low, target.high), calm_gains(target, plant)[None], rule, held), rule
 
 
 @pytest.mark.parametrize("motor", ["class_750w", "class_1kw"])

@@ -5,8 +5,8 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
+from rigs.stepped_load import stepped
 from scipy.linalg import eigh, null_space
-from stepped_load import stepped
 
 from drive_env.motors import MOTORS
 from mechanics.friction import FRICTION_MODELS

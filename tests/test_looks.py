@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from held_objects import HeldObjects
+from rigs.held_objects import HeldObjects
 
 from drive_env.dictionary.entries import Entry
 from drive_env.drives.limits import NO_LIMIT

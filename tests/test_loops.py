@@ -29,7 +29,7 @@ from drive_env.firmware.servo.power_stage import convert_energy, power_stage, re
 from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.motors import MOTORS
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import OPTIONS, cached
 
 window = FIRMWARE.window
 
@@ -45,7 +45,7 @@ POSITION_P = "Position Mode Settings.P_Parameter"
 
 
 # --- kernels ------------------------------------------------------------------------------------------------------
-@njit(**OPTIONS)
+@cached()
 def run_motion_loops(drive, demand, measured, out):
     """Feed velocity (or torque, by the lane's level) demands and measured velocities; out: i_q_ref, sum, error."""
     for k in range(demand.shape[0]):
@@ -60,7 +60,7 @@ def run_motion_loops(drive, demand, measured, out):
             out[k, 2, lane] = drive.velocity_error[lane]
 
 
-@njit(**OPTIONS)
+@cached()
 def run_current_loop(drive, i_q_ref, i_d, i_q, angle, out):
     """Feed set-points, measured currents and angles; out: duty d and q in that angle, sums d and q."""
     for k in range(i_q_ref.shape[0]):
@@ -80,7 +80,7 @@ def run_current_loop(drive, i_q_ref, i_d, i_q, angle, out):
             out[k, 3, lane] = drive.current_sum_q[lane]
 
 
-@njit(**OPTIONS)
+@cached()
 def run_current_ticks(records, dt, h, i_q_ref, out):
     """Run current loop and power stage, rotors locked; out, before each tick: i_q_ref, i_q, duty alpha, beta."""
     for block in range(records.shape[0]):
@@ -104,7 +104,7 @@ def run_current_ticks(records, dt, h, i_q_ref, out):
 ERROR_P, THETA, ERROR_V, OMEGA, I_REF, I_Q, OMEGA_TRUE, OMEGA_REF = range(8)
 
 
-@njit(**OPTIONS)
+@cached()
 def excite(records, plant, rates, scratch, num_axes, level, demand, out):
     """Run the whole axis with a demand of its own per window, shape (n, axes); out (n, 8, axes)."""
     for k in range(demand.shape[0]):

@@ -9,7 +9,7 @@ from pathlib import Path
 import canopen
 import canopen.lss
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.bus.world import World

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numba import njit
 from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives
@@ -24,7 +23,7 @@ H = 200e-6
 S_0, S_1, S_2, F_C, F_S, V_S, MASS = 1e5, math.sqrt(1e5), 0.4, 1.0, 1.5, 1e-3, 1.0
 
 
-@njit(error_model="numpy")
+@cached()
 def bristle_torque(v, other, mass, h, z, s_0, s_1, coulomb, breakaway, stribeck, viscous, drag):
     """The stage, which kernels alone can call, for Python."""
     return friction_laws.bristle_torque(v, other, mass, h, z, s_0, s_1, coulomb, breakaway, stribeck, viscous, drag)

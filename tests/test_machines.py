@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.inertia_check import MisfitWarning

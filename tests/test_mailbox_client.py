@@ -6,6 +6,7 @@ import struct
 import threading
 
 import pytest
+from rigs.clock import Clock
 
 from drive_env.dictionary.aborts import TOGGLE_NOT_ALTERNATED
 from drive_env.ethercat.coe import CoeService, message, split
@@ -105,18 +106,6 @@ def test_emergencies_between_are_kept_and_answer_nothing():
 
 
 # --- message by message -----------------------------------------------------------------------------------------------
-class Clock:
-    """Time that passes by sleeping alone."""
-
-    def __init__(self):
-        self.now, self.slept = 1000.0, []
-
-    def monotonic(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.slept.append(seconds)
-        self.now += seconds
 
 
 class Mailbox:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numba import njit
 
 from drive_env import motors
 from drive_env.firmware.cycle import Rates
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo.alignment import ENCODER
 from drive_env.firmware.servo_mains.stages import FIRMWARE, prepare_link
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 start_window, tick = FIRMWARE.start_window, FIRMWARE.tick
 MOTOR = motors.MOTORS["am3041_e"]
@@ -36,7 +35,7 @@ NOMINAL = {
 }  # fmt: skip
 
 
-@njit(**OPTIONS)
+@cached()
 def run_module(records, rates, periods, sums, trace):
     """Run periods of the first block: sums (6, lanes) [J], of what each axis or, of a link's terms, its link has done.
 

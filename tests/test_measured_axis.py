@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_dynamics import machine_of
+from rigs.known_machines import machine_of
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import bandwidth_gains

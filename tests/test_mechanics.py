@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from mechanics.loads import LOADS, find_load

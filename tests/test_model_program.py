@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
-
-from drive_env import cia402
-from drive_env.canopen.nmt import NmtState
-from drive_env.cia402 import State
-from drive_env.safety.model import __main__ as command_module
-from drive_env.safety.model.drive import Drive
-from drive_env.safety.model.exploration import (
+from rigs.safety_model.drive import Drive
+from rigs.safety_model.exploration import (
     GIVEN_UP,
     LEFT,
     RUNS_ON,
     TAKEN_FOR_OFF,
     UNWATCHED,
     Counterexample,
-    Exploration,
     described,
     explore,
 )
-from drive_env.safety.model.frames import transfers
-from drive_env.safety.model.program import PLAYS, WORDS, program_steps
-from drive_env.safety.model.rules import (
+from rigs.safety_model.frames import transfers
+from rigs.safety_model.program import PLAYS, WORDS, program_steps
+from rigs.safety_model.rules import (
     DISABLED,
     ENABLE,
     NO_POWER,
@@ -35,9 +27,13 @@ from drive_env.safety.model.rules import (
     TODAY,
     Assumptions,
 )
-from drive_env.safety.model.situation import At, Hand, Held, Situation, StopStage
-from drive_env.safety.model.steps import attended
-from drive_env.safety.model.supervisor import supervisor_steps
+from rigs.safety_model.situation import At, Hand, Held, Situation, StopStage
+from rigs.safety_model.steps import attended
+from rigs.safety_model.supervisor import supervisor_steps
+
+from drive_env import cia402
+from drive_env.canopen.nmt import NmtState
+from drive_env.cia402 import State
 
 LIVE = Drive(fsa=State.OPERATION_ENABLED, turns=True, nmt=NmtState.OPERATIONAL)
 READY = Drive(fsa=State.READY_TO_SWITCH_ON, nmt=NmtState.OPERATIONAL)
@@ -274,23 +270,6 @@ def test_the_model_that_was_explored_is_this_one(rules, assumptions, states, tra
     result = explore(rules, assumptions)
     assert (result.states, result.transitions) == (states, transitions)
     assert {wrong: len(one.trace) for wrong, one in result.found.items()} == lengths
-
-
-def test_both_rule_sets_are_explored_by_the_command(monkeypatch, capsys):
-    asked = []
-    monkeypatch.setattr(command_module, "explore", lambda rules, assumptions: asked.append((rules, assumptions)) or (
-        Exploration(7, 9, 1.25, {} if rules is OURS else {RUNS_ON: "a trace"})
-    ))  # fmt: skip
-    for arguments, troubles in (([], 1), (["--troubles", "3"], 3), (["--troubles", "0"], 0)):
-        monkeypatch.setattr(sys, "argv", ["model", *arguments])
-        command_module.main()
-        assert asked[-2:] == [(TODAY, Assumptions(troubles)), (OURS, Assumptions(troubles))]
-        assert capsys.readouterr().out.splitlines() == [
-            "TODAY: 7 states, 9 steps, 1.2 s", "a trace", "OURS: 7 states, 9 steps, 1.2 s", "no counterexample"
-        ]  # fmt: skip
-    monkeypatch.setattr(sys, "argv", ["model", "--troubles", "4"])
-    with pytest.raises(SystemExit):
-        command_module.main()
 
 
 @pytest.mark.parametrize(

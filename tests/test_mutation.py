@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mutation
 import pytest
-from thinning import part
+from rigs.thinning import part
 
 TABLE = mutation.read_table()
 QUICK = ["drive_env/safety/oscillation.py", "tuning/fallback_gains.py", "tuning/identify/confidence.py"]

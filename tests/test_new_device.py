@@ -16,10 +16,10 @@ import uuid
 import canopen
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from test_canopen_master import NODE, PATIENCE, BootUps, Pump, until
-from test_eds_reader import FOLDER, entry
-from test_parity import WorldBus
+from rigs.canopen_wire import Wire
+from rigs.pump import NODE, PATIENCE, BootUps, Pump, until
+from rigs.small_eds import FOLDER, entry
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion

@@ -1,7 +1,7 @@
 """No path on which a motor runs on: each one that was found, with the truth from inside the emulator.
 
 Where a master may refuse or stop in time, both will do; what counts is where the rotor was and how it ended. Numbers of
-the verdict are those of tests/fault_injection.py: travel of 3 turns either way, a drive that notices its master's death
+the verdict are those of rigs/fault_injection.py: travel of 3 turns either way, a drive that notices its master's death
 after 0.1 s, half of the commissioned deceleration.
 """
 
@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     DEAD_MASTER,
     EXPECTED,
     LIMITS,
@@ -171,6 +171,7 @@ def test_the_answer_to_the_enabling_write_is_lost(emulated):
         ended_well(world)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("lost", ["the first two", "all"])
 def test_stop_controlwords_are_lost(emulated, lost):
     with bench(emulated) as (world, bus):
@@ -192,6 +193,7 @@ def test_stop_controlwords_are_lost(emulated, lost):
         turned(world, SLOW)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("end", ["close", "death"])
 def test_a_controlword_that_disables_nothing_is_no_stop(emulated, end):
     """8Fh has the bits of enable operation and that of fault reset: the drive stays enabled."""
@@ -209,6 +211,7 @@ def test_a_controlword_that_disables_nothing_is_no_stop(emulated, end):
         turned(world, SLOW)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("after", [1, 5, 20])
 def test_ctrl_c_pressed_again_while_it_stops(emulated, after):
     """The second and the third come some frames after the first, while the first is being worked on."""
@@ -232,6 +235,7 @@ def test_ctrl_c_pressed_again_while_it_stops(emulated, after):
         turned(world, TO_AND_FRO)
 
 
+@pytest.mark.slow
 @linux_only
 def test_three_ctrl_c_two_milliseconds_apart(emulated, programs):
     found = {}
@@ -245,6 +249,7 @@ def test_three_ctrl_c_two_milliseconds_apart(emulated, programs):
     assert not any(found.values()), found
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("doing", ["records", "advances", "computes"])
 def test_another_thread_stops_what_the_program_does(emulated, doing):
     """`Envelope.stop_at_once`: the button of a page, while a job of the same program is under way."""
@@ -293,6 +298,7 @@ def test_a_stop_from_another_thread_while_nothing_is_enabled_does_nothing(emulat
         turned(world, SLOW)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("when", ["as it is enabled", "while it turns"])
 def test_the_second_of_two_axes_falls_silent(when):
     with EmulatedDrives(load="inertia", num_machines=2, num_threads=1) as two, bench(two, (1, 2)) as (world, bus):
@@ -414,6 +420,7 @@ def test_a_silence_that_rounds_to_none(emulated):
 
 
 # --- signals of a script that has no handlers -----------------------------------------------------------------------
+@pytest.mark.every(3)
 @linux_only
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_a_signal_stops_a_script_at_once(emulated, programs, number):
@@ -471,6 +478,7 @@ def record_eight_others_in_torque(drives):
     drives.record(objects, 0.5, play={0x6071: np.full(500, 800)})
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("script", [
     turn_and_read, turn_and_sleep, play_that_enables, record_eight_others, record_eight_others_in_torque,
 ], ids=lambda script: script.__name__)  # fmt: skip
@@ -546,7 +554,7 @@ def stacked_relative_moves(drives):
     read_on(drives, 1.5)
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.parametrize("script", [
     coarser_scale, coarser_scale_in_torque, home_and_move_again, offset_in_csp, offset_by_sdo, stacked_relative_moves,
 ], ids=lambda script: script.__name__)  # fmt: skip
@@ -575,6 +583,7 @@ def test_the_current_keeps_its_limit(emulated):
 
 
 # --- stops ---------------------------------------------------------------------------------------------------------
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     "settings",
     [{0x6085: 1}, {0x6085: 1, 0x605A: 6}],
@@ -629,7 +638,7 @@ def too_fast(drives):
     drives.record([0x606C], 0.3, play={0x6071: np.full(300, 800)})
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("end", [
     close_at_speed, exception_at_speed, ctrl_c_at_speed, too_fast,
 ], ids=lambda end: end.__name__)  # fmt: skip

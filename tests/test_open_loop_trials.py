@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stepper_rig import BARE
+from rigs.stepper_rig import BARE
 from typer.testing import CliRunner
 
 from drive_env import cia402

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_parity import served
+from rigs.world_bus import served
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, cia402, motion

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from mechanics import Contact, Friction, Load, Parameter

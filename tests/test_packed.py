@@ -10,7 +10,7 @@ from functools import cache
 import mujoco
 import numpy as np
 import pytest
-from stepped_load import stepped
+from rigs.stepped_load import stepped
 
 from drive_env import EmulatedDrives, motion
 from mechanics.loads import LOADS

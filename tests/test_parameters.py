@@ -7,8 +7,8 @@ import dataclasses
 from types import SimpleNamespace
 
 import pytest
-from held_objects import HeldObjects
-from scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.held_objects import HeldObjects
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
 from drive_env.devices import find_device

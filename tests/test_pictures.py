@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
-from test_render import needs_gl
+from rigs.drawing import needs_gl
 
 from drive_env import EmulatedDrives
 from drive_env.devices import device_names
@@ -92,6 +92,7 @@ def test_the_single_environment_renders_and_who_looks_changes_nothing(kind):
     np.testing.assert_array_equal(*found)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("device", [pytest.param(name, marks=needs_gl) for name in device_names()])
 def test_every_device_is_drawn(device):
     """A stepper tells no torque current; its third panel has how far it is behind its steps, which is its torque."""

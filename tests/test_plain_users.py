@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
+from rigs.drawing import needs_gl
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.vec_env import VecEnv
-from test_render import needs_gl
 from typer.testing import CliRunner
 
 import agents.training.train

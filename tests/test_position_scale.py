@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from several_axes import build
-from test_parity import WorldBus
+from rigs.canopen_wire import Wire
+from rigs.several_axes import build
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, Limits, ObjectAccessError, motion
 from drive_env.bus.world import World

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives, motion
@@ -15,7 +14,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.power_stage import convert_energy, power_stage, refresh_winding
 from drive_env.firmware.servo.stages import FIRMWARE
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 DT = 40e-6  # s, current loop
 WINDOW = 200e-6  # s, velocity loop
@@ -26,7 +25,7 @@ LOCKED = 1e30  # kg*m^2: the rotor keeps its speed
 R, L, PSI, N_P, SUPPLY = 0.36, 0.6e-3, 5.952380952e-3, 4, 24.0
 
 
-@njit(**OPTIONS)
+@cached()
 def run_stage(drive, dt, window, duty, trace):
     """Hold duty[k] (alpha, beta per lane) in tick k; trace: i_d, i_q after, tau_m, u_dc after, theta_m before."""
     derive(drive, dt)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from numba import njit
 from scipy.optimize import brentq
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware.common import profiles
+from mechanics.compiled import cached
 
 DT = 1e-3
 
 
-@njit
+@cached()
 def play_trapezoid(x, v, target, v_max, a_up, a_down, dt, steps):
     path = np.empty((steps + 1, 2))
     path[0, 0], path[0, 1] = x, v
@@ -28,7 +28,7 @@ def play_trapezoid(x, v, target, v_max, a_up, a_down, dt, steps):
     return path
 
 
-@njit
+@cached()
 def play_ramp(v, v_end, rate, dt, steps):
     path = np.empty(steps + 1)
     path[0] = v
@@ -38,7 +38,7 @@ def play_ramp(v, v_end, rate, dt, steps):
     return path
 
 
-@njit
+@cached()
 def play_stop(x, v, rate, dt, steps):
     path = np.empty((steps + 1, 2))
     path[0, 0], path[0, 1] = x, v

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_eds import I8, I16, I32, TEXT, U16, described, small_eds
+from rigs.small_eds import I8, I16, I32, TEXT, U16, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.fieldbus.errors import BusError, NoAnswerError, RefusedError

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import typer
 from PIL import Image
+from rigs.drawing import needs_gl
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, motion
@@ -37,17 +38,6 @@ from mechanics.shaft import one, way
 
 SMALL = PictureFormat(width=640, height=360)
 
-
-def why_nothing_can_be_drawn():
-    try:
-        opengl.new_context(16, 16).free()
-    except OpenGLError as error:
-        return str(error)
-    return ""
-
-
-NO_GL = why_nothing_can_be_drawn()
-needs_gl = pytest.mark.skipif(bool(NO_GL), reason=NO_GL or "there is OpenGL")
 
 ARM = """
 <mujoco>

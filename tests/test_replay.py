@@ -4,35 +4,26 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.recorded_moves import (
+    CURRENT,
+    DEMAND,
+    POSITION,
+    SPEED,
+    TARGET,
+    TORQUE,
+    TRUTH,
+    TURN,
+    VELOCITY,
+    a_move,
+    machines,
+    recorded,
+    written,
+)
 
-from drive_env import EmulatedDrives, motion
-from drive_env.commands.scope import write_table
-from drive_env.dictionary.entries import Entry
 from drive_env.randomisation.random_machines import Distributions, Law
+from drive_env import motion
 from drive_env.trials import replay as module
 from drive_env.trials.replay import Log, _candidates, command_of, compare, fit, read_log, replay
-
-TURN = 65536  # increments
-TRUTH = {"load.inertia": 2.4e-5, "load.coulomb": 4e-3}
-DEMAND, POSITION, VELOCITY, CURRENT = (0x6062, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0)
-TARGET, SPEED, TORQUE = (0x607A, 0), (0x60FF, 0), (0x6071, 0)
-
-
-def machines(count=1, seed=5, load="two_mass", **options):
-    return EmulatedDrives(load=load, num_machines=count, seed=seed, num_threads=1, **options)
-
-
-def recorded(objects, mode, play, load="two_mass", parameters=TRUTH, period=0.001):
-    """A log of the real machine, whose noise is another."""
-    real = machines(seed=77, load=load, parameters=parameters)
-    motion.enable(real, mode)
-    trace = real.record(objects, len(next(iter(play.values()))) * 0.001, play=play, period=period)
-    return Log(trace.t, {name: trace[name] for name in objects})
-
-
-def a_move(seconds=0.4):
-    t = np.arange(round(seconds * 1000)) * 1e-3
-    return np.rint(TURN * (1.0 - np.cos(2.0 * np.pi * 5.0 * t))).astype(int)
 
 
 @pytest.fixture(scope="module")
@@ -177,12 +168,6 @@ def test_the_same_seed_finds_the_same(log):
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------
-def written(path, log, labels=("node 1",)):
-    known = EmulatedDrives(load="inertia", num_threads=1).device.new_dictionary()
-    entries = [known.find(name) for name in log.objects]
-    assert all(isinstance(entry, Entry) for entry in entries)
-    rows = {entry: log.objects[name] for entry, name in zip(entries, log.objects, strict=True)}
-    write_table(path, entries, list(labels), log.t, rows)
 
 
 def test_what_scope_writes_is_read_back(log, tmp_path):

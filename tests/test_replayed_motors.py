@@ -12,9 +12,8 @@ import time
 
 import can
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
-from test_every_change_leaves_a_file import node, wait_until
-from test_serve import environment
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.served_drives import environment, node, wait_until
 from typer.testing import CliRunner
 
 from drive_env.commands import replayed_motors
@@ -267,6 +266,7 @@ def test_a_bus_that_is_lost_is_not_called_safe(bus, tmp_path, monkeypatch):
     assert (code, "the motors of node 1 may be running" in error) == (REFUSED, True)
 
 
+@pytest.mark.every(3)
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("times", [1, 3])
@@ -330,6 +330,7 @@ def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bu
     assert beats and set(beats) == {b"\5"}
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("values", "frames", "why"),
     [

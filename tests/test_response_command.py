@@ -4,7 +4,6 @@ import csv
 import json
 
 import pytest
-from test_tune_cli import drive_tune
 from typer.testing import CliRunner
 
 from tuning.commands.cli import app
@@ -13,17 +12,17 @@ from tuning.commands.cli import app
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("response")
-    return folder, drive_tune("response", "--load", "inertia", "--high", "200", "--out", "out", cwd=folder)
+    return folder, in_process("--load", "inertia", "--high", "200", "--out", str(folder / "out"))
 
 
 @pytest.mark.slow
 def test_it_prints_margins_plant_and_drive_time(run):
-    _, done = run
-    assert done.returncode == 0, done.stderr
+    folder, done = run
+    assert done.exit_code == 0, done.stderr
     assert all(word in done.stdout for word in ("margin", "[deg]", "crossover"))
     assert "axis 0: total inertia " in done.stdout
     assert "no resonance between 5 and" in done.stdout
-    assert "s of drive time; written to out" in done.stdout
+    assert f"s of drive time; written to {folder / 'out'}" in done.stdout
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_agents_training import tiny
-from test_scale import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
+from rigs.shards import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
+from rigs.trainings import tiny
 from typer.testing import CliRunner
 
 from agents.evaluation.evaluation import evaluate
@@ -348,6 +348,7 @@ def test_a_search_is_not_resumed_with_a_file_that_was_changed(own, monkeypatch):
     assert "parts/body.xml of arm/arm.xml (load) was changed since the run in out.unfinished" in result.output
 
 
+@pytest.mark.slow
 def test_settings_of_a_search_repeat_it_from_its_folder_alone(own, decoys, monkeypatch):
     assert drive_tune(*OPTIMISE, "--sampler", "grid").exit_code == 0
     found = (own / "out" / "trials.csv").read_bytes()
@@ -384,6 +385,7 @@ def test_a_journal_is_not_gone_on_with_for_something_else(own, other):
     assert added.count(b"\n") == 1 and b"study_name" in added  # no trial
 
 
+@pytest.mark.slow
 def test_a_comparison_is_not_resumed_with_a_file_that_was_changed(own, monkeypatch):
     def stop(*_, log, **__):
         log.append(0, {"rows": np.array("[]")})
@@ -459,6 +461,7 @@ def test_a_search_elsewhere_has_the_files_of_here(own, decoys, tmp_path):
     assert here.cost == there.cost and np.array_equal(here.rule, there.rule)
 
 
+@pytest.mark.slow
 def test_a_comparison_elsewhere_has_the_files_of_here(own, decoys):
     from tuning.compare.tuners import find_tuner
 

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 import pytest
-from closed_loop_rig import build
-from stepper_rig import lane
+from rigs.closed_loop_rig import build
+from rigs.stepper_rig import lane
 
 from drive_env import motion
 

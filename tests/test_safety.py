@@ -11,8 +11,8 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
-from test_parity import served
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.world_bus import served
 
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, motion
 from drive_env.bus.hub import Hub

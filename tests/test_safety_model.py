@@ -13,7 +13,22 @@ from typing import NamedTuple
 
 import can
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
+from rigs.safety_model import drive as drive_model
+from rigs.safety_model.drive import Drive
+from rigs.safety_model.exploration import GIVEN_UP, LEFT, RUNS_ON, TAKEN_FOR_OFF, UNRAMPED, UNWATCHED, explore
+from rigs.safety_model.program import WORDS
+from rigs.safety_model.rules import (
+    NO_POWER,
+    OURS,
+    OWN_ID,
+    SET_POINT,
+    SHUTDOWN,
+    TODAY,
+    Assumptions,
+)
+from rigs.safety_model.situation import At, beginnings
+from rigs.safety_model.steps import steps
 
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError
 from drive_env.bus.hub import Hub
@@ -23,21 +38,6 @@ from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.cia402 import STATE_CODING, State
 from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port, open_bus
-from drive_env.safety.model import drive as drive_model
-from drive_env.safety.model.drive import Drive
-from drive_env.safety.model.exploration import GIVEN_UP, LEFT, RUNS_ON, TAKEN_FOR_OFF, UNRAMPED, UNWATCHED, explore
-from drive_env.safety.model.program import WORDS
-from drive_env.safety.model.rules import (
-    NO_POWER,
-    OURS,
-    OWN_ID,
-    SET_POINT,
-    SHUTDOWN,
-    TODAY,
-    Assumptions,
-)
-from drive_env.safety.model.situation import At, beginnings
-from drive_env.safety.model.steps import steps
 
 ENABLING = ("write 06h", "write 0Fh")
 LATE = ("play", "RPDO held", "late frame", "foreign SYNC")

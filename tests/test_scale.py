@@ -19,50 +19,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs.shards import GRID, PATIENCE, contents, environment, run_command, start_and_wait_for_a_shard
 
 from tuning.runs import pools, provenance, sweep
 from tuning.runs.experiment import load_experiment, resolve
 from tuning.runs.pools import PoolError, in_order, open_pool, parse_cluster
 from tuning.runs.shard_log import ShardLog, ShardLogError
 from tuning.runs.sweep_files import save_sweep
-from tuning.runs.unfinished import SHARDS, shard_log, unfinished_folder
-
-ROOT = Path(__file__).parent.parent
-PATIENCE = 300.0  # s, for a computer that stands still for minutes
-# 2304 points in three shards, 100 ms each.
-GRID = """
-device = "tmcm1636"
-motor = "qbl4208"
-load = "inertia"
-seed = 3
-
-[[sweep]]
-object = "2042h:01"
-low = 100
-high = 3000
-count = 48
-spacing = "log"
-
-[[sweep]]
-object = "2042h:02"
-low = 100
-high = 3000
-count = 48
-spacing = "log"
-
-[excitation]
-velocity_rpm = 1000.0
-velocity_time = 0.01
-acceleration_rpm_per_s = 100000.0
-load_torque = -0.05
-load_time = 0.06
-duration = 0.1
-sampling_period = 0.001
-
-[metric]
-name = "iae"
-"""
-FILES = ("results.csv", "settings.toml", "heatmap.png", "best_response.png")
+from tuning.runs.unfinished import shard_log
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +51,6 @@ def whole(experiment):
 def saved(whole, tmp_path_factory):
     """Its files, as bytes."""
     return contents(save_sweep(whole, tmp_path_factory.mktemp("saved") / "run"))
-
-
-def contents(folder):
-    return {name: (folder / name).read_bytes() for name in FILES}
 
 
 def equal(one, other):
@@ -575,43 +535,6 @@ def test_results_of_other_sources_are_not_gone_on_with(tmp_path, monkeypatch):
 
 
 # --- the command --------------------------------------------------------------------------------------------------
-def arguments(config, out, *more):
-    return [
-        sys.executable,
-        "-m",
-        "tuning.commands.cli",
-        "sweep",
-        "--config",
-        str(config),
-        "--out",
-        str(out),
-        *map(str, more),
-    ]
-
-
-def environment():
-    return os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"}
-
-
-def run_command(config, out, *more):
-    return subprocess.run(
-        arguments(config, out, *more), env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
-
-
-def start_and_wait_for_a_shard(config, out, *more):
-    """Return the command, running, with at least one shard done and the rest not."""
-    log = unfinished_folder(out) / SHARDS
-    process = subprocess.Popen(
-        arguments(config, out, *more), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    deadline, size, before = time.monotonic() + PATIENCE, 0, -1
-    # While a shard is being written it is none yet, and who is killed then leaves nothing to go on from.
-    while not (size > 1000 and size == before) and process.poll() is None:
-        assert time.monotonic() < deadline, "no shard was done"
-        time.sleep(0.01)
-        size, before = log.stat().st_size if log.exists() else 0, size
-    return process
 
 
 @pytest.fixture(scope="module")

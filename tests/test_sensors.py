@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy import signal, stats
 
 from drive_env import EmulatedDrives, motion
@@ -15,7 +14,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.firmware.servo.stages import FIRMWARE
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 TWO_PI = 2.0 * math.pi
 COUNTS = 4096
@@ -25,7 +24,7 @@ STEP = 0.048828125  # A: 12 bit over +-100 A, 200/4096
 FREE = {"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0}
 
 
-@njit(**OPTIONS)
+@cached()
 def run_encoder(drive, h, theta, position, velocity, angle):
     """Turn the rotor through theta, one row per period, and record what is measured."""
     derive(drive, h)
@@ -40,7 +39,7 @@ def run_encoder(drive, h, theta, position, velocity, angle):
             angle[k, lane] = math.atan2(drive.sin_meas[lane], drive.cos_meas[lane])
 
 
-@njit(**OPTIONS)
+@cached()
 def run_adc(drive, i_d, i_q, raw, current):
     """Measure currents at the rotor's angle; raw (n, 2, 8) LSB, current (n, 3, 8) A."""
     derive(drive, 4e-5)

@@ -1,19 +1,17 @@
 """`drive-env serve` as a user meets it: what it prints, how it ends, what it says to mistakes; the TOML of a bus."""
 
 import errno
-import os
 import re
 import signal
 import socket
 import subprocess
 import sys
 import tomllib
-from contextlib import contextmanager
-from pathlib import Path
 
 import can
 import pytest
 import typer
+from rigs.served_drives import ROOT, command, environment, served
 from typer.testing import CliRunner
 
 from drive_env.bus.config import Bus, BusConfigError, Machine, build_world, load_bus
@@ -26,44 +24,13 @@ from drive_env.master.can.port import open_bus
 from drive_env.master.can_drives import CanDrives
 from drive_env.motors import MOTORS
 
-ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "bus.toml"
-# The command alone, so that a mistake in another command does not show here.
-APP = "import typer; from drive_env.commands.serve import serve; typer.run(serve)"
-
-
-def command(*arguments):
-    return [sys.executable, "-c", APP, *map(str, arguments)]
-
-
-def environment():
-    return os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"}
 
 
 def run_serve(*arguments, cwd):
     return subprocess.run(
         command(*arguments), cwd=cwd, env=environment(), capture_output=True, text=True, timeout=120, check=False
     )
-
-
-@contextmanager
-def served(*arguments, cwd):
-    """A server in a process of its own; yields the process and the channel that it printed."""
-    process = subprocess.Popen(
-        command("--port", "0", *arguments), cwd=cwd, env=environment(),
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        for line in process.stdout:
-            if match := re.search(r'channel="(socket://127\.0\.0\.1:\d+)"', line):
-                break
-        else:
-            pytest.fail(process.stderr.read())
-        yield process, match[1]
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
 
 
 # --- serving --------------------------------------------------------------------------------------------------------

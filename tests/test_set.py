@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
 
 from drive_env.commands.cli import app
@@ -204,7 +204,7 @@ def test_so_is_that_of_an_axis_that_does_not_tell_any_more(drive, monkeypatch):
 
 def test_a_second_master_enables_between_look_and_write(monkeypatch):
     """The whole emulated bus in lockstep: its enabling words arrive right before the write."""
-    from fault_injection import ANSWER, ObservedWorld, WorldBus
+    from rigs.fault_injection import ANSWER, ObservedWorld, WorldBus
 
     from drive_env import EmulatedDrives
     from drive_env.canopen.frames import Frame

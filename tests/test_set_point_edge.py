@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_drive_quirks import build
+from rigs.quirks import build
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.dictionary.roles import Role

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from several_axes import AXES, build, six_axes
-from test_parity import WorldBus
+from rigs.canopen_wire import Wire
+from rigs.several_axes import AXES, build, six_axes
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World

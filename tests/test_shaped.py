@@ -10,11 +10,10 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 
 from drive_env.firmware.common import fields, shaped
 from drive_env.firmware.record import RecordLayout
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 DT = 0.001
 LAYOUT = RecordLayout(fields.PARAMETERS, fields.STATE)
@@ -27,7 +26,7 @@ FAST_SLOW = (lambda y: np.cos(0.5 * np.pi * y),) * 2
 TYPES = {-3: SINE, -2: FAST_FAST, -1: FAST_SLOW, 1: SINE_SQUARE}
 
 
-@njit(**OPTIONS)
+@cached()
 def run(drive, target, speed, up, down, dt, rows):
     """Advance axis 0 period by period: rows (periods, 3) of position, velocity and acceleration demand."""
     for k in range(rows.shape[0]):

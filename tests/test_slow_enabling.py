@@ -6,8 +6,17 @@ import random
 
 import numpy as np
 import pytest
-from fault_injection import eds_read_once, no_longer_than, problems, run_lockstep, sample, worst_of
-from test_tmcm6212_faults import AXES, KINDS, LIMITS, TRAVEL, TURN, run_with
+from rigs.fault_injection import (
+    KINDS,
+    eds_read_once,
+    no_longer_than,
+    problems,
+    run_lockstep,
+    run_with,
+    sample,
+    worst_of,
+)
+from rigs.six_axes import AXES, LIMITS, TRAVEL, TURN
 
 from drive_env import EmulatedDrives, cia402, motion
 

@@ -12,8 +12,9 @@ from types import SimpleNamespace
 import can
 import numpy as np
 import pytest
-from fault_injection import ON, ObservedWorld, WorldBus
-from typer.testing import CliRunner
+from rigs.commands import drive_tune
+from rigs.fault_injection import ON, ObservedWorld, WorldBus
+from rigs.known_machines import gains
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.bus.can_port import CanPort
@@ -25,7 +26,6 @@ from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.sdo import SdoClient
 from drive_env.safety.envelope import SafetyError
 from tuning import snapshot as module
-from tuning.commands.cli import app
 from tuning.snapshot import (
     Snapshot,
     SnapshotError,
@@ -50,10 +50,6 @@ TRIED = np.array([[1000, 900, 800, 700, 600]])
 def target():
     with emulated(load="inertia", num_machines=3) as made:
         yield made
-
-
-def gains(drives):
-    return np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=1)
 
 
 def change(drives):
@@ -233,10 +229,6 @@ def opened(channel):
     return on_bus(
         interface="virtual", channel=channel, nodes=(1, 2), travel=FREE, supply=24.0, pace="lockstep", timeout=20.0
     )
-
-
-def drive_tune(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_one_command_brings_back_what_a_program_left_behind_that_was_killed(tmp_path, monkeypatch):

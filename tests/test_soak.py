@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from soak_cycle import BRIDGE, CHOPPER, COPPER, IDLE, LEAP, OFF_CURRENT, SHAFT, SOURCE, SPEED, run_cycle
-from thinning import part
+from rigs.soak_cycle import BRIDGE, CHOPPER, COPPER, IDLE, LEAP, OFF_CURRENT, SHAFT, SOURCE, SPEED, run_cycle
+from rigs.thinning import part
 
 from drive_env import EmulatedDrives, motion
 from drive_env.bus.bus_faults import MOST_BABBLE, BusFaults

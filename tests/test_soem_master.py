@@ -8,6 +8,7 @@ import threading
 from types import SimpleNamespace
 
 import pytest
+from rigs.clock import Clock
 
 from drive_env.ethercat.coe import CoeService, message, split
 from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
@@ -21,20 +22,6 @@ STATUS = 0x0130
 RECEIVE, ROOM, SEND, LENGTH = 0x1000, 48, 0x1080, 64  # mailboxes: what the master writes, what it reads
 SEND_STATUS, SEND_ACTIVATION, HAS_MAIL = 0x080D, 0x080E, 0x0B
 PROBE = "40 00 10 00 00 00 00 00"  # a read of 1000h
-
-
-class Clock:
-    """Time that passes by sleeping alone."""
-
-    def __init__(self):
-        self.now, self.slept = 1000.0, []
-
-    def monotonic(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.slept.append(seconds)
-        self.now += seconds
 
 
 class SdoError(Exception):

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.world_bus import served
 from scipy import stats
-from test_parity import served
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from ethercat_segment import EmulatedSegment
-from test_parity import WorldBus
+from rigs.ethercat_segment import EmulatedSegment
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion
 from drive_env.bus.world import World

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from stepper_rig import SMOOTH, build, hold, lane
+from rigs.stepper_rig import SMOOTH, build, hold, lane
 
 from drive_env import motion
 from drive_env.motors import MOTORS

@@ -7,9 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
+from rigs.stepper_rig import MICROSTEPS, SMOOTH, build, hold, lane
 from scipy.integrate import solve_ivp
-from stepper_rig import MICROSTEPS, SMOOTH, build, hold, lane
 
 from drive_env import motion
 from drive_env.firmware.common.dc_link import derive_link
@@ -17,7 +16,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.stepper.stages import FIRMWARE
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
 from drive_env.motors import MOTORS
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 MOTOR = MOTORS["qsh4218_51"]
 R, L, PSI, N_P, SUPPLY = MOTOR.R_s, MOTOR.L_q, MOTOR.psi_m, 50, 24.0
@@ -31,7 +30,7 @@ BLANK = (16, 24, 36, 54)
 
 
 # --- the winding, exact -------------------------------------------------------------------------------------------
-@njit(**OPTIONS)
+@cached()
 def run_stage(drive, dt, window, ticks, trace):
     """Hold the PWM's voltage for some ticks; trace: i_a, i_b after, torque and power of each tick."""
     derive_link(drive, dt)

@@ -8,8 +8,8 @@ import shutil
 
 import numpy as np
 import pytest
-from stepper_rig import BARE, lane
-from test_parity import WorldBus
+from rigs.stepper_rig import BARE, lane
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, cia402

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from stepper_rig import FREE, MICROSTEPS, build, lane
+from rigs.stepper_rig import FREE, MICROSTEPS, build, lane
 
 from drive_env import motion
 from drive_env.motors import MOTORS

@@ -7,8 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
-from stepper_rig import FREE, MICROSTEPS, build, lane
+from rigs.stepper_rig import FREE, MICROSTEPS, build, lane
 
 from drive_env import motion
 from drive_env.emulator.group import rates_of
@@ -16,7 +15,7 @@ from drive_env.firmware.cycle import mechanics_window
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.stages import FIRMWARE
 from drive_env.motors import MOTORS
-from mechanics.compiled import OPTIONS
+from mechanics.compiled import cached
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 BRIDGE, COPPER, SHAFT = range(3)
@@ -25,7 +24,7 @@ KINDS = ("motoring", "braking", "speeding up", "slowing down")
 PPS = MICROSTEPS / (2.0 * math.pi)
 
 
-@njit(**OPTIONS)
+@cached()
 def run_axes(records, plant, rates, scratch, num_axes, cycles, sums):
     """Run whole communication cycles; sums (3, axes) [J]: bridge, copper, shaft."""
     dt = rates.tick

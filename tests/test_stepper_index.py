@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 import pytest
-from stepper_rig import SMOOTH, build, lane
+from rigs.stepper_rig import SMOOTH, build, lane
 
 from drive_env import motion
 from drive_env.firmware.record import set_lanes

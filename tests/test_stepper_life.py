@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from stepper_rig import BARE, MICROSTEPS, lane
+from rigs.stepper_rig import BARE, MICROSTEPS, lane
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.inertia_check import MisfitWarning

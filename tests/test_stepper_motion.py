@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 import pytest
-from stepper_rig import FREE, MICROSTEPS, SMOOTH, build, hold, holding_torque, lane
+from rigs.stepper_rig import FREE, MICROSTEPS, SMOOTH, build, hold, holding_torque, lane
 
 from drive_env import motion
 from drive_env.emulator.loop_trace import trace_loops

@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 import pytest
-import stepper_rig
+from rigs import stepper_rig
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives

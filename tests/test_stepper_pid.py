@@ -13,8 +13,8 @@ import math
 
 import numpy as np
 import pytest
-from closed_loop_rig import PID_RECIPE, build, close_loop
-from stepper_rig import MICROSTEPS, SMOOTH, holding_torque, lane
+from rigs.closed_loop_rig import PID_RECIPE, build, close_loop
+from rigs.stepper_rig import MICROSTEPS, SMOOTH, holding_torque, lane
 
 from drive_env.motors import MOTORS
 

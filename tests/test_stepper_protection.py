@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from stepper_rig import BARE, SMOOTH, build, hold, lane
+from rigs.stepper_rig import BARE, SMOOTH, build, hold, lane
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.loop_trace import SIGNALS, trace_loops

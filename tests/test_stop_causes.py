@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_link_energy import proving
+from rigs.known_machines import proving
 
 from drive_env import motion
 from drive_env.drives.emergency import EmergencyMessage

@@ -6,8 +6,8 @@ import json
 import time
 
 import pytest
+from rigs.studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
 from selenium.webdriver.common.keys import Keys
-from studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
 
 pytestmark = needs_chromium
 PAGES = ("/axes", "/scope", "/dictionary")
@@ -54,7 +54,7 @@ def test_a_page_opens_without_an_error_and_from_this_computer_alone(tab, path):
     assert tab.one(".studio-stop").is_displayed()
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):

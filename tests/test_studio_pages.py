@@ -14,8 +14,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from fault_injection import served
-from studio_rig import Tab, chromium, needs_chromium, studio, until
+from rigs.fault_injection import served
+from rigs.studio_rig import Tab, chromium, needs_chromium, studio, until
 
 from drive_env import EmulatedDrives
 from drive_env.devices import device_names
@@ -144,6 +144,7 @@ def framing(inside):
         server.shutdown()
 
 
+@pytest.mark.every(3)
 @needs_chromium
 @pytest.mark.parametrize("path", ["/axes", "/nothing", "/studio/assets/studio.js"])
 def test_a_page_of_another_port_shows_nothing_of_the_studio_in_a_frame(made, path):

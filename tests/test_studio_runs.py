@@ -11,6 +11,7 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from rigs.trainings import write_events
 
 from drive_env.studio import runs_folder, runs_page
 from drive_env.studio.runs_compare import compare, figures_of
@@ -152,21 +153,6 @@ def test_two_runs_are_compared(runs):
 
 
 # --- learning curves ----------------------------------------------------------------------------------------------
-def write_events(folder, count):
-    """Let TensorBoard's own writer write a training's curves."""
-    pytest.importorskip("tensorboard", reason="the extra `agents` is not installed")
-    from tensorboard.compat.proto.event_pb2 import Event
-    from tensorboard.compat.proto.summary_pb2 import Summary
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
-
-    writer = EventFileWriter(str(folder))
-    for k in range(count):
-        values = [
-            Summary.Value(tag=tag, simple_value=k * f) for tag, f in (("rollout/ep_rew_mean", 2.0), ("loss", -1.0))
-        ]
-        writer.add_event(Event(step=100 * k, summary=Summary(value=values)))
-    writer.close()
-    return next(folder.glob("events.out.tfevents.*"))
 
 
 def test_curves_are_read_also_while_they_are_written(runs):

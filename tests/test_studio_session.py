@@ -346,6 +346,7 @@ def truly(session):
     return abs(float(session.glimpse(lambda machine: machine.rotor_speed[0], 10.0)))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("way", ["closed", "silent"])
 @pytest.mark.parametrize(("made", "load"), JOBS)
 def test_a_job_that_moves_ends_with_its_page_though_another_one_is_there(made, load, way):

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_injection import served
-from studio_rig import StudioProcess, Tab, chromium, needs_chromium, until
+from rigs.fault_injection import served
+from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, until
 
 from drive_env import EmulatedDrives
 
@@ -24,7 +24,7 @@ RPM = 2.0 * np.pi / 60.0
 SPEED = 300.0 * RPM  # of the jog [rad/s]
 STOPS = 2.0  # s that a stop may take here: half a second of silence, the ramp, and a busy computer
 AT_ONCE = 0.1  # s from the press of quick stop to rest, of which the ramp takes 25 ms
-BUSY = 8.0  # s that a page computes here
+BUSY = 5.0  # s that a page computes here
 PROGRAM = (str(Path(__file__).with_name("busy_studio.py")),)
 
 
@@ -87,6 +87,7 @@ def test_a_button_that_is_released_ends_the_jog(driver, bench):
     assert world.truth.is_on().all()  # it stays enabled
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("way", ["button", "space"])
 def test_quick_stop(driver, bench, way):
     world, _ = bench
@@ -146,6 +147,7 @@ def test_quick_stop_does_not_wait_for_a_page_that_computes(driver, bench, way):
     raise AssertionError(f"the stops took {took} s")
 
 
+@pytest.mark.slow
 def test_a_release_does_not_wait_for_a_page_that_computes(driver, bench):
     world, made = bench
     tab = turning(driver, bench)
@@ -171,7 +173,7 @@ def test_a_jog_ends_with_its_browser_though_a_page_computes(driver, bench):
     driver.get("about:blank")
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_studio_ends_though_a_page_computes(driver, bench, number):
     world, made = bench
@@ -208,6 +210,7 @@ def test_a_move_ends_with_its_page_though_another_one_is_there(driver, bench):
         assert abs(turns) < 5.0 * STOPS
 
 
+@pytest.mark.slow
 def test_a_step_that_is_played_ends_with_its_page_though_another_one_is_there(driver, bench):
     """Its set-points go out in one call, which takes ten seconds."""
     world, made = bench
@@ -266,6 +269,7 @@ def test_the_browser_sleeps(driver, bench):
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_the_studio_is_killed(driver, bench):
     """Nobody is left to command anything: the drive's own watchdog stops it."""
     world, made = bench

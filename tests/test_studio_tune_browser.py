@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_injection import served as on_a_bus
+from rigs.fault_injection import served as on_a_bus
+from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, studio, until
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, studio, until
 
 from drive_env import EmulatedDrives
 from drive_env.drives.raw_gains import read_gains
@@ -104,7 +104,7 @@ def test_a_page_opens_without_an_error_and_from_this_computer_alone(tab, path):
     assert foreign == []
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):
@@ -190,6 +190,7 @@ def test_a_step_is_recorded_on_the_bus_within_its_travel(driver, bench, emulated
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_quick_stop_in_the_middle_of_auto_on_the_bus(driver, bench, emulated):
     world, made = bench
     before = parameters(emulated)
@@ -325,7 +326,7 @@ def test_a_report_runs_no_script_and_two_runs_are_compared(tab, folder):
 
 
 def test_learning_curves_of_a_training(tab, folder):
-    from test_studio_runs import write_events
+    from rigs.trainings import write_events
 
     run = folder / "runs" / "training"
     run.mkdir(parents=True, exist_ok=True)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.known_machines import open_machines
 
 from drive_env import motion
 from drive_env.emulator.inertia_check import MisfitWarning
@@ -49,13 +50,6 @@ def small(tmp_path):
         return path
 
     return write
-
-
-def open_machines(machines, num_threads=None):
-    """Yield machines ready to be tuned, those of one load and motor as one target, and their indices."""
-    for indices in groups(machines):
-        with open_group([machines[k] for k in indices], num_threads) as target:
-            yield target, indices
 
 
 # --- the public part ----------------------------------------------------------------------------------------------

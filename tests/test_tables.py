@@ -126,7 +126,7 @@ def channel():
 
 
 @pytest.mark.parametrize(("command", "code"), [
-    (("scan", "--last", "2", "--timeout", "20"), 0),
+    (("scan", "--last", "2", "--timeout", "3"), 0),
     (("monitor", "-n", "1", "-n", "2", "--duration", "0.01"), 0),
     (("commission", "ec_45_flat", "--dry-run"), 0),
     (("diff", "some_parameters_of_a_drive_whose_name_is_long.toml"), 1),

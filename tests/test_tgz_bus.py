@@ -2,7 +2,7 @@
 
 With another D-Mode the drive takes nothing from its master (TGZ manual, section on 6060h). What an axis does then that
 was enabled, the manual does not say: ours stops by itself, and another one may run on, which `ignores` has it do. The
-verdict on every stop is the emulator's inside alone (tests/fault_injection.py).
+verdict on every stop is the emulator's inside alone (tests/rigs/fault_injection.py).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from contextlib import contextmanager, suppress
 import canopen
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from fault_injection import (
+from rigs.canopen_wire import Wire
+from rigs.fault_injection import (
     ANSWER,
     DEAD_MASTER,
     EXPECTED,
@@ -41,7 +41,7 @@ from fault_injection import (
     until,
     worst_of,
 )
-from test_parity import assert_equal
+from rigs.world_bus import assert_equal
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame
@@ -411,6 +411,7 @@ def test_heartbeats_that_stay_away_stop_an_axis_that_takes_no_commands(inside, g
         assert (inside.read(0x6041) & 0x4F == 0x08).all()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("gate", ["stops", "ignores"])
 def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
     """The master may stop before, if the computer is too busy for it to see the drives."""

@@ -7,13 +7,12 @@ nothing is, to the bit. What the objects do in figures, test_servo_mains.py and 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
+from rigs.canopen_wire import Wire
+from rigs.stepper_scenes import Scene, label
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
@@ -25,14 +24,6 @@ TURN = 65536
 RPM = 1000  # velocity units, as a drive is commissioned
 SEEN = (0x6041, 0x6061, 0x6062, 0x6064, 0x606B, 0x606C, 0x6077, 0x60F4)
 TRUE = ("theta_m", "omega_m", "i_q", "i_d", "i_q_ref", "stage_on", "u_q")
-
-
-class Scene(NamedTuple):
-    """What is done with drives, and what is seen; `rows` are objects that it needs."""
-
-    play: Any
-    load: Any = "inertia"
-    rows: Mapping[Any, int] = MappingProxyType({})
 
 
 def look(drives):
@@ -196,11 +187,6 @@ ELSEWHERE = {
 
 def keys():
     return {name if isinstance(name, tuple) else (name, 0) for name in ROWS}
-
-
-def label(name):
-    index, sub = name if isinstance(name, tuple) else (name, 0)
-    return f"{index:04X}-{sub}"
 
 
 def vary(name, scene, one, other, axis=0):

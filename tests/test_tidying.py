@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
 from drive_env.dictionary.aborts import ObjectAccessError

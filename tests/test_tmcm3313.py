@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from test_parity import WorldBus
+from rigs.canopen_wire import Wire
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World

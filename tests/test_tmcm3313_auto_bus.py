@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fault_injection import ObservedWorld, eds_read_once
-from test_parity import WorldBus
+from rigs.fault_injection import ObservedWorld, eds_read_once
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, Limits, cia402
 from drive_env.devices import find_device

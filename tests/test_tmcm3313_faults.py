@@ -10,7 +10,7 @@ import random
 
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     KINDS,
     RADIANS,
     eds_read_once,
@@ -131,7 +131,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert (closed == (1 if name in ("closed_loop", "closed_loop_paths", "torque") else 0)).all()
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(5)
 @pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from closed_loop_rig import PID_RECIPE
-from test_parity import WorldBus
+from rigs.canopen_wire import Wire
+from rigs.closed_loop_rig import MOTOR, NAME, PID_RECIPE, target_of
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion
 from drive_env.bus.world import World
@@ -14,16 +14,12 @@ from drive_env.cia402 import State, state_of
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import read_gains
-from drive_env.motors import MOTORS
 from drive_env.phase_current import holding_torque, run_and_standby
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import leave_oscillations_to_trials
 from tuning.snapshot import load_snapshot, restore
 from tuning.stepper.commissioning import commission
-from tuning.target import Target
 
-NAME = "qsh4218_51"
-MOTOR = MOTORS[NAME]
 TURN = 51_200  # microsteps
 AXES = 3
 OPEN, CLOSED = 0, 1
@@ -130,12 +126,6 @@ def test_stopped_takes_enabled_axes_to_fault_in_a_loop_or_not():
 
 
 # --- tuning over a bus ------------------------------------------------------------------------------------------------
-def target_of(drives):
-    count, device = drives.num_axes, drives.device
-    low, high = np.full(count, -60.0), np.full(count, 60.0)
-    return Target(
-        drives, device, MOTOR, np.full(count, MOTOR.voltage), low, high, MOTOR.rated_speed, MOTOR.rated_current
-    )
 
 
 def over_a_bus(act):

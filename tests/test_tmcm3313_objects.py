@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from stepper_scenes import (
+from rigs.canopen_wire import Wire
+from rigs.stepper_scenes import (
     COMMON,
     ENCODER,
     TURN,

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from test_parity import WorldBus
+from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World

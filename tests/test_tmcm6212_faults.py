@@ -10,9 +10,8 @@ import random
 
 import numpy as np
 import pytest
-from fault_injection import (
+from rigs.fault_injection import (
     KINDS,
-    RADIANS,
     eds_read_once,
     no_longer_than,
     problems,
@@ -22,13 +21,9 @@ from fault_injection import (
     stop_by_ramp,
     worst_of,
 )
+from rigs.six_axes import AXES, LIMITS, TRAVEL, TURN
 
-from drive_env import EmulatedDrives, Limits, cia402, motion
-
-AXES = 6
-TURN = 200 * 256  # microsteps
-LIMITS = Limits(position=(-3 * TURN, 3 * TURN), velocity=6 * TURN)
-TRAVEL = tuple(3 * sign * 2.0 * np.pi / RADIANS for sign in (-1, 1))  # as `problems` counts
+from drive_env import EmulatedDrives, cia402, motion
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from stepper_scenes import BELT, COMMON, TURN, Scene, belt, label, stand, there_and_back, turn, vary
+from rigs.canopen_wire import Wire
+from rigs.stepper_scenes import BELT, COMMON, TURN, Scene, belt, label, stand, there_and_back, turn, vary
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device

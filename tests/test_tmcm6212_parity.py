@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_parity import WorldBus, assert_equal
+from rigs.world_bus import WorldBus, assert_equal
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
@@ -144,6 +144,7 @@ LOADS = {pp: "robot", six_point: "inertia", pv: "robot", csp: "robot", csv: "rob
 SCRIPTS = {script.__name__: script for script in LOADS}
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("name", "safety"),
     [

@@ -8,8 +8,8 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from rigs.world_bus import WorldBus
 from scipy.linalg import solve_continuous_are
-from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World

@@ -103,6 +103,7 @@ def test_it_would_be_found(conversation, tmp_path):
     assert len(found) == 1
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("service", "least"),
     [

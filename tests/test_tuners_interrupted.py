@@ -16,8 +16,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from test_every_change_leaves_a_file import PATIENCE, files
-from test_serve import environment
+from rigs.served_drives import PATIENCE, environment, files
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, cia402

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_injection import ON, TURN, ObservedWorld, served, until
-from test_serve import environment
+from rigs.fault_injection import ON, TURN, ObservedWorld, served, until
+from rigs.served_drives import environment
 
 from drive_env import EmulatedDrives, SafetyError
 from drive_env.bus.hub import Hub

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_ethercat_drive import first_line
+from rigs.namespaces import first_line
 
 from drive_env.bus.config import Bus, BusConfigError, Machine, build_world, load_bus
 from drive_env.ethercat.application import AlState

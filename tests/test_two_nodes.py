@@ -5,7 +5,7 @@ import uuid
 
 import can
 import pytest
-from test_parity import WorldBus
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives

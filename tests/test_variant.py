@@ -10,8 +10,8 @@ import canopen
 import gymnasium
 import numpy as np
 import pytest
-from canopen_wire import Wire
-from test_parity import WorldBus
+from rigs.canopen_wire import Wire
+from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, motion

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from held_objects import HeldObjects
+from rigs.held_objects import HeldObjects
 
 from drive_env import Limits, cia402
 from drive_env.dictionary.roles import Role

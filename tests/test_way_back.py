@@ -14,17 +14,8 @@ from contextlib import contextmanager
 import can
 import numpy as np
 import pytest
-from auto_stages import skip_stages
-from test_every_change_leaves_a_file import (
-    GAIN_OBJECTS,
-    PATIENCE,
-    files,
-    node,
-    parameters,
-    status_is,
-    wait_until,
-)
-from test_serve import environment
+from rigs.auto_stages import skip_stages
+from rigs.served_drives import GAIN_OBJECTS, PATIENCE, environment, files, node, parameters, status_is, wait_until
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as drive_agent
@@ -229,7 +220,7 @@ def test_what_a_process_says_at_its_end_is_so(tmp_path, command, how):
 # --- images of EtherCAT -------------------------------------------------------------------------------------------
 def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
     """A mapping is changed while no sync manager carries it: `undo` was refused 1A00h:01 with 0601 0000h."""
-    from test_ethercat_tuning import served
+    from rigs.ethercat_served import served
 
     from drive_env.master.ethercat_drives import EtherCatDrives
     from drive_env.master.parameters import read_parameters
@@ -254,8 +245,8 @@ def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
 # --- axes that are left out ---------------------------------------------------------------------------------------
 def test_what_is_borrowed_of_axes_left_out_is_in_the_file_and_comes_back(tmp_path):
     """PDOs are mapped for a whole TMCM-6212: 50 objects of axes 1 to 5 stayed changed after `--axis 0` was killed."""
-    from test_chosen_axes import partly_wired
-    from test_parity import WorldBus
+    from rigs.several_axes import partly_wired
+    from rigs.world_bus import WorldBus
 
     from drive_env import CanDrives
     from drive_env.bus.world import World

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 import pytest
-from test_parity import served
-from thinning import part
+from rigs.thinning import part
+from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device

@@ -25,8 +25,8 @@ from functools import cache
 
 import numpy as np
 from adversary import end_with_parent, quiet
-from fault_injection import EXPECTED, eds_read_once
-from in_memory_link import MemoryBus, MemoryDrives
+from rigs.fault_injection import EXPECTED, eds_read_once
+from rigs.in_memory_link import MemoryBus, MemoryDrives
 
 from drive_env import EmulatedDrives, Limits, SafetyError, motion
 from drive_env.devices import find_device

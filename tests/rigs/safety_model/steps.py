@@ -6,12 +6,12 @@ that a trouble has held back (`Situation.held`).
 
 from __future__ import annotations
 
-from drive_env.safety.model.drive import tick
-from drive_env.safety.model.others import late_frame_steps, other_steps, signal_steps
-from drive_env.safety.model.program import program_steps
-from drive_env.safety.model.rules import Assumptions, Rules
-from drive_env.safety.model.situation import DRIVE, At, Hand, Situation, Step, Steps, beating, moved
-from drive_env.safety.model.supervisor import supervisor_steps
+from rigs.safety_model.drive import tick
+from rigs.safety_model.others import late_frame_steps, other_steps, signal_steps
+from rigs.safety_model.program import program_steps
+from rigs.safety_model.rules import Assumptions, Rules
+from rigs.safety_model.situation import DRIVE, At, Hand, Situation, Step, Steps, beating, moved
+from rigs.safety_model.supervisor import supervisor_steps
 
 
 def steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:

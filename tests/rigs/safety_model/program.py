@@ -5,9 +5,9 @@ from __future__ import annotations
 from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.firmware.common.fsa import ENABLE_OPERATION
-from drive_env.safety.model.drive import NOBODY, hear, latch, sync, take_nmt, write_controlword
-from drive_env.safety.model.frames import deliver, transfers
-from drive_env.safety.model.rules import (
+from rigs.safety_model.drive import NOBODY, hear, latch, sync, take_nmt, write_controlword
+from rigs.safety_model.frames import deliver, transfers
+from rigs.safety_model.rules import (
     DISABLE_VOLTAGE,
     ENABLE,
     ENABLE_AND_RESET,
@@ -18,7 +18,7 @@ from drive_env.safety.model.rules import (
     Assumptions,
     Rules,
 )
-from drive_env.safety.model.situation import (
+from rigs.safety_model.situation import (
     IN_A_STOP,
     LIBRARY,
     At,

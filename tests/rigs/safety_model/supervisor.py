@@ -5,9 +5,9 @@ from __future__ import annotations
 from drive_env import cia402
 from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State as Fsa
-from drive_env.safety.model.frames import named, transfers
-from drive_env.safety.model.rules import DISABLE_VOLTAGE, QUICK_STOP, Assumptions, Rules
-from drive_env.safety.model.situation import (
+from rigs.safety_model.frames import named, transfers
+from rigs.safety_model.rules import DISABLE_VOLTAGE, QUICK_STOP, Assumptions, Rules
+from rigs.safety_model.situation import (
     GONE,
     IN_A_STOP,
     LIBRARY,

@@ -11,12 +11,13 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import stepper_rig
-from stepper_rig import SMOOTH
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware.record import set_lanes
 from drive_env.motors import MOTORS
+from rigs import stepper_rig
+from rigs.stepper_rig import SMOOTH
+from tuning.target import Target
 
 U8, U16, U32, I16, I32 = 0x05, 0x06, 0x07, 0x03, 0x04
 # Index, sub-index, name, type, access, factory value, field, unit.
@@ -130,3 +131,15 @@ def close_loop(drives, mode=1, *, operation="pp"):
         if np.all(drives.read(0x2120)[np.broadcast_to(mode, drives.num_axes) == 1] == 1):
             return
     raise AssertionError("the loop did not close")
+
+
+NAME = "qsh4218_51"
+MOTOR = MOTORS[NAME]
+
+
+def target_of(drives):
+    count, device = drives.num_axes, drives.device
+    low, high = np.full(count, -60.0), np.full(count, 60.0)
+    return Target(
+        drives, device, MOTOR, np.full(count, MOTOR.voltage), low, high, MOTOR.rated_speed, MOTOR.rated_current
+    )

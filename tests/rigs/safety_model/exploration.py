@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State as Fsa
-from drive_env.safety.model.drive import NOBODY, tick
-from drive_env.safety.model.rules import Assumptions, Rules
-from drive_env.safety.model.situation import (
+from rigs.safety_model.drive import NOBODY, tick
+from rigs.safety_model.rules import Assumptions, Rules
+from rigs.safety_model.situation import (
     DRIVE,
     GONE,
     LIBRARY,
@@ -22,7 +22,7 @@ from drive_env.safety.model.situation import (
     beating,
     beginnings,
 )
-from drive_env.safety.model.steps import attended, left_alone, steps
+from rigs.safety_model.steps import attended, left_alone, steps
 
 RUNS_ON = "runs on: nothing monitors it, and no watchdog ends it"
 GIVEN_UP = "the watchdog is given up while the axis is live"

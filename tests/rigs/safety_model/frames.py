@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from drive_env import cia402
 from drive_env.cia402 import State
-from drive_env.safety.model.drive import latch, write_consumer, write_controlword
-from drive_env.safety.model.rules import Assumptions
-from drive_env.safety.model.situation import ACKNOWLEDGED, GONE, LIBRARY, Hand, Held, Situation, has_sdo, moved
+from rigs.safety_model.drive import latch, write_consumer, write_controlword
+from rigs.safety_model.rules import Assumptions
+from rigs.safety_model.situation import ACKNOWLEDGED, GONE, LIBRARY, Hand, Held, Situation, has_sdo, moved
 
 
 def deliver(s: Situation, frame: Held) -> Situation:

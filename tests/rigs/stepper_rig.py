@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import MOTORS
+from rigs import TESTS
 
-BARE = str(Path(__file__).parent / "bare_stepper")
+BARE = str(TESTS / "bare_stepper")
 MICROSTEPS = 51200  # a turn, by the scale of the bare drive
 FREE = {"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0, "load.inertia": 1e-12}
 SMOOTH = FREE | {"motor.detent_torque": 0.0, "motor.coulomb": 0.0, "motor.viscous": 0.0}

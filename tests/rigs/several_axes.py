@@ -12,6 +12,9 @@ from __future__ import annotations
 import configparser
 import shutil
 
+import numpy as np
+
+from drive_env import EmulatedDrives
 from drive_env.devices import FOLDER, find_device
 
 AXES = 6
@@ -130,3 +133,13 @@ def build(folder):
 def six_axes(folder):
     """Return the module, written into a folder, as a device."""
     return find_device(str(build(folder)))
+
+
+AXES, WIRED = 6, (1, 3)
+
+
+def partly_wired(**options):
+    """Return the six axes of a TMCM-6212 of which two have a motor."""
+    no_motor = np.array([float(axis not in WIRED) for axis in range(AXES)])
+    parameters = {"motor.open_a": no_motor, "motor.open_b": no_motor}
+    return EmulatedDrives("tmcm6212", "inertia", num_machines=AXES, num_threads=1, parameters=parameters, **options)

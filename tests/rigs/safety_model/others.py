@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from drive_env.canopen.nmt import Command
-from drive_env.safety.model.drive import NOBODY, sync, take_nmt, tick, trip, write_controlword
-from drive_env.safety.model.frames import deliver
-from drive_env.safety.model.rules import ENABLE, SHUTDOWN, Assumptions, Rules
-from drive_env.safety.model.situation import (
+from rigs.safety_model.drive import NOBODY, sync, take_nmt, tick, trip, write_controlword
+from rigs.safety_model.frames import deliver
+from rigs.safety_model.rules import ENABLE, SHUTDOWN, Assumptions, Rules
+from rigs.safety_model.situation import (
     GONE,
     IN_A_STOP,
     At,

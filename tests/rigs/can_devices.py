@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from canopen_wire import Wire
 
 import drive_env
+from rigs.canopen_wire import Wire
 
 NODE = 5
 OFF, NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID

@@ -5,6 +5,7 @@ from __future__ import annotations
 from drive_env.dictionary.drive_eds import read_types
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from drive_env.fieldbus.description import CIA_402, Description
+from rigs import TESTS
 
 I8, I16, I32, U8, U16, U32, TEXT, I64 = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09, 0x15
 
@@ -37,3 +38,48 @@ def _variable(kind, access, pdo):
 def described(eds, num_axes, hints=CIA_402):
     """Return what a master knows of a drive with this EDS, whose answers take 0.5 s at most."""
     return Description("small", ObjectDictionary(eds), num_axes, None, hints, timeout=0.5, _types=read_types(eds))
+
+
+FOLDER = TESTS / "data" / "eds"
+
+
+def entry(index="6081", name="Profile velocity", kind="0x7", data_type="0x0007", access="rw", **more):
+    """Return the section of an object."""
+    rows = {"ParameterName": name, "ObjectType": kind, "DataType": data_type, "AccessType": access} | more
+    return f"[{index}]\n" + "".join(f"{key}={value}\n" for key, value in rows.items() if value is not None) + "\n"
+
+
+EDS = """
+[FileInfo]
+FileName=some.eds
+[DeviceInfo]
+VendorName=somebody
+[MandatoryObjects]
+SupportedObjects=1
+1=0x1000
+[OptionalObjects]
+SupportedObjects={count}
+{numbers}
+[1000]
+ParameterName=Device type
+ObjectType=0x7
+DataType=0x0007
+AccessType=ro
+{objects}
+"""
+TYPES = {"u8": "0x0005", "u16": "0x0006", "u32": "0x0007", "i8": "0x0002", "i16": "0x0003", "i32": "0x0004",
+         "f32": "0x0008", "text": "0x0009", "u24": "0x0016", "bool": "0x0001", "i64": "0x0015",
+         "octets": "0x000A"}  # fmt: skip
+
+
+def eds_of(folder, *rows):
+    """An EDS with objects: index, type, access."""
+    numbers = "\n".join(f"{k}=0x{index:04X}" for k, (index, *_) in enumerate(rows, 1))
+    objects = "\n".join(
+        f"[{index:04X}]\nParameterName=object {index:04X}\nObjectType=0x7\n"
+        f"DataType={TYPES[kind]}\nAccessType={access}\n"
+        for index, kind, access in rows
+    )
+    path = folder / "some.eds"
+    path.write_text(EDS.format(count=len(rows), numbers=numbers, objects=objects), encoding="utf-8")
+    return path

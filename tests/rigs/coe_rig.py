@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import struct
 
-from ethercat_rig import STATION, Rig
-
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.coe_node import CoeNode
 from drive_env.ethercat.datagrams import Datagram, DatagramCommand
 from drive_env.ethercat.slave import EtherCatSlave
 from drive_env.ethercat.world import EtherCatWorld
+from rigs.ethercat_rig import STATION, Rig
 
 COE = 3
 MAILBOXES = "00 10 00 01 26 00 01 00  00 11 00 01 22 00 01 00"  # 1000h and 1100h, 256 bytes each

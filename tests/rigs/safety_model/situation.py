@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 
 from drive_env.canopen.nmt import SERVICES, NmtState
 from drive_env.cia402 import State as Fsa
-from drive_env.safety.model.drive import NOBODY, Drive
-from drive_env.safety.model.rules import ENABLE, FIXED_ID, OWN_ID, Assumptions, Rules
+from rigs.safety_model.drive import NOBODY, Drive
+from rigs.safety_model.rules import ENABLE, FIXED_ID, OWN_ID, Assumptions, Rules
 
 
 class _Place(Enum):

@@ -1,0 +1,99 @@
+"""Emulated machines whose truth is known: their plants, and identifications that cost nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drive_env import EmulatedDrives
+from drive_env.devices import find_device
+from drive_env.gains import rule_gains, write_gains
+from drive_env.loops.true_plant import linear_load, true_machines, true_plant
+from mechanics.shaft import way
+from tuning.auto.identified import calm_gains
+from tuning.auto.proving import ProvingGround
+from tuning.compare.suite import (
+    groups,
+    open_group,
+)
+from tuning.identify.estimate import refused
+
+
+def truth(drives, axis, offset):
+    """Return the true values of an axis, in data sheet units of torque."""
+    plant = true_plant(drives, axis)
+    group = next(g for g in drives.inside.groups if g.machines.start <= axis < g.machines.stop)
+    load, copy = group.load, axis - group.machines.start
+    ratio = np.abs(load.plant.motion[: load.num_frictions] @ way(load).joints.T)[:, 0]
+    each = load.plant.friction[:, 0].T[copy] * ratio
+    dry = each.sum()
+    parameters = drives.machine.parameters
+    if "load.efficiency" in parameters:
+        # What a screw or a gear carries at constant speed: gravity, or the friction behind it.
+        carried = max(each[-1], abs(offset) * plant.torque_constant)
+        dry += (1.0 / parameters["load.efficiency"][axis] - 1.0) * carried
+    viscous = plant.viscous
+    if "load.efficiency" in parameters and abs(offset) * plant.torque_constant < 2.0 * each[-1]:
+        # What lies behind the transmission is dearer by its losses, unless it is gravity that is carried.
+        viscous += (1.0 / parameters["load.efficiency"][axis] - 1.0) * (viscous - parameters["motor.viscous"][axis])
+    K = plant.torque_constant
+    return {
+        "resistance": parameters["motor.R_s"][axis],
+        "inductance": parameters["motor.L_q"][axis],
+        "inertia": plant.inertia * drives.motor.torque_constant / K,
+        "coulomb": dry / K,
+        "viscous": viscous / K,
+        "resonance": plant.resonance,
+        "anti_resonance": plant.anti_resonance,
+    }
+
+
+def proving(target, held=(0.0, 0.0)):
+    """Return where gains are tried on a machine that is known, and the rule's gains."""
+    plant = true_plant(target.drives)
+    rule = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)
+    write_gains(target.drives, rule)
+    return ProvingGround(target, [plant], (target.low, target.high), calm_gains(target, plant)[None], rule, held), rule
+
+
+def machine_of(load, axes=1, **options):
+    """Return the linear machine, an axis's inertia [kg*m^2], and the emulated one's plant, None of several axes."""
+    with EmulatedDrives(load=load, num_threads=1, **options) as drives:
+        machines = true_machines(drives)
+        if axes == 1:
+            plant = true_plant(drives)
+            return machines, plant.inertia, plant
+        found = linear_load(drives.inside.groups[0].load)
+        # An axis moves as if the others' motors were loose: 1 / (rotors M^-1 rotors).
+        return machines, float(1.0 / (found.rotors @ np.linalg.solve(found.M[0], found.rotors.T))[0, 0]), None
+
+
+def open_machines(machines, num_threads=None):
+    """Yield machines ready to be tuned, those of one load and motor as one target, and their indices."""
+    for indices in groups(machines):
+        with open_group([machines[k] for k in indices], num_threads) as target:
+            yield target, indices
+
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
+
+
+def gains(drives):
+    return np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=1)
+
+
+def standing_in(target, where=None):
+    """Return the identification of drives whose truth is known: what the search needs, at no cost."""
+    from tuning.identify.estimate import Estimate, Identification
+
+    found = []
+    for axis in range(target.num_axes):
+        plant = true_plant(target.drives, axis)
+        values = {
+            "resistance": plant.R, "inductance": plant.L, "inertia": plant.inertia, "coulomb": 0.1, "viscous": 1e-4,
+            "offset": 0.0, "velocity_filter": plant.velocity_filter, "pole_pairs": 4.0, "encoder_direction": 1.0,
+            "loop_delay": plant.delay,
+        }  # fmt: skip
+        estimates = {name: Estimate(value, 0.97 * value, 1.03 * value, "") for name, value in values.items()}
+        blank = {name: refused("Hz", "rigid") for name in ("anti_resonance", "resonance")}
+        found.append(Identification(estimates | blank, 0.0))
+    return found
