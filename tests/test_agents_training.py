@@ -13,8 +13,9 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
-from agents import hyperparameter_search as search
 from rigs.trainings import TINY, tiny
+
+from agents import hyperparameter_search as search
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.open_policy import open_policy
 from agents.policies.agent_file import AgentFile

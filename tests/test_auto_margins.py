@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tuning.identify.estimate import Identification
 from rigs.auto_stages import basis, recorded
 
 from drive_env import cia402, motion
@@ -18,6 +17,7 @@ from drive_env.loops.margins import Margins, margins
 from drive_env.loops.true_plant import true_plant
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
+from tuning.identify.identified_axis import Identification
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated, timed

@@ -14,8 +14,8 @@ from rigs.served_drives import GAIN_OBJECTS, PATIENCE, environment, files, node,
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as drive_agent
-from drive_env.fieldbus.description import Description
 from drive_env import cia402
+from drive_env.fieldbus.description import Description
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import load_snapshot
 

@@ -8,11 +8,9 @@ from rigs.known_machines import proving, truth
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import rule_gains
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import write_gains
 from drive_env.firmware.record import get_lanes
-from drive_env.gains import write_gains
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto
 from tuning.identify.identification import identify

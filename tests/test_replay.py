@@ -20,8 +20,8 @@ from rigs.recorded_moves import (
     written,
 )
 
-from drive_env.randomisation.random_machines import Distributions, Law
 from drive_env import motion
+from drive_env.randomisation.random_machines import Distributions, Law
 from drive_env.trials import replay as module
 from drive_env.trials.replay import Log, _candidates, command_of, compare, fit, read_log, replay
 

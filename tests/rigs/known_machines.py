@@ -6,7 +6,8 @@ import numpy as np
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.gains import rule_gains, write_gains
+from drive_env.devices.gains import rule_gains
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.true_plant import linear_load, true_machines, true_plant
 from mechanics.shaft import way
 from tuning.auto.identified import calm_gains
@@ -15,7 +16,7 @@ from tuning.compare.suite import (
     groups,
     open_group,
 )
-from tuning.identify.estimate import refused
+from tuning.estimate import refused
 
 
 def truth(drives, axis, offset):
@@ -83,7 +84,8 @@ def gains(drives):
 
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
-    from tuning.identify.estimate import Estimate, Identification
+    from tuning.estimate import Estimate
+    from tuning.identify.identified_axis import Identification
 
     found = []
     for axis in range(target.num_axes):

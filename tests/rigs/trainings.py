@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from agents.tasks import environment_name
 from agents.training import hyperparameters
-from agents.training.tasks import environment_name
 from agents.training.training_run import TrainingRun
 
 TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
