@@ -69,10 +69,10 @@ SHORT_BLANK, SHORT_OFF = 1, 3  # 2092h, 2097h
 
 
 def preset(device: Device, motor: Motor, table: Mapping[str, Any]) -> dict[str, int]:
-    """Return what a `commissioning.toml` makes of a motor: object name -> raw value, in the order of writing.
+    """Return the values that a `commissioning.toml` asks for a motor: object name -> raw value, in the order of writing.
 
     Raises:
-        ValueError: If a gain leaves the drive's range: the motor is none for this drive; or for an unknown rule or
+        ValueError: If a gain leaves the drive's range: the motor does not suit this drive; or for an unknown rule or
             quantity.
     """
     if (rule := RULES.get(table["rule"])) is None:
@@ -169,7 +169,7 @@ def standard_preset(device: Device, motor: Motor) -> dict[str, int]:
     """Return object ("6081:0") -> raw value, in the order of writing.
 
     Raises:
-        ValueError: If a gain leaves the drive's range: the motor is none for this drive.
+        ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
     """
     from drive_env.devices.gains import bandwidth_gains
 
@@ -229,7 +229,7 @@ def _values(motor: Motor) -> dict[str, float]:
 
 
 def _scale(device: Device, dictionary: ObjectDictionary, motor: Motor) -> dict[str, int]:
-    """Return what the scale of positions is set to where the factory's values make none: counts of the encoder."""
+    """Return the scale of positions in counts of the encoder; {} if the factory's values are valid."""
     scale = position_scale(device.roles)
     if scale is None:
         return {}

@@ -53,12 +53,12 @@ def parse_key(text: str) -> Key:
 
 
 def device_data(folder: Path) -> dict[str, Any]:
-    """Return what a folder's `device.toml` says, over `defaults.toml` and what the family that it is `like` has.
+    """Return a folder's `device.toml` laid over its family's file (`like`) and `defaults.toml`.
 
     A variant's is returned as it is.
 
     Raises:
-        ValueError: If it cannot be read, or names a family that there is not.
+        ValueError: If it cannot be read, or names an unknown family.
     """
     own = read_toml(folder / "device.toml")
     if "variant_of" in own:

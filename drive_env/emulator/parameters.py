@@ -205,7 +205,7 @@ def velocity_filter(cutoff: Floats, rate: float) -> tuple[Floats, Floats, Floats
 
 
 def field(name: str, part: int = 0, live: str = "") -> Write:
-    """Return what writes a parameter that is a field of the record as it stands.
+    """Return a function that writes a parameter into a field of the record unchanged.
 
     Args:
         name: The field.

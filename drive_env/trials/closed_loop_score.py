@@ -69,7 +69,7 @@ class ClosedLoopScore(StepperScore):
         return drives.read(cia402.POSITION_ACTUAL) + self._move.distance, is_open
 
     def _load_step(self, objects: list[ObjectName]) -> Mapping[Any, Integers]:
-        """Push the axes away, and let them come back; return what was recorded meanwhile."""
+        """Record the axes while they are pushed away and come back."""
         drives, pushed = self._drives, []
         torque, lasts = self._pushes()
         for k in range(LONGEST_PUSH):

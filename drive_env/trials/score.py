@@ -435,7 +435,7 @@ class RobustScore(Saved):
     _cost: Callable[[Any], Floats] = staticmethod(cost)
 
     def _objects(self) -> list[ObjectName]:
-        """Return what is recorded: position and statusword, and between them the parts of the demanded current."""
+        """Return the objects to record: position and statusword, and between them the parts of the demanded current."""
         roles = self._drives.device.roles
         demanded = [name for name in _DEMANDED if not isinstance(name, Role) or name in roles]
         return [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
@@ -452,7 +452,7 @@ class RobustScore(Saved):
         return move.distance + place, np.zeros(self._drives.num_axes, bool)
 
     def _load_step(self, objects: list[ObjectName]) -> Mapping[Any, Integers]:
-        """Load the machines until the trial ends; return what was recorded meanwhile."""
+        """Load the machines until the trial ends, and record them."""
         self._drives.machine.load_torque = self._constant + self._load_torque
         trace = self._drives.record(objects, (TRIAL - SETTLED) * CYCLE)
         return {name: trace[name] for name in objects}
