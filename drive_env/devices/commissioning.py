@@ -69,7 +69,7 @@ SHORT_BLANK, SHORT_OFF = 1, 3  # 2092h, 2097h
 
 
 def preset(device: Device, motor: Motor, table: Mapping[str, Any]) -> dict[str, int]:
-    """Return the values that a `commissioning.toml` asks for a motor: object name -> raw value, in the order of writing.
+    """Return the values of a `commissioning.toml` for a motor: object name -> raw value, in the order of writing.
 
     Raises:
         ValueError: If a gain leaves the drive's range: the motor does not suit this drive; or for an unknown rule or
