@@ -101,7 +101,7 @@ def _opening(outcome: AxisResult) -> str:
 
 
 def requirements(dynamics: Dynamics, outcome: AxisResult) -> tuple[Requirement, ...]:
-    """Return what dynamics ask of an axis with its gains, and whether it was measured to be kept."""
+    """Return the requirements of dynamics on an axis, and whether its gains were measured to keep each."""
     rows = []
     for loop in LOOPS:
         found, least = outcome.margins.get(loop, UNKNOWN), outcome.at_least.get(loop)

@@ -50,7 +50,7 @@ def identified_plant(target: Target, axis: int, identified: Identification) -> t
 
 
 def wrong_wiring(target: Target, identified: Identification) -> str:
-    """Return what is wrong with the wiring, "" if it is right."""
+    """Name the fault of the wiring, "" if it is right."""
     direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
     if direction is not None and direction.value < 0.0:
         return identified.estimates["inertia"].reason

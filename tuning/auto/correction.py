@@ -188,7 +188,7 @@ def _lowered(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, mo
 def _try(
     bench: AutoBench, recorded: RecordedGains, gains: Integers, where: Mask, why: Sequence[str]
 ) -> tuple[RecordedGains, Mask, Mask]:
-    """Try corrected gains; return what is known with those that passed, which axes have them, which were stopped."""
+    """Try corrected gains; return the record with those that passed, the axes that have them, and those stopped."""
     try:
         with bench.spending(bench.target.together(where)):
             proof = bench.ground.run(gains, where)

@@ -157,7 +157,7 @@ def _in_play(target: Target, basis: Basis, response: MeasuredLoop, k: int) -> st
 
 
 def _seen(response: MeasuredLoop, k: int) -> int:
-    """Return how many lines of an axis are coherent, together with their neighbours where a model fits."""
+    """Count the coherent lines of an axis; where a model fits, together with their neighbours."""
     return round(float(response.refined(k)[2].mean()) * len(response.f))
 
 
@@ -167,7 +167,7 @@ def _without_response(recorded: RecordedGains, where: Mask, why: str) -> Recorde
 
 
 def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
-    """Return what the final gains are worth, too: their margins as measured, or a lower bound."""
+    """Return the final gains with their margins as measured, or lower bounds of them."""
     for model, axes in loop_models(bench.target, basis.identified, recorded, bench.going, bench.dynamics):
         for k in map(int, axes):
             measured = measured_axis(bench, basis, recorded, k)
@@ -304,7 +304,7 @@ def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
 def _by_model(
     bench: AutoBench, basis: Basis, k: int, gains: Integers, loops: Sequence[str]
 ) -> tuple[dict[str, AtLeast], str]:
-    """Return what margins of loops are at least by the model of the identified axis, and that in words."""
+    """Return lower bounds of the loops' margins by the model of the identified axis, and these in words."""
     plant, identified = basis.identified.plants[k], basis.identified.found[k]
     why = "the axis was not identified" if identified is None else why_unbounded(identified)
     if any(k in axes and len(axes) > 1 for axes in one_plant(bench.target, basis.identified)):

@@ -56,7 +56,7 @@ class Mechanism(NamedTuple):
 
 
 def one_axis(plant: Plant) -> Mechanism:
-    """Return what an axis moves that is alone."""
+    """Return the mechanism of an axis that is alone."""
     if not plant.is_elastic:
         return Mechanism(np.array([[plant.inertia]]), np.array([[plant.viscous]]), np.zeros((1, 1)), np.eye(1))
     rotor = plant.rotor_inertia
@@ -69,7 +69,7 @@ def one_axis(plant: Plant) -> Mechanism:
 
 
 def two_ends(first: Plant, second: Plant) -> Mechanism | None:
-    """Return what two axes move that drive one part, by what each moves while the other one is off.
+    """Return the mechanism of two axes that drive one part, from the plant of each while the other one is off.
 
     Args:
         first: One axis; its inertia is the whole one, its anti-resonance that of the part on the other rotor.

@@ -160,7 +160,7 @@ def keep_what_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains,
         for known, gains in ((of_before, basis.before), (of_new, recorded.gains)):
             known[own] = np.minimum(known[own], model.slack(bench.dynamics, gains[own][None])[0])
     now, before = (np.repeat(one.cost.reshape(-1, axes).max(axis=1), axes) for one in (shown, earlier))
-    # Gains with which an axis shakes at rest are nobody's choice.
+    # Gains with which an axis shakes at rest are never kept.
     kept = where & (before < now) & ~np.repeat(earlier.restless.reshape(-1, axes).any(axis=1), axes)
     kept = bench.whole_machines(kept & (of_before >= np.fmin(of_new, 0.0)))
     if not kept.any():

@@ -301,7 +301,7 @@ class ProvingGround:
         return np.where(where, worst, np.nan)
 
     def noise(self, gains: Integers, where: Mask) -> Floats:
-        """Return what the measurement of their current makes of the swing at rest of axes, over the rated one (RMS).
+        """Return the noise of the measured current at rest, over the rated current (RMS).
 
         Args:
             gains: That they have afterwards, (num_axes, count); the current loop works with these.

@@ -238,7 +238,7 @@ def _elsewhere(tasks: Sequence[_Task], left: Sequence[int], pool: Pool, say: Say
 
 
 def _run(task: _Task) -> str:
-    """Return what a tuner makes of the machines of a group, as text."""
+    """Tune the machines of a group with a tuner; return the outcome as text."""
     with closing(_Bench(task, 1)) as bench:
         return _text_of(bench.rows(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics)))
 
@@ -292,7 +292,7 @@ class _Bench:
                     return None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit
 
     def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
-        """Return what a rule proposes, and the audit of the identification, which is the same for all rules."""
+        """Return a rule's gains, and the audit of the identification, which all rules share."""
         if self._identified is None:
             before = read_gains(target)
             found, seconds = identify_all(target)
@@ -301,7 +301,7 @@ class _Bench:
         return tuner.propose(target, found, before, seconds), audit
 
     def rows(self, name: str, tuner: Tuner) -> list[MachineRow]:
-        """Return what a tuner makes of every machine."""
+        """Tune every machine with a tuner."""
         outcome, gains, failure, audit = self._tune(name, tuner)
         scores, worst = self._yardstick.score(gains), self._yardstick.margins(gains)
         asked, per_machine = self._yardstick.dynamics, self._yardstick.axes
@@ -344,7 +344,7 @@ class _Bench:
 
 
 def _checked_gains(outcome: Any, target: Target) -> Integers:
-    """Return a tuner's gains; ValueError if they are none, which is the tuner's mistake."""
+    """Return a tuner's gains; ValueError if they are invalid, which is the tuner's mistake."""
     shape = (target.num_axes, target.device.gains.count)
     gains = np.asarray(outcome.gains)
     if not isinstance(outcome, Outcome) or gains.shape != shape or not np.issubdtype(gains.dtype, np.integer):

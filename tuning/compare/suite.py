@@ -104,7 +104,7 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
         count: How many machines at most, taken from all loads and motors in turn.
 
     Raises:
-        ExperimentError: For a suite, key, name or number that is none, naming those that are.
+        ExperimentError: For an unknown suite, key, name or number; the text lists those there are.
     """
     path = _path(name_or_path)
     table = _read(path)
@@ -207,7 +207,7 @@ def _located(what: str, name: str, folder: Path) -> Path | None:
 
 
 def _named(what: str, name: str, folder: Path) -> str:
-    """Return what a name of a suite stands for; of a path its content, which goes wherever the machine goes."""
+    """Resolve a name of a suite; of a path read the content, which then travels with the machine."""
     try:
         return name if (place := _located(what, name, folder)) is None else taken(what, place)
     except ValueError as error:

@@ -74,7 +74,7 @@ def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = 
         dynamics: What the loops must keep, for tuners that can be asked.
 
     Raises:
-        MissingTunerError: For a name that is none, listing those there are, or a package that is missing.
+        MissingTunerError: For an unknown name, listing those there are, or a package that is missing.
     """
     rows = tuner_rows()
     if name not in rows:
@@ -103,8 +103,8 @@ def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
 class RuleTuner:
     """A rule of `tuning.rules.rules_by_name` as a tuner: identify, compute, write.
 
-    What is identified does not depend on the rule: whoever has several rules tune the same machines identifies once and
-    asks each to propose.
+    The identification does not depend on the rule: for several rules on the same machines, identify once and have each
+    propose.
     """
 
     def __init__(self, name: str) -> None:
@@ -138,7 +138,7 @@ class RuleTuner:
 
 
 def identify_all(target: Target) -> tuple[list[Identification], float]:
-    """Return what is identified of a target, and the drive time that it took [s]."""
+    """Identify a target; return the result and the drive time that it took [s]."""
     from tuning.identify.identification import identify
 
     with timed(target) as (watched, clock):
@@ -177,7 +177,7 @@ def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
     """Return a registered tuner."""
     try:
         found: Tuner = entry.load()
-    except Exception as error:  # whatever somebody else's module does when it is imported
+    except Exception as error:  # a foreign module may raise anything when it is imported
         raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} cannot be loaded: {error}") from error
     if not callable(found):
         raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} is not a function but {found!r}")
