@@ -306,7 +306,7 @@ class Played:
 def trials(monkeypatch):
     monkeypatch.setattr(gain_trial, "device_of", lambda drives: DEVICE)
     monkeypatch.setattr(gain_trial, "ampere_per_count", lambda drives: 1e-3)
-    monkeypatch.setattr("drive_env.devices.gains.device_of", lambda drives: DEVICE)
+    monkeypatch.setattr("drive_env.drives.raw_gains.device_of", lambda drives: DEVICE)
     monkeypatch.setattr("drive_env.trials.positioning.per_increment", lambda drives, name: 1.0)
     return lambda drives, axes=2: Trials(drives, MOTOR, axes, 0.004)
 
