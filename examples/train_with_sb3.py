@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from stable_baselines3 import PPO
 
-from drive_env.envs import make_vec_env
+from drive_env import make_vec_env
 
 
 @dataclass

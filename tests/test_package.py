@@ -94,3 +94,14 @@ def test_an_environment_for_stable_baselines_without_it_says_the_pip_line(tmp_pa
 def test_without_any_extra_the_programs_start(arguments, tmp_path):
     done = run_without(OF_AGENTS + OF_CLUSTER, command(*arguments), tmp_path)
     assert done.returncode == 0, done.stderr
+
+
+def test_what_a_caller_uses_and_catches_comes_from_the_package():
+    """Each name is the same object as in its home, and only what is asked for is imported."""
+    assert [*drive_env.__all__] == sorted(drive_env.__all__) and {"BusError", "Drives", "open_drives"} <= {
+        *drive_env.__all__
+    }
+    for name in drive_env.__all__:
+        assert getattr(drive_env, name).__name__.rpartition(".")[2] == name
+    told = [sys.executable, "-c", "import sys, drive_env; drive_env.BusError; print('mujoco' in sys.modules)"]
+    assert subprocess.run(told, capture_output=True, text=True, check=True).stdout == "False\n"
