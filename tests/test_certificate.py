@@ -196,6 +196,8 @@ def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, t
     path = tmp_path / name
     done = verify(path)
     assert (done.exit_code, done.stdout) == (0, f"{path} is unchanged\n")
+    told = CliRunner().invoke(app, ["verify", str(path), "--json"])
+    assert json.loads(told.stdout) == {"file": str(path), "unchanged": True}
     path.write_text(path.read_text(encoding="utf-8").replace("0.3612", "0.3613"), encoding="utf-8")
     done = verify(path)
     assert done.exit_code == 1

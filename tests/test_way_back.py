@@ -106,6 +106,11 @@ def test_what_a_lost_run_left_is_named_with_its_set_points_and_undone(tmp_path, 
         assert said.startswith("drive-tune: changed still: 2042h:01 ") and " is 77, not " in said
         assert "6071h:00 Target torque is 300, not 0" in said
         assert said.endswith(f"; drive-tune undo {file} restores the state before")
+        planned = CliRunner().invoke(drive_tune, ["undo", str(file), "--dry-run"])
+        assert planned.exit_code == 0, planned.output
+        assert "axis 0: 2042h:01 " in planned.stdout and f": 77, would be {before[GAIN_OBJECTS[2]]}\n" in planned.stdout
+        assert planned.stdout.endswith("2 parameters would be restored (dry run: nothing was written)\n")
+        assert machine.read(GAIN_OBJECTS[2])[0] == 77 and machine.read(TARGET_TORQUE)[0] == 300
         done = undo(file)
         assert done.exit_code == 0, done.output
         assert parameters(bus) == before

@@ -23,9 +23,11 @@ from drive_env.commands.options import DeviceName as DeviceName
 from drive_env.commands.options import Interface as Interface
 from drive_env.commands.options import Json as Json
 from drive_env.commands.options import Nodes as Nodes
+from drive_env.commands.options import WouldDo as WouldDo
 from drive_env.commands.options import Yes as Yes
 from drive_env.commands.options import ask as ask
 from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus, options_of, with_options
+from drive_env.commands.options import look_first as look_first
 from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
 from drive_env.default_device import DEFAULT_DEVICE

@@ -14,14 +14,17 @@ from tuning.commands.options import (
     Channel,
     Interface,
     Json,
+    WouldDo,
     Yes,
     ask,
     errors_as_exit_codes,
     fail,
+    look_first,
     print_json,
 )
 
 if TYPE_CHECKING:
+    from drive_env.master.parameters import Difference
     from tuning.snapshot import Snapshot
 
 
@@ -41,6 +44,7 @@ def undo(
     unchecked: Unchecked = False,
     yes: Yes = False,
     json: Json = False,
+    dry_run: WouldDo = False,
 ) -> None:
     """Restore the parameters that drives had before a change.
 
@@ -59,8 +63,11 @@ def undo(
         address = {**snapshot.bus, **{name: value for name, value in given.items() if value is not None}}
         nodes = ", ".join(map(str, address.get("nodes", [])))
         which = f"axis {', '.join(map(str, address['axes']))} of node {nodes}" if "axes" in address else f"node {nodes}"
-        ask(f"Restore {which} on {address.get('channel')}?", yes)
         keep = snapshot.stored if store is None else store
+        if dry_run:
+            _print_plan(_planned(file, snapshot, dict(address), other_drive=other_drive), store=keep, json=json)
+            return
+        ask(f"Restore {which} on {address.get('channel')}?", yes)
         try:
             changed, verified = _restore(file, snapshot, dict(address), keep, other_drive=other_drive)
         except (KeyboardInterrupt, BusError):
@@ -76,6 +83,38 @@ def undo(
     kept = "; stored in the drives" if keep else ""
     count = f"{len(changed)} parameter{'s' * (len(changed) != 1)}"
     print(f"{count} restored, {verified} verified by a second reading{kept}")
+
+
+def _planned(
+    file: Path, snapshot: Snapshot, address: dict[str, Any], *, other_drive: bool
+) -> list[tuple[int, Difference]]:
+    """Return the changes that a restoration would make, as (axis, difference); it raises where that would refuse."""
+    from drive_env.master.open_drives import open_drives
+    from drive_env.master.parameters import check_at_rest
+    from tuning import snapshot as snapshots
+
+    address.pop("axes", None)
+    named = {name: address.get(name) for name in ("interface", "channel", "nodes", "bitrate")}
+    look_first(device=snapshot.device, timeout=address.get("timeout"), **named)
+    with open_drives(snapshot.device, safety=False, **address) as drives:
+        snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)
+        planned = snapshots.differences(drives, snapshot)
+        for axis, change in planned:
+            check_at_rest(drives, [(change.entry.index, change.entry.sub)], axis)
+    return planned
+
+
+def _print_plan(planned: list[tuple[int, Difference]], *, store: bool, json: bool) -> None:
+    """Print the changes that a restoration would make."""
+    if json:
+        rows = [{"axis": k, "object": c.entry.label, "found": c.found, "wanted": c.wanted} for k, c in planned]
+        print_json({"would change": rows, "would store": store, "written": 0})
+        return
+    for axis, change in planned:
+        print(f"axis {axis}: {change.entry.label}: {change.found}, would be {change.wanted}")
+    kept = ", and stored" if store else ""
+    count = f"{len(planned)} parameter{'s' * (len(planned) != 1)}"
+    print(f"{count} would be restored{kept} (dry run: nothing was written)")
 
 
 def _restore(
