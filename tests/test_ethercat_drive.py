@@ -8,6 +8,7 @@ import ethercat_cable
 import numpy as np
 import pytest
 from rigs.namespaces import needs_namespaces, seen_by
+from rigs.namespaces import spaces as spaces
 
 from drive_env import EmulatedDrives, motion
 

@@ -10,12 +10,14 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from drive_env.cia402 import Key
 from mechanics.untrusted import read_json
 
-Section = dict[Key, int]
+if TYPE_CHECKING:
+    from drive_env.cia402 import Key
+
+Section = dict["Key", int]
 FORMAT = 1
 
 
