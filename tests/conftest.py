@@ -27,11 +27,11 @@ if hasattr(signal, "SIGHUP"):
 def pytest_collection_modifyitems(config, items):
     """Of the rows of a test that is marked `every(n)` and are not slow each n-th is in each run; the others are slow.
 
-    SLOW_STRIDE=n takes of each test's slow rows the first of n alone (and see rigs/thinning.py).
+    SLOW_STRIDE and SLOW_SHARE leave out slow rows and slow tests: see rigs/thinning.py.
     """
-    from rigs.thinning import STRIDE
+    from rigs.thinning import EACH, FIRST, STRIDE
 
-    rows, slow, left_out = Counter(), Counter(), []
+    rows, slow, numbers, left_out = Counter(), Counter(), {}, []
     for item in items:
         test = item.nodeid.partition("[")[0]
         every = item.get_closest_marker("every")
@@ -40,7 +40,8 @@ def pytest_collection_modifyitems(config, items):
                 item.add_marker(pytest.mark.slow)
             rows[test] += 1
         if item.get_closest_marker("slow") is not None:
-            if slow[test] % STRIDE:
+            number = numbers.setdefault(test, len(numbers))
+            if slow[test] % STRIDE or number % EACH != FIRST:
                 left_out.append(item)
             slow[test] += 1
     if left_out:

@@ -1,8 +1,9 @@
-"""SLOW_STRIDE=n: slow tests do the n-th part of what they do; unset, all."""
+"""SLOW_STRIDE=n: slow tests do the n-th part of what they do. SLOW_SHARE=k/n: each n-th of them runs, from the k-th on."""
 
 import os
 
 STRIDE = int(os.environ.get("SLOW_STRIDE", "1"))
+FIRST, EACH = map(int, os.environ.get("SLOW_SHARE", "0/1").split("/"))
 
 
 def part(whole: int, least: int) -> int:
