@@ -1,4 +1,4 @@
-"""SLOW_STRIDE=n: slow tests do the n-th part of their work. SLOW_SHARE=k/n: each n-th of them runs, from the k-th on."""
+"""SLOW_STRIDE=n: slow tests do the n-th part of their work. SLOW_SHARE=k/n: each n-th of them runs, from the k-th."""
 
 import os
 
