@@ -63,7 +63,7 @@ def test_identification_blames_neither_encoder_nor_wiring_for_late_syncs(late):
     """It said that the field made 0.16, 0.58 or 5.23 electrical turns per turn, or that the encoder was reversed."""
     with late.open() as target:
         found = identify(target)[0]
-        assert target.drives.bus.total_timing.worst >= STALL
+        assert target.drives.bus.total_timing.worst > 0.9 * STALL
     # Chance may leave the check right; what the motor then shows is measured by a clock that is wrong.
     reasons = {one.reason for one in found.estimates.values() if LATE in one.reason}
     assert reasons
