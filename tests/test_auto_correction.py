@@ -175,6 +175,11 @@ def test_of_gains_whose_loops_were_never_seen_those_designed_for_more_margin_sta
     assert found.gains[0, POSITION_P] == FIRST[4], "what overshoots is designed again, not position P lowered alone"
 
 
+def test_of_two_designs_that_were_never_seen_the_later_one_stays_though_it_costs_no_less(monkeypatch):
+    found, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, slack=lambda p: np.nan)
+    assert bench.asked[0] == "soft" and found.gains.tolist() == [gains_of(800)]
+
+
 def test_of_a_machine_one_axis_of_which_failed_its_move_no_loop_was_looked_at(monkeypatch):
     """The others' responses were not measured either: that asks for no more margin."""
     told = iter(["it swung", ""])

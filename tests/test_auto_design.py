@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import closing
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import cascade_columns
+from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto import design as module
@@ -46,6 +48,18 @@ def designed(request):
     coarse, fine, plant = both_twins(request.param)
     with closing(coarse.twins), closing(fine.twins):
         yield coarse, fine, plant, design(coarse, fine, [plant])
+
+
+def test_an_axis_that_could_not_be_measured_must_keep_the_dynamics_without_its_spring_too():
+    """A soft spring may be the play of a gear; with it a high integral gain looks safe."""
+    (elastic, _), (rigid, _) = known("two_mass"), known("inertia")
+    target = SimpleNamespace(device=DEVICE, motor=MOTOR)
+    models = module._as_rigid(target, [elastic, elastic, rigid], [None, "measured", None], find_dynamics("standard"))
+    assert [axes.tolist() for _, axes in models] == [[0]]
+    plain = replace(elastic.plant, anti_resonance=math.inf, resonance=math.inf)
+    gains = np.array([4021, 1573, 445, 329, 118])
+    wanted = LoopModel(DEVICE, MOTOR, [plain], one_axis(plain)).margins(gains[None])
+    assert models[0][0].margins(gains[None]) == wanted
 
 
 @pytest.mark.slow

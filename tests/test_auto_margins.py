@@ -17,6 +17,10 @@ from drive_env.loops.margins import Margins, margins
 from drive_env.loops.true_plant import true_plant
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
+from tuning.auto.loop_model import loop_models
+from tuning.auto.measured_margins import MeasuredAxis
+from tuning.auto.stages import IdentifiedAxes
+from tuning.estimate import refused
 from tuning.identify.identified_axis import Identification
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
@@ -112,6 +116,25 @@ def test_without_a_model_that_fits_nothing_is_said(measured):
     assert np.isnan(without.at_least("velocity", GAINS)).all()
 
 
+def test_what_was_refused_as_a_resonance_bounds_nothing(measured):
+    """The play of a gear fits a soft spring as well; what lies above it is then unknown."""
+    response, _, _ = measured
+    fit = response.fits[0]
+    assert fit.plant.is_elastic and np.isfinite(response.at_least("velocity", GAINS)).all()
+    play = fit._replace(estimates=fit.estimates | {"resonance": refused("Hz", "it depends on the direction")})
+    assert np.isnan(replace(response, fits=(play,)).at_least("velocity", GAINS)).all()
+
+
+def test_of_a_measured_axis_the_response_tells_what_another_velocity_p_does_and_the_model_the_rest(measured):
+    response, plant, _ = measured
+    identified = IdentifiedAxes((Identification({}, 0.0),), (plant,))
+    with emulated(load="two_mass", num_threads=1) as target:
+        for seen, names in ((recorded(GAINS[None], response=response), False), (None, True)):
+            ((model, _),) = loop_models(target, identified, seen, np.ones(1, bool), find_dynamics("standard"))
+            kept = model.kept(find_dynamics("standard"), GAINS[None])
+            assert ("velocity P x 1.5" in kept) == names and "load inertia x 2" in kept
+
+
 @pytest.mark.parametrize(("seen", "bound", "reserved"), [
     ((60.0, 12.0), (50.0, 9.0), None),
     ((np.nan, 12.0), (50.0, 9.0), False),  # a bound, and said
@@ -184,6 +207,21 @@ def test_a_machine_as_it_may_become_keeps_less_of_the_dynamics_and_not_nothing(k
     auto_margins.judge(bench, basis(start.gains), start)
     (journal,) = bench.journals
     assert ("rejected" if journal.reason else "reserved" if journal.reservations else "") == verdict, vars(journal)
+
+
+@pytest.mark.parametrize("by_response", [True, False])
+def test_of_another_velocity_p_the_worse_of_response_and_model_counts(by_response, monkeypatch):
+    """A coupled axis has both: of its own velocity P, and of that of all axes together."""
+    bench, start = verdict_on({"velocity": SOUND, "position": SOUND}, 0.1, monkeypatch)
+    name, low, high = "velocity P x 1.5", 0.1, 0.9
+    model = SimpleNamespace(kept=lambda dynamics, gains: {name: high if by_response else low})
+    axis = object.__new__(MeasuredAxis)
+    monkeypatch.setattr(MeasuredAxis, "kept", lambda self, dynamics, gains: {name: low if by_response else high})
+    monkeypatch.setattr(MeasuredAxis, "margins", lambda self, gains: {"velocity": SOUND, "position": SOUND})
+    monkeypatch.setattr(auto_margins, "measured_axis", lambda *given: axis)
+    monkeypatch.setattr(auto_margins, "loop_models", lambda *given: [(model, np.array([0]))])
+    auto_margins.judge(bench, basis(start.gains), start)
+    assert bench.journals[0].reason.startswith(f"with {name} it keeps 10 % of the margins of stiff dynamics")
 
 
 def verdict_on(found, overshoot, monkeypatch, variant=1.0):

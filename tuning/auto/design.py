@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from tuning.auto.loop_model import LinkedAxis, LoopModel
     from tuning.auto.measured_margins import MeasuredAxis
     from tuning.auto.stages import Basis, RecordedGains
+    from tuning.target import Target
 
 # The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
 # bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.
@@ -88,11 +89,7 @@ def design_axes(
         for model, of in loop_models(target, basis.identified, recorded, where, bench.dynamics)
     ]
     if recorded is not None and not target.linked:
-        # What could not be measured may be rigid: the play of a gear looks like a soft spring.
-        for n, one in enumerate(measured):
-            if one is None and known[n].plant.is_elastic:
-                rigid = replace(known[n].plant, anti_resonance=math.inf, resonance=math.inf)
-                models.append((model_of(target.device, target.motor, rigid, bench.dynamics), np.array([n])))
+        models += _as_rigid(target, known, measured, bench.dynamics)
 
     twins = partial(Twins, target.device, target.motor, known, scaler, SETS, dynamics=dynamics or bench.dynamics)
     with closing(twins(worlds=WORLDS[:1])) as one_world, closing(twins(repeats=RUNS)) as all_worlds:
@@ -119,6 +116,18 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
     known = known_of(plant, found, reach)
     restless = recorded is not None and recorded.swing[k] > RESTLESS
     return known._replace(coulomb=STILL_FRICTION * known.coulomb) if restless else known
+
+
+def _as_rigid(
+    target: Target, known: Sequence[Known], measured: Sequence[MeasuredAxis | LinkedAxis | None], dynamics: Dynamics
+) -> list[tuple[LoopModel, Integers]]:
+    """Return rigid models of elastic axes that could not be measured: the play of a gear looks like a soft spring."""
+    rigid = [replace(one.plant, anti_resonance=math.inf, resonance=math.inf) for one in known]
+    return [
+        (model_of(target.device, target.motor, rigid[n], dynamics), np.array([n]))
+        for n, one in enumerate(measured)
+        if one is None and known[n].plant.is_elastic
+    ]
 
 
 class Judge(NamedTuple):

@@ -218,7 +218,9 @@ def _tell_variants(
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         every = model.kept(dynamics, gains)
         if isinstance(measured, MeasuredAxis):
-            every |= measured.kept(dynamics, own)
+            # Of coupled axes their model tells, too, what happens where all of them have another velocity P.
+            told = measured.kept(dynamics, own)
+            every |= {name: min(kept, every.get(name, kept)) for name, kept in told.items()}
         name, kept = min(every.items(), key=lambda one: one[1])
         if kept < OFF_NOMINAL * (1.0 - MEASURED) and (measured is not None or dynamics is bench.dynamics):
             tell(
