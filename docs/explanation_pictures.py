@@ -228,7 +228,7 @@ class Example(NamedTuple):
 EXAMPLES = (
     Example("lively", (4021, 1573, 908, 1499, 592)),
     Example("faster: velocity P x 1.4, position P x 2", (4021, 1573, 1271, 1499, 1184)),
-    Example("as auto designs", (5580, 1579, 1099, 1525, 419)),  # `drive-tune auto --load belt`
+    Example("as auto designs", (5580, 1579, 1108, 1861, 385)),  # `drive-tune auto --load belt`
 )
 BELT_INERTIA = 2.34e-5  # kg*m^2 at the rotor, as `drive-tune identify --load belt` finds it
 

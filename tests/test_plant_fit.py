@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from drive_env.devices import find_device
-from drive_env.loops.linear_model import Plant, velocity_open_loop
+from drive_env.loops.linear_model import Plant, velocity_open_loop, velocity_plant
 from drive_env.motors import find_motor
 from tuning.estimate import Estimate, refused
+from tuning.response import plant_fit
 from tuning.response.held_samples import seen_by_bus
 from tuning.response.plant_fit import PlantFit, fit_plant
 
@@ -61,8 +62,12 @@ def test_one_spring_is_found_wherever_it_lies_between_the_lines(anti_resonance, 
     assert found.plant.inertia == pytest.approx(true.inertia, rel=0.05)
 
 
-def test_a_response_whose_valley_is_the_first_line_is_fitted_without_an_anti_resonance_of_0():
-    assert fitted(5.5, 1.35, 0.02)[1].plant.anti_resonance > 0.0
+def test_no_search_begins_at_0_hz_where_the_response_is_lowest_at_its_first_line():
+    start = Plant.from_data_sheet(SERVO, AM3041, 540.0, 3.0 * AM3041.inertia)
+    f = np.arange(5.0, 401.0, 5.0)
+    rising = velocity_plant(SERVO, start, SERVO_GAINS, f) * np.linspace(0.5, 2.0, len(f))
+    loop = plant_fit._Loop(SERVO, SERVO_GAINS, f, rising, np.ones(len(f)), 0.0)
+    assert all(5.0 <= one.anti_resonance < one.resonance for one in plant_fit._candidate_pairs(loop, rising, start))
 
 
 def fitted(anti_resonance, ratio, damping):

@@ -22,6 +22,7 @@ from agents.commands.cli import app as drive_agent
 from agents.tuner import tuning_run
 from drive_env import cia402, motion
 from drive_env.fieldbus.description import Description
+from drive_env.master.can.port import Port
 from tuning.auto import one_button as auto_module
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import SET_POINTS, Transaction, differences
@@ -91,7 +92,7 @@ def test_an_emulated_drive_that_ends_with_the_program_needs_no_way_back(monkeypa
 
 
 # --- what it reads ------------------------------------------------------------------------------------------------
-def test_what_a_lost_run_left_is_named_with_its_set_points_and_undone(tmp_path, capsys):
+def test_what_a_lost_run_left_is_named_with_its_set_points_and_undone(tmp_path, capsys, monkeypatch):
     """6071h is a command, so no parameter file has it: with 300 mA in it the next `enable` in cst turns the motor."""
     file = tmp_path / "before.toml"
     with node() as (machine, bus):
@@ -106,7 +107,11 @@ def test_what_a_lost_run_left_is_named_with_its_set_points_and_undone(tmp_path, 
         assert said.startswith("drive-tune: changed still: 2042h:01 ") and " is 77, not " in said
         assert "6071h:00 Target torque is 300, not 0" in said
         assert said.endswith(f"; drive-tune undo {file} restores the state before")
+        sent, send = [], Port.send
+        monkeypatch.setattr(Port, "send", lambda self, *frame, **how: (sent.append(frame), send(self, *frame, **how)))
         planned = CliRunner().invoke(drive_tune, ["undo", str(file), "--dry-run"])
+        monkeypatch.undo()
+        assert {(number, data[0]) for number, data in sent} == {(0x601, 0x40)}, "nothing but uploads"
         assert planned.exit_code == 0, planned.output
         assert "axis 0: 2042h:01 " in planned.stdout and f": 77, would be {before[GAIN_OBJECTS[2]]}\n" in planned.stdout
         assert planned.stdout.endswith("2 parameters would be restored (dry run: nothing was written)\n")
