@@ -1,4 +1,4 @@
-"""A value with its 95 % interval, or with the reason why there is none."""
+"""A value with its 95 % interval, or the reason why it was not identified."""
 
 from __future__ import annotations
 

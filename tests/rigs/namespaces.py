@@ -49,7 +49,7 @@ def inside(space, *arguments):
 
 
 def first_line(process):
-    """Return what a process prints first; it may compile before."""
+    """Return the first line that a process prints; it may compile before."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end and process.poll() is None:
         if select.select((process.stdout,), (), (), 1.0)[0]:
@@ -76,7 +76,7 @@ def served(spaces, pace, device="tmcm3313", load="portal"):
 
 
 def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal", library="pysoem"):
-    """Return what a master saw of a drive that is served."""
+    """Return the report of a master on a served drive."""
     pytest.importorskip(library, reason=f"{library} is not installed: pip install -e '.[test]'")
     with served(spaces, pace, device, load):
         master = inside(spaces.master, TESTS / program_of_master, spaces.master_interface, *arguments)

@@ -69,7 +69,7 @@ def node(lockstep=True):
 
 
 def parameters(bus):
-    """Return what a master reads of the drive, its communication too."""
+    """Return the parameters that a master reads, those of communication too."""
     _, interface, _, channel, *lockstep = bus
     pace = "lockstep" if lockstep else "real-time"
     with CanDrives(interface=interface, channel=channel, pace=pace, safety=False) as drives:

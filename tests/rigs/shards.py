@@ -79,7 +79,7 @@ def start_and_wait_for_a_shard(config, out, *more):
         arguments(config, out, *more), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     deadline, size, before = time.monotonic() + PATIENCE, 0, -1
-    # While a shard is being written it is none yet, and who is killed then leaves nothing to go on from.
+    # A shard counts once it is written whole: a run that is killed before leaves nothing to continue from.
     while not (size > 1000 and size == before) and process.poll() is None:
         assert time.monotonic() < deadline, "no shard was done"
         time.sleep(0.01)

@@ -212,7 +212,7 @@ def model_of(device: Device, motor: Motor, plant: Plant, dynamics: Dynamics, *, 
 
 
 def measured_response(target: Target, recorded: RecordedGains | None, k: int) -> MeasuredLoop | None:
-    """Return the response that was measured of an axis, None if there is none, or of linked axes."""
+    """Return the measured response of an axis; None if it was not measured, or if the axis is linked."""
     if target.linked or recorded is None or recorded.response is None or recorded.unseen[k]:
         return None
     return recorded.response if np.isfinite(recorded.response.open_loop[:, k]).any() else None
