@@ -63,7 +63,9 @@ class ClosedLoop(NamedTuple):
 
 
 LOAD_DETECTION = ("load detection", "CoolStep")  # loops of settings by which a stepper's drive acts on its load reading
-PER_UNIT = {"load detection": 12.0, "CoolStep": 2.5}  # steps of such a setting that a search takes for a factor of e
+FEED_FORWARD = ("feed-forward", "speed")  # loop and part of the share of the demanded speed that a position loop adds
+# Steps of a setting, of which 0 is a value as others are, that a search takes for a factor of e.
+PER_UNIT = {"load detection": 12.0, "CoolStep": 2.5, FEED_FORWARD[0]: 300.0}
 RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of a stepper's phases: loop and part
 
 
@@ -209,7 +211,7 @@ class GainSet:
         Args:
             raw: What is changed.
             by: How much, of shape (..., len(columns)): the logarithm of a factor by which a gain acts more; of settings
-                of a load detection, of which 0 and below are values as others are, in units of `PER_UNIT`.
+                of which 0 is a value as others are, in units of `PER_UNIT`.
             columns: Which gains.
             highest: Of all gains.
         """
@@ -251,6 +253,13 @@ class GainSet:
     def strength(self, raw: Integers, columns: Sequence[int]) -> Floats:
         """Return by how much some gains act, up to a constant of each, (..., len(columns))."""
         return np.asarray(raw[..., columns].astype(float) ** self.powers[columns])
+
+    def without_feed_forward(self, raw: Integers) -> Integers:
+        """Return gains of shape (..., count) whose feed-forward, if there is one, is 0."""
+        columns = self.columns_of(FEED_FORWARD[0])
+        result = raw.copy()
+        result[..., columns] = 0
+        return result
 
     def opens(self, raw: Sequence[int] | Integers, *loops: str) -> bool:
         """Return whether gains of shape (count,) leave one of the loops open: its P is 0."""

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.devices import Device
+from drive_env.devices.gain_set import FEED_FORWARD
 from drive_env.dictionary.units import RPM, UNITS, Context, find_unit
 from drive_env.motors import Motor
 from mechanics.arrays import Floats, Integers
@@ -148,7 +149,7 @@ def bandwidth_gains(
     )
     own = _of_device(device, np.array(raw)).tolist()
     for gain, value in zip(device.gains.rows, own, strict=True):
-        if not 0.5 <= value < gain.highest + 0.5:
+        if not gain.lowest - 0.5 <= value < gain.highest + 0.5:
             raise ValueError(f"{gain.title} would be {value:.0f}, outside 1...{gain.highest}; choose another bandwidth")
     return np.array([round(value) for value in own], np.int64)
 
@@ -275,7 +276,7 @@ def _lacks(device: Device) -> str:
     """Return the parts that a device lacks for the linear model, "" for none."""
     if device.gains.cascade != PI:
         return "its gains.toml names no cascade"
-    own = [(row.loop, row.part) for row in device.gains.rows]
+    own = [(row.loop, row.part) for row in device.gains.rows if (row.loop, row.part) != FEED_FORWARD]
     missing = [f"{part} of the {loop} loop" for loop, part in _CHIP if (loop, part) not in own]
     if missing:
         return f"its gains.toml has no {', no '.join(missing)}"
@@ -325,6 +326,8 @@ def loop_scales(device: Device) -> list[GainScale]:
 def per_chip(device: Device) -> dict[Part, GainScale]:
     """Return the scale of a device's integers to the chip's, by loop and part; exactly 1 where it counts alike.
 
+    The chip has no feed-forward: it is left out.
+
     Raises:
         ValueError: If the device names no cascade, or has a gain which that does not have, or has once.
     """
@@ -338,6 +341,8 @@ def per_chip(device: Device) -> dict[Part, GainScale]:
     scales: dict[Part, GainScale] = {}
     for row, own in zip(known.rows, loop_scales(device), strict=True):
         part = row.loop, row.part
+        if part == FEED_FORWARD:
+            continue
         if part not in _CHIP:
             raise ValueError(
                 f"{device.name}: gains.toml: {row.name} is {row.part} of the {row.loop} loop, which the cascade "
@@ -358,8 +363,9 @@ def as_chip(device: Device, gains: RawGains) -> list[float]:
     Raises:
         ValueError: If the device names no cascade.
     """
-    own = {part: float(scale.value(raw)) for raw, (part, scale) in zip(gains, per_chip(device).items(), strict=True)}
-    return [own.get(part, math.nan) for part in _CHIP]
+    scales = per_chip(device)
+    given = {(row.loop, row.part): raw for row, raw in zip(device.gains.rows, gains, strict=True)}
+    return [float(scales[part].value(given[part])) if part in scales else math.nan for part in _CHIP]
 
 
 def si_scales(device: Device, supply: float) -> dict[Part, GainScale]:
@@ -381,9 +387,14 @@ def si_scales(device: Device, supply: float) -> dict[Part, GainScale]:
 
 
 def _of_device(device: Device, raw: Floats) -> Floats:
-    """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units."""
-    order = list(_CHIP)
-    return np.stack([own.raw(raw[..., order.index(part)]) for part, own in per_chip(device).items()], axis=-1)
+    """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units.
+
+    A feed-forward, which the chip does not have, is 0.
+    """
+    order, scales = list(_CHIP), per_chip(device)
+    none = np.zeros(raw.shape[:-1])
+    parts = [(row.loop, row.part) for row in device.gains.rows]
+    return np.stack([scales[p].raw(raw[..., order.index(p)]) if p in scales else none for p in parts], axis=-1)
 
 
 def _context(device: Device) -> Context:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from drive_env.devices.gain_set import FEED_FORWARD
 from drive_env.devices.gains import Part, cascade_columns, si_scales, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.trials.score import robust_cost
@@ -52,6 +53,7 @@ EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
 STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
+FED_FORWARD = np.array([0.3, 0.5, 0.7, 0.85, 1.0])  # of the highest feed-forward: what is tried with the best gains
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
 
@@ -226,6 +228,11 @@ def design(
         promising = np.argsort(np.where(slack > 0.0, promise(near), 1e9 - slack), axis=1, kind="stable")
         near = np.take_along_axis(near, promising[:, :PROMISING, None], axis=1)
         pool, cost = np.concatenate([pool, near], axis=1), np.concatenate([cost, fine.score(near)], axis=1)
+    ahead = device.gains.column(*FEED_FORWARD)
+    if ahead is not None:
+        fed = np.repeat(np.take_along_axis(pool, cost.argmin(axis=1)[:, None, None], axis=1), len(FED_FORWARD), axis=1)
+        fed[..., ahead] = np.rint(device.gains.rows[ahead].highest * FED_FORWARD)
+        pool, cost = np.concatenate([pool, fed], axis=1), np.concatenate([cost, fine.score(fed)], axis=1)
     order = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
     pool = np.take_along_axis(pool, order[:, :, None], axis=1)
     return Designed(pool, np.take_along_axis(cost, order, axis=1), coarse.slack(pool))
@@ -246,7 +253,8 @@ def _grid(device: Device, plant: Plant) -> Integers:
             ("velocity", "I"): w / integration,
             ("position", "P"): position * w,
         }
-        rows.append([float(scale.raw(values[part])) for part, scale in scales.items()])
+        parts = [(row.loop, row.part) for row in device.gains.rows]
+        rows.append([float(scales[part].raw(values[part])) if part in scales else 0.0 for part in parts])
     return _whole(device, np.array(rows))
 
 

@@ -277,13 +277,14 @@ class ProvingGround:
 
         The step is STEP_SIZE counts of an encoder of 4096, or of a coarser one of the motor: small enough for the loops
         to stay linear, and large enough for friction and noise not to matter. A first one, there and back, does not
-        count: by it the integrator lets go of what dry friction has kept in it. Linked axes step together.
+        count: by it the integrator lets go of what dry friction has kept in it. Linked axes step together. It is there
+        for the loops: a feed-forward, which answers the jump with a push of its own, is off meanwhile.
         """
         drives, where = self.target.drives, self.target.together(where)
         self._fallback.begin()
         self._begin(where)
         self._hold_still(where)
-        write_gains(drives, gains, where)
+        write_gains(drives, self.target.device.gains.without_feed_forward(gains), where)
         size = np.rint(np.maximum(STEP_SIZE * self._count, STEP_ANGLE * self.move.increments)).astype(np.int64)
         here = drives.read(cia402.POSITION_ACTUAL)
         motion.select_mode(drives, "csp", where)
@@ -297,6 +298,7 @@ class ProvingGround:
                 worst = np.maximum(worst, beyond / size)
         finally:
             motion.select_mode(drives, "pp", where)
+        write_gains(drives, gains, where)
         self._begin_without_a_step(where)
         return np.where(where, worst, np.nan)
 

@@ -255,7 +255,7 @@ class Twins:
 
 def gain_bounds(device: Device) -> tuple[Integers, Integers]:
     """Return the least and the greatest integers that a search may try, shape (count,) each."""
-    least, most = np.ones(device.gains.count, np.int64), device.gains.highest
+    least, most = np.minimum(device.gains.lowest, 1), device.gains.highest
     integral = device.gains.column("velocity", "I")
     if integral is not None:
         scale = si_scales(device, 1.0)["velocity", "I"]  # which no supply changes

@@ -291,7 +291,8 @@ def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, f
     if device.gains.cascade != PI:
         return {}
     found = dict(zip(SI_UNITS, gains_in_si(device, supply, tuple(map(int, gains))), strict=True))
-    return {_si_name(gain): found[gain.loop, gain.part] for gain in device.gains.rows}
+    parts = {(gain.loop, gain.part): gain for gain in device.gains.rows}
+    return {_si_name(gain): found[part] for part, gain in parts.items() if part in found}
 
 
 def _si_name(gain: Gain) -> str:

@@ -124,8 +124,6 @@ def _not_kept(target: Target) -> str:
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
-    from drive_env.devices.gains import cascade_columns
-
     if json:
         names = target.device.gains.names
         rows = [
@@ -147,19 +145,19 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in written.items()}
         print_json({"axes": rows} | summary | files)
         return
-    columns = (
-        Column("axis"), Column("", "name"), Column("torque\nP, I", "name"), Column("velocity\nP, I", "name"),
-        Column("position\nP", "name"), Column("velocity\nloop", "name"), Column("position\nloop", "name"),
-    )  # fmt: skip
-    cells, cascade = [], cascade_columns(target.device)
+    known = target.device.gains
+    loops = list(dict.fromkeys(row.loop for row in known.rows))
+    heads = [_head(loop, [known.rows[k].title for k in known.columns_of(loop)]) for loop in loops]
+    columns = [Column("axis"), Column("", "name"), *(Column(head, "name") for head in heads)]
+    columns += [Column("velocity\nloop", "name"), Column("position\nloop", "name")]
+    cells: list[tuple[str, ...]] = []
     numbers = target.axis_numbers
     for k, axis in zip(numbers, result.axes, strict=True):
         for name, gains in (("before", axis.before), ("after", axis.after)):
             told = name == "after" and axis.accepted
             margins = [_margins(axis, loop) if told else "" for loop in ("velocity", "position")]
-            torque_p, torque_i, velocity_p, velocity_i, position_p = (gains[column] for column in cascade)
-            pairs = f"{torque_p}, {torque_i}", f"{velocity_p}, {velocity_i}"
-            cells.append((str(k), name, *pairs, str(position_p), *margins))
+            by_loop = [", ".join(str(gains[column]) for column in known.columns_of(loop)) for loop in loops]
+            cells.append((str(k), name, *by_loop, *margins))
     print_table(columns, cells)
     lines = []
     for k, axis, seconds in zip(numbers, result.axes, result.drive_seconds, strict=True):
@@ -179,6 +177,12 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     if target.bus:
         lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)
+
+
+def _head(loop: str, titles: list[str]) -> str:
+    """Return the head of a column: the loop as the first title begins, or as it is called, and the gains in it."""
+    shared = titles[0].rpartition(" ")[0]
+    return f"{shared or loop}\n{', '.join(title.removeprefix(shared).strip() for title in titles)}"
 
 
 def _margins(axis: AxisResult, loop: str) -> str:

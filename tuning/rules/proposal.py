@@ -89,13 +89,13 @@ class Workbench:
         self._notes.append(text)
 
     def so_far(self, more: Mapping[Part, int] | None = None) -> tuple[int, ...]:
-        """Return the gains taken so far, and more, in the device's order; 1 for a gain that is not taken yet."""
+        """Return the gains taken so far, and more, in the device's order; the least for a gain that is not taken."""
         found = self._raw | dict(more or {})
-        return tuple(found.get(part, 1) for part in self._rows)
+        return tuple(found.get(part, row.lowest) for part, row in self._rows.items())
 
     def proposal(self) -> Proposal:
         """Return the proposal of the gains taken."""
-        return Proposal(tuple(self._raw[part] for part in self._rows), dict(self._wanted), tuple(self._notes))
+        return Proposal(self.so_far(), dict(self._wanted), tuple(self._notes))
 
     def _take(self, part: Part, value: float) -> float:
         gain, wanted = self._rows[part], float(self.scales[part].raw(value))

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.devices.gains import as_chip, gains_in_si, per_chip
+from drive_env.devices.gain_set import FEED_FORWARD
+from drive_env.devices.gains import gains_in_si
 from tuning.certificate.certificate import SI_UNITS
 from tuning.studio import tune_jobs
 from tuning.studio.tune_panel import TunePanel, card
@@ -37,13 +38,14 @@ def value_at(place: int, highest: int) -> int:
 def si_texts(device: Device, supply: float, gains: tuple[int, ...]) -> list[str]:
     """Return each gain in SI with its unit, "" where nothing is known of it."""
     try:
-        parts, chip = list(per_chip(device)), as_chip(device, gains)
         values = dict(zip(SI_UNITS, gains_in_si(device, supply, gains), strict=True))
     except (ValueError, ZeroDivisionError):
         return [""] * len(gains)
-    del chip
     texts = []
-    for part in parts:
+    for part, raw in zip([(row.loop, row.part) for row in device.gains.rows], gains, strict=True):
+        if part == FEED_FORWARD:
+            texts.append(f"{0.1 * raw:g} %")
+            continue
         value, unit = values[part], SI_UNITS[part]
         what = "T_i = " if part[1] == "I" else ""
         texts.append(f"{what}{value:.4g} {unit}" if math.isfinite(value) else "off" if value == math.inf else "")

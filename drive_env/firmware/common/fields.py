@@ -13,6 +13,7 @@ PARAMETERS = (
     Field("live", "i4", "", "1: this lane is an axis"),
     # --- parameters and commands that the dictionary writes -------------------------------------------------------
     Field("position_p", "f8", "1/s", "position loop: speed per following error; 0: the demand is followed without lag"),
+    Field("feed_forward", "f8", "1", "position loop: share of the demanded speed that is added to what it asks for"),
     Field("position_scaler", "f8", "inc/rev", "2058h", 65536.0),
     Field("limit_switches", "i4", "", "2005h"),
     Field("home_offset", "f8", "rad", "607Ch"),

@@ -69,6 +69,12 @@ def stop_ramp(drive, lane):
 
 
 @stage
+def lag_of_demand(drive, lane):
+    """Return how far behind its demand the position loop is at the demanded speed; its gain is not 0."""
+    return drive.velocity_demand[lane] * (1.0 - drive.feed_forward[lane]) / drive.position_p[lane]
+
+
+@stage
 def start_braking(drive, lane):
     """Let a stop begin with the motion there is, where the demand does not tell it.
 
@@ -83,7 +89,7 @@ def start_braking(drive, lane):
     if level == 0:
         drive.loop_level[lane] = 1
     elif level == 2 and drive.position_p[lane] > 0.0:
-        drive.position_demand[lane] += drive.velocity_demand[lane] / drive.position_p[lane]
+        drive.position_demand[lane] += lag_of_demand(drive, lane)
 
 
 @stage
@@ -110,7 +116,7 @@ def change_mode(drive, lane):
     by_position = drive.mode[lane] == PP or drive.mode[lane] == HM or acts_as(drive.mode[lane]) == CSP
     if before != 2 and by_position and drive.position_p[lane] > 0.0:
         # The position loop asks for the present speed only with the lag that it has at that speed.
-        lag = drive.velocity_demand[lane] / drive.position_p[lane]
+        lag = lag_of_demand(drive, lane)
         window = drive.following_error_window[lane]
         if window == 0.0 or abs(lag) < window:
             drive.position_demand[lane] += lag
