@@ -116,6 +116,15 @@ def identification(**values):
     return Identification(blank | estimates, 0.0)
 
 
+def test_a_variant_of_a_fast_resonance_is_one_that_the_physics_resolves():
+    known = KNOWN._replace(
+        plant=replace(KNOWN.plant, anti_resonance=400.0, resonance=490.0), spread=dict.fromkeys(twin.UNCERTAIN, 0.5)
+    )
+    with closing(Twins(DEVICE, MOTOR, [known], np.array([65536.0]), 1, num_threads=1)) as twins:
+        performance, _ = twins.judge(np.array([[[4000, 1500, 400, 300, 100]]]))
+    assert np.isfinite(performance).all()
+
+
 def test_intervals_become_the_twins_doubt_and_what_was_refused_the_greatest():
     found = known_of(RIGID, identification(velocity_filter=(260.0, 0.2), resonance=(141.0, 0.05)), 3.0)
     assert (found.coulomb, found.viscous) == (0.1, 2e-4)

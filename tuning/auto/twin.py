@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 # quarter of a second that the robust cost looks at.
 LONGEST_INTEGRATION = 0.65536  # s, of the velocity loop
 FASTEST_RESONANCE = 500.0  # Hz; a faster one is taken as rigid: the physics' step does not resolve it
+MOST_RESONANCE = 1.1 * FASTEST_RESONANCE  # Hz, of a variant
 LEAST_LOAD = 0.05  # of the total inertia: what is left for a load where the rotor's data sheet value takes all
 LEAST_RATIO = 1.03  # of resonance over anti-resonance: nearer to each other they cancel
 BREAKAWAY = 1.5  # over sliding friction, of bearings
@@ -117,8 +118,9 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
     """
     plant = known.plant
     off = {name: _factor(getattr(world, name), known.spread.get(name, 0.0)) for name in UNCERTAIN}
-    total, anti_resonance = plant.inertia * off["inertia"], plant.anti_resonance * off["anti_resonance"]
-    resonance = max(plant.resonance * off["resonance"], LEAST_RATIO * anti_resonance)
+    total = plant.inertia * off["inertia"]
+    anti_resonance = min(plant.anti_resonance * off["anti_resonance"], MOST_RESONANCE / LEAST_RATIO)
+    resonance = max(min(plant.resonance * off["resonance"], MOST_RESONANCE), LEAST_RATIO * anti_resonance)
     filtered = corner(device, plant) * off["velocity_filter"]
     noise, resistance = (
         device.stage[name].default if value is None else value
