@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices.gains import si_scales
-from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
+from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
 from drive_env.trials.score import TRIPPED, RobustScore
@@ -111,16 +111,28 @@ def is_elastic(plant: Plant) -> bool:
     return plant.anti_resonance < plant.resonance < FASTEST_RESONANCE
 
 
-def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVariant = WORLDS[0]) -> dict[str, float]:
+def twin_parameters(
+    device: Device,
+    motor: Motor,
+    known: Known,
+    world: MachineVariant = WORLDS[0],
+    lightest: float = INERTIA_RANGE[0],
+) -> dict[str, float]:
     """Return the parameters of the emulated machine (one inertia or two masses) that matches the identification.
 
     The torque constant is the data sheet's: inertia and friction are identified relative to it, so it does not matter.
+
+    Args:
+        device: The drive.
+        motor: Its motor.
+        known: The axis.
+        world: What is different from it.
+        lightest: The least load inertia that the robust cost makes of it, over its own.
     """
     plant = known.plant
     off = {name: _factor(getattr(world, name), known.spread.get(name, 0.0)) for name in UNCERTAIN}
-    total = plant.inertia * off["inertia"]
-    anti_resonance = min(plant.anti_resonance * off["anti_resonance"], MOST_RESONANCE / LEAST_RATIO)
-    resonance = max(min(plant.resonance * off["resonance"], MOST_RESONANCE), LEAST_RATIO * anti_resonance)
+    total, anti_resonance = plant.inertia * off["inertia"], plant.anti_resonance * off["anti_resonance"]
+    resonance = max(plant.resonance * off["resonance"], LEAST_RATIO * anti_resonance)
     filtered = corner(device, plant) * off["velocity_filter"]
     noise, resistance = (
         device.stage[name].default if value is None else value
@@ -138,7 +150,9 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
     if is_elastic(plant):
         rotor = total * (anti_resonance / resonance) ** 2
         load = total - rotor
-        stiffness = load * (2.0 * math.pi * anti_resonance) ** 2
+        # The variants of the robust cost have less load on the same spring: the physics' step must resolve them, too.
+        most = (2.0 * math.pi * MOST_RESONANCE) ** 2 / (1.0 / rotor + 1.0 / (lightest * load))
+        stiffness = min(load * (2.0 * math.pi * anti_resonance) ** 2, most)
         values["load.stiffness"] = stiffness
         values["load.damping"] = 2.0 * plant.damping * world.damping * stiffness / (2.0 * math.pi * resonance)
     else:
@@ -192,6 +206,7 @@ class Twins:
         self.num_axes, self._worlds = len(known), len(worlds)
         self._parts: list[tuple[Integers, RobustScore]] = []  # those of a load: which axes they are, and their score
         elastic = np.array([is_elastic(one.plant) for one in known])
+        lightest = self.dynamics.inertia_range[0]
         for load, mask in (("inertia", ~elastic), ("two_mass", elastic)):
             if not mask.any():
                 continue
@@ -202,7 +217,7 @@ class Twins:
             )  # fmt: skip
             self._parts.append((axes, robust))
             chosen = [known[int(k)] for k in axes]
-            rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in chosen]
+            rows = [[twin_parameters(device, motor, one, world, lightest) for world in worlds] for one in chosen]
             columns = {name: np.array([[row[name] for row in axis] for axis in rows]) for name in rows[0][0]}
             robust.set_machines(
                 {name: np.repeat(values, sets, axis=0).reshape(-1) for name, values in columns.items()},
