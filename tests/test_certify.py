@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rigs.auto_stages import recorded
 
+from drive_env.devices import find_device
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
@@ -32,6 +33,7 @@ from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated
 
+KNOWN = find_device("tmcm1636").gains
 STANDARD = find_dynamics("standard")
 GAINS = {"inertia": (5555, 1565, 1257, 1961, 926), "belt": (5580, 1579, 1099, 1845, 395)}  # what auto ends with
 
@@ -77,7 +79,7 @@ def kept(name, *, bound=UNBOUNDED, overshoot=0.05, **changed):
     """Return what a certificate says of a requirement of an axis whose loops are sound but for this."""
     loops = {"velocity": SOUND, "position": SOUND._replace(**changed)}
     axis = AxisResult((1,) * 5, (1,) * 5, margins=loops, at_least={"position": bound}, overshoot=overshoot)
-    rows = {row.name: row for row in requirements(STANDARD, axis)}
+    rows = {row.name: row for row in requirements(STANDARD, axis, KNOWN)}
     assert len(rows) == 7
     return rows[name].asked, rows[name].found, rows[name].is_bound, rows[name].kept
 
@@ -106,7 +108,7 @@ def test_of_all_that_the_dynamics_ask_for_it_is_said_whether_it_is_kept(name, gi
 
 
 def test_where_nothing_was_measured_nothing_is_said_to_be_kept():
-    rows = requirements(STANDARD, AxisResult((1,) * 5, (1,) * 5))
+    rows = requirements(STANDARD, AxisResult((1,) * 5, (1,) * 5), KNOWN)
     assert {row.kept for row in rows} == {NOT_MEASURED} and len(rows) == 7
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drive_env.devices.gain_set import FEED_FORWARD
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from mechanics.arrays import Floats
@@ -35,6 +36,7 @@ from tuning.runs.inputs import hashes
 from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
     from drive_env.loops.dynamics import Dynamics
     from tuning.auto.proving import Shown
     from tuning.auto.result import AxisResult, Result
@@ -87,7 +89,7 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
         steps=(*_steps(result, axis), *loaded) if outcome.accepted else (),
         frequency_responses=_responses(target, result, axis, outcome) if outcome.accepted else (),
         dynamics=result.dynamics.name,
-        requirements=requirements(result.dynamics, outcome) if outcome.accepted else (),
+        requirements=requirements(result.dynamics, outcome, target.device.gains) if outcome.accepted else (),
         figures=_crossovers(target, outcome) if outcome.accepted else {},
         corrections=outcome.corrections,
         notes=outcome.notes,
@@ -100,7 +102,7 @@ def _opening(outcome: AxisResult) -> str:
     return "all checks passed" if not outcome.reservations else "all checks that could be made passed"
 
 
-def requirements(dynamics: Dynamics, outcome: AxisResult) -> tuple[Requirement, ...]:
+def requirements(dynamics: Dynamics, outcome: AxisResult, gains: GainSet) -> tuple[Requirement, ...]:
     """Return the requirements of dynamics on an axis, and whether its gains were measured to keep each."""
     rows = []
     for loop in LOOPS:
@@ -118,7 +120,8 @@ def requirements(dynamics: Dynamics, outcome: AxisResult) -> tuple[Requirement, 
             rows.append(Requirement(name, asked.limit, bound if is_bound else value, is_bound, kept))
     allowed = AskedMargin("", "", 100.0 * dynamics.overshoot, 100.0 * OVERSHOOT_ERROR, "%", 0, -1.0)
     overshoot = float(np.maximum(100.0 * outcome.overshoot, 0.0))
-    name = f"overshoot of a step of {STEP_SIZE} counts in csp [%]"
+    alone = " without feed-forward" if gains.columns_of(FEED_FORWARD[0]) else ""
+    name = f"overshoot of a step of {STEP_SIZE} counts in csp{alone} [%]"
     return (*rows, Requirement(name, allowed.limit, overshoot, False, _kept(allowed, overshoot)))
 
 
