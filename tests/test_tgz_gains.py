@@ -115,7 +115,7 @@ def test_p_k_and_p_sff_leave_a_lag_of_what_is_not_fed_forward():
 
 
 def test_integration_times_are_what_the_linear_model_and_si_say():
-    gains = np.array([3571, 3077, 6400, 40_000, 31_416])
+    gains = np.array([3571, 3077, 6400, 40_000, 31_416, 0])
     si = gains_in_si(DEVICE, VOLTS, gains)
     assert si.torque_p == pytest.approx(3.571 * VOLTS / OF_LINK)
     assert si.torque_integration == pytest.approx(3.077e-3)
