@@ -133,7 +133,7 @@ def test_what_igh_s_master_makes_of_a_refusal():
 
 
 def test_the_registers_of_an_eni(drives):
-    """Init commands in the order of an ENI: clear, SYNC0 by both bytes of its activation, sync managers, FMMUs, states."""
+    """Init commands in an ENI's order: clear, SYNC0 by both bytes of its activation, sync managers, FMMUs, states."""
     rig = CoeRig(drives)
     outputs, inputs = TWINCAT.sizes
     rig.write(0x0120, "11 00")  # Init, with acknowledge

@@ -6,6 +6,7 @@ import pytest
 
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.ethercat.ethercat_objects import ethercat_objects
 from drive_env.node.axis import ObjectPort
 from drive_env.node.process_image import ASSIGNMENTS, INPUTS, OUTPUTS, ImageObjects
 
@@ -25,6 +26,9 @@ class Image:
     def __init__(self, name, **values):
         self.device, self.values, self.allows = find_device(name), {}, True
         self.entries = self.device.new_dictionary()
+        if self.device.ethercat is not None:  # of what it has there, what can be written there alone
+            written = ethercat_objects(self.device)
+            self.entries = self.entries.including(written[index] for index in self.device.ethercat.writable)
         self.objects = ImageObjects(self.device, self.entries, lambda: self.allows)
         self.objects.connect(self.port)
 

@@ -1,7 +1,7 @@
 """Masters in the field: what each writes in Pre-Op, what its images carry, and how it enables.
 
-Facts of public sources: IgH's master (`fsm_pdo.c`, `fsm_pdo_entry.c`, `fsm_slave_config.c`), ICube's ethercat_driver_ros2
-(the EPOS3 and SV660N configurations, `generic_ec_cia402_drive.cpp`), start-up lists of TwinCAT as PSI's ecmccfg has them
+Facts of public sources: IgH's master (fsm_pdo.c, fsm_pdo_entry.c, fsm_slave_config.c), ICube's ethercat_driver_ros2
+(its EPOS3 and SV660N configurations, generic_ec_cia402_drive.cpp), start-up lists of TwinCAT as PSI's ecmccfg has them
 and an ENI of two IS620N, a configuration of CODESYS with SoftMotion and XINJE DP3C. Each is put to three axes at 800h,
 with the objects that the TMCM-3313 has in place of those that it has not.
 """
@@ -136,8 +136,8 @@ TWINCAT = Startup(
     "Hii", ("word", "target", "speed"), "Hi2x", ("word", "position"), True,
 )  # fmt: skip
 
-# Mode and interpolation time from the device's description; a gap where its drive has a touch probe (60B8h). In which
-# order it writes the rest, no public source tells: here with complete access and the mapping first, as `SOEM #530` has it.
+# Mode and interpolation time from the device's description; a gap where its drive has a touch probe (60B8h). No public
+# source tells in which order it writes the rest: here with complete access and the mapping first, as SOEM's issue 530.
 CODESYS = Startup(
     """
     6060:00 08
@@ -189,7 +189,7 @@ class FieldAxis:
             word = word & 0x7F | 0x0F
         elif shown["word"] & 0x4F == 0x08:
             word |= 0x80
-        # ICube's driver leaves the target alone until the drive shows a mode, and holds where the axis is until enabled.
+        # ICube's driver sends no target until the drive shows a mode, and then where the axis is until it is enabled.
         target = shown["position"] if shown.get("mode", 8) else self.now["target"]
         if self.start is not None:
             target = self.start + min(self.enabled, self.cycles) * self.step
