@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
+import subprocess
 
 import pytest
 from rigs.coe_rig import CoeRig
@@ -13,10 +15,12 @@ from rigs.namespaces import spaces as spaces
 
 from drive_env import EmulatedDrives
 from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.ethercat.pcap_log import PcapLog
 from drive_env.master.ethercat.ethercat_master import ImageSizes, Sync0
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 
 CYCLES, SETTLING = 150, 200
+TSHARK = shutil.which("tshark")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +76,31 @@ def test_a_start_up_can_be_repeated(pre_op, name):
     for one in (*STARTUPS.values(), STARTUPS[name]):
         assert {code for _, code in answers(pre_op, one)} == {0}
     assert (pre_op.node.output_size, pre_op.node.input_size) == STARTUPS[name].sizes
+
+
+@pytest.mark.skipif(TSHARK is None, reason="tshark is not installed (Debian: apt install tshark)")
+@pytest.mark.parametrize("name", STARTUPS)
+def test_wireshark_reads_the_same_writes_and_no_malformed_frame(drives, name, tmp_path):
+    startup, path, rig = STARTUPS[name], tmp_path / "startup.pcap", CoeRig(drives)
+    with PcapLog(path) as log:
+        rig.world.segment.listeners.append(log.add)
+        rig.bring_to(AlState.PRE_OP)
+        answers(rig, startup)
+        outputs, inputs = startup.sizes
+        rig.bring_to(AlState.OP, outputs=outputs, inputs=inputs)
+        moved(lambda images: [rig.exchange_image(images[0], inputs)[0]], startup)
+
+    def dissected(*arguments):
+        done = subprocess.run([TSHARK, "-r", path, *arguments], capture_output=True, text=True, timeout=60.0)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    assert dissected("-Y", "_ws.malformed") == []
+    sent = "ecat_mailbox.coe.sdoccsid && eth.src[0] == 01"  # as they left the master
+    fields = ("ecat_mailbox.coe.sdoidx", "ecat_mailbox.coe.sdosub")
+    found = dissected("-Y", sent, "-T", "fields", *(part for field in fields for part in ("-e", field)))
+    read = [tuple(int(word, 16) for word in line.split()) for line in found]
+    assert read == [(index, sub or 0) for index, sub, _ in startup.rows()]
 
 
 def test_codesys_with_the_assignment_taken_away_first(pre_op):
