@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 
+import numpy as np
 import pytest
 from rigs.coe_rig import CoeRig
 from rigs.ethercat_segment import EmulatedSegment
@@ -13,10 +14,12 @@ from rigs.field_masters import AXES, CODESYS, ENABLED, HAS_STATE, ICUBE, STARTUP
 from rigs.namespaces import needs_namespaces, seen_by
 from rigs.namespaces import spaces as spaces
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, EtherCatDrives, motion
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.pcap_log import PcapLog
 from drive_env.master.ethercat.ethercat_master import ImageSizes, Sync0
+from drive_env.master.ethercat.frame_master import FrameMaster
+from drive_env.master.ethercat.frame_ways import CallWay
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 
 CYCLES, SETTLING = 150, 200
@@ -128,6 +131,24 @@ def test_six_axes_of_two_modules_under_icube_s_configuration(sync0):
         found = moved(lambda images: master.exchange(images, 1.0), ICUBE, slaves=2)
         assert found == pytest.approx([CYCLES * 4 * k for k in range(1, 7)], abs=40)
         master.close()
+
+
+@pytest.mark.parametrize("name", STARTUPS)
+def test_our_master_works_where_another_left_its_mapping_and_puts_it_back(pre_op, name):
+    """Gaps are in it, which no image of ours has."""
+    objects = (0x1600, 0x1A00, 0x1C12, 0x1C13)
+    assert {code for _, code in answers(pre_op, STARTUPS[name])} == {0}
+    left = [pre_op.upload(index, complete=True) for index in objects]
+    master = FrameMaster(CallWay(pre_op.world.receive))
+    with EtherCatDrives("tmcm3313", master=master, nodes=(0,), pace="lockstep") as drives:
+        drives.record([0x6041, 0x6064], 0.002, {0x607A: np.tile(drives.read(0x6064), (2, 1))})  # maps both images
+        motion.enable(drives, mode="csp")
+        start = drives.read(0x6064)
+        targets = start + np.minimum(np.arange(CYCLES + 50), CYCLES)[:, None] * 4
+        trace = drives.record([0x6041, 0x6064], (CYCLES + 50) * 0.001, {0x607A: targets})
+        np.testing.assert_allclose(trace[0x6064][-1] - start, CYCLES * 4, atol=40)
+    pre_op.bring_to(AlState.PRE_OP)
+    assert [pre_op.upload(index, complete=True) for index in objects] == left
 
 
 def igh(master, position, rows):
