@@ -6,6 +6,7 @@ import pytest
 
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.ethercat.ethercat_objects import ethercat_objects
 from drive_env.node.axis import ObjectPort
 from drive_env.node.process_image import ASSIGNMENTS, INPUTS, OUTPUTS, ImageObjects
 
@@ -25,6 +26,9 @@ class Image:
     def __init__(self, name, **values):
         self.device, self.values, self.allows = find_device(name), {}, True
         self.entries = self.device.new_dictionary()
+        if self.device.ethercat is not None:  # of what it has there, what can be written there alone
+            written = ethercat_objects(self.device)
+            self.entries = self.entries.including(written[index] for index in self.device.ethercat.writable)
         self.objects = ImageObjects(self.device, self.entries, lambda: self.allows)
         self.objects.connect(self.port)
 
@@ -109,20 +113,38 @@ def test_an_assignment_names_a_mapping_of_its_own_way(image):
         image.write(0x1C12, 1, 0x1600)
 
 
-def test_a_mapping_is_changed_while_nobody_carries_it(image):
-    with refused("06010000", "1A00h:00 .* is in use; set 1C13h:00 to 0 before changing its mapping"):
-        image.write(0x1A00, 0, 0)
-    image.write(0x1C13, 0, 0)
-    assert image.objects.input_size == 0 and image.objects.mapped(INPUTS) == []
+@pytest.mark.parametrize("is_assigned", [False, True], ids=["assignment away", "assigned"])
+def test_a_mapping_is_changed_whether_or_not_it_is_assigned(image, is_assigned):
+    with refused("06010003", "1A00h:01 .* is one of 9 in use; set sub-index 0 to 0 before"):
+        image.write(0x1A00, 1, 0x60770010)
+    if not is_assigned:
+        image.write(0x1C13, 0, 0)
+        assert image.objects.input_size == 0 and image.objects.mapped(INPUTS) == []
     image.write(0x1A00, 0, 0)
+    assert image.objects.mapped(INPUTS) == ([(0x1A00, [])] if is_assigned else [])
     image.write(0x1A00, 1, 0x60770010)
     image.write(0x1A00, 2, 0)
     image.write(0x1A00, 0, 1)
     with pytest.raises(ObjectAccessError, match="cannot map 0000h:00"):
         image.port(0x1A00, 0).check(2)
+    assert image.objects.input_size == (2 if is_assigned else 0)
+    image.write(0x1C13, 0, 0)
     image.write(0x1C13, 1, 0x1A00)
     image.write(0x1C13, 0, 1)
     assert image.objects.mapped(INPUTS) == [(0x1A00, [0x60770010])] and image.objects.input_size == 2
+
+
+def test_what_gaps_cannot_be_is_told(image):
+    image.write(0x1600, 0, 0)
+    for sub, raw in enumerate((0x00000004, 0x60400010, 0x00000041), 1):
+        image.write(0x1600, sub, raw)
+    with refused("06040041", "1600h:00 .*: 1 entries make 4 bits; fill gaps up to whole bytes"):
+        image.write(0x1600, 0, 1)
+    with refused("06040041", "1600h:00 .*: entry 2 would begin within a byte; fill gaps up to whole bytes"):
+        image.write(0x1600, 0, 2)
+    image.write(0x1600, 1, 0x00000008)
+    with refused("06040042", "1600h:00 .*: entry 3 is a gap of 65 bits; one gap has 64 at most"):
+        image.write(0x1600, 0, 3)
 
 
 def test_of_an_image_s_directions_each_maps_its_own(image):

@@ -9,8 +9,8 @@ from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.dictionary.aborts import (
     CANNOT_BE_MAPPED,
     NO_SUCH_OBJECT,
+    PDO_LENGTH_EXCEEDED,
     SUB_INDEX_ZERO_IN_USE,
-    UNSUPPORTED_ACCESS,
     VALUE_RANGE,
     VALUE_TOO_HIGH,
     WRONG_STATE,
@@ -183,8 +183,8 @@ def test_the_image_is_changed_from_the_outside_in(image):
 @pytest.mark.parametrize(
     ("before", "step", "code"),
     [
-        ([], (0x1600, 0, 0), UNSUPPORTED_ACCESS),  # sync manager 2 carries it
-        ([], (0x1600, 1, 0x60400010), UNSUPPORTED_ACCESS),
+        ([], (0x1600, 0, 0), 0),  # though sync manager 2 carries it
+        ([], (0x1600, 1, 0x60400010), SUB_INDEX_ZERO_IN_USE),
         ([], (0x1C12, 1, 0x1600), SUB_INDEX_ZERO_IN_USE),
         ([], (0x1C12, 0, 2), VALUE_TOO_HIGH),  # table 29: one at most
         ([(0x1C12, 0, 0)], (0x1600, 0, 10), VALUE_TOO_HIGH),  # table 22: nine at most
@@ -208,6 +208,38 @@ def test_what_is_refused(image, before, step, code):
     assert results[-1] == code
 
 
+def remap(image, words, mapping=0x1600):
+    """Write the entries of a mapping that stays assigned; return the answer to their number."""
+    assert write(image, mapping, 0, 0) == 0
+    for sub, word in enumerate(words, 1):
+        assert write(image, mapping, sub, word) == 0
+    return write(image, mapping, 0, len(words))
+
+
+def test_gaps_are_bytes_that_nobody_reads(drives, image):
+    """Entries without an object: before, between (8 bits as 1 and 7) and behind the objects."""
+    assert remap(image, (0x00000010, 0x60600008, 0x00000001, 0x00000007, 0x607A0020, 0x00000008)) == 0
+    assert image.output_size == 2 + 1 + 1 + 4 + 1
+    assert image.write_outputs(b"\xaa\xaa\x08\xaa\x78\x56\x34\x12\xaa")
+    assert (drives.read(0x6060)[0], drives.read(0x607A)[0]) == (8, 0x12345678)
+    assert remap(image, (0x60610008, 0x00000018, 0x60410010), 0x1A00) == 0
+    word = drives.read(0x6041)[0]
+    assert image.read_inputs() == b"\x08" + bytes(3) + int(word).to_bytes(2, "little")
+    assert remap(image, (0x00000040, 0x00000040)) == 0
+    assert image.output_size == 16 and image.write_outputs(bytes(range(16)))
+
+
+@pytest.mark.parametrize(("words", "code"), [
+    ((0x60600008, 0x00000004, 0x60400010), CANNOT_BE_MAPPED),  # the controlword within a byte
+    ((0x60600008, 0x00000004), CANNOT_BE_MAPPED),  # the next mapping within a byte
+    ((0x60600008, 0x00000041), PDO_LENGTH_EXCEEDED),  # 65 bits
+    ((0x60600008, 0x00000000), NO_SUCH_OBJECT),  # a gap of nothing is none
+])  # fmt: skip
+def test_gaps_that_the_drive_cannot_carry(image, words, code):
+    assert remap(image, words) == code
+    assert (image.dictionary.port(0x1600, 0).read(), image.output_size) == (0, 0)
+
+
 def test_an_entry_that_is_unused_is_checked_when_it_is_used(image):
     for step in ((0x1C12, 0, 0), (0x1600, 0, 0), (0x1600, 2, 0)):
         assert write(image, *step) == 0
@@ -223,5 +255,5 @@ def test_it_stays_as_it_is_while_the_node_says_so(drives):
 
 @pytest.mark.parametrize("key", [(0x1600, 0), (0x1A00, 2), (0x1C00, 1), (0x1C12, 0), (0x1C13, 1)])
 def test_without_it_its_objects_are_read_only(drives, key):
-    with pytest.raises(ObjectAccessError, match="no service behind it"):
+    with pytest.raises(ObjectAccessError, match="can only be read"):
         drives.write(key, drives.read(key))

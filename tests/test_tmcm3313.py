@@ -19,7 +19,7 @@ from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import (
-    CANNOT_BE_STORED,
+    READ_ONLY,
     UNSUPPORTED_ACCESS,
     VALUE_RANGE,
     VALUE_TOO_HIGH,
@@ -222,6 +222,32 @@ def test_the_pid_of_table_3(viscous, mode):
     assert abs(pushed) > 900 and abs(left) > 1000
 
 
+def test_the_actual_velocity_is_the_motor_s_where_an_encoder_shows_it():
+    """606Ch in open loop: of a rotor that is held, turns with its field, and is turned by force while it is off.
+
+    606Ah = 0 on axes 0 and 2. Without an encoder (axis 1) nothing but the steps can be shown.
+    """
+    held = {"load.viscous": np.array([20.0, 20.0, 0.005]), "load.inertia": 1e-6}
+    with EmulatedDrives("tmcm3313", "inertia", num_machines=AXES, parameters=held, num_threads=1) as drives:
+        drives.write(0x606A, np.array([0, -1, 0]))
+        drives.write(0x6065, 0)
+        motion.enable(drives, mode="pv")
+        drives.write(0x60FF, 40_000)
+        drives.advance(0.5)
+        trace = drives.record([0x606C, 0x6064], 0.5)
+        shown, slope = trace[0x606C].mean(axis=0), np.diff(trace[0x6064], axis=0).mean(axis=0) * 1000.0
+        assert abs(shown[0]) < 2000 and shown[1] == 40_000
+        assert shown[2] == pytest.approx(40_000, rel=0.02)
+        np.testing.assert_allclose(shown, slope, atol=800)
+        motion.disable(drives)
+        drives.machine.load_torque = np.array([0.0, 0.0, 0.05])
+        drives.advance(0.2)
+        before = drives.machine.rotor_angle[2]
+        shown = drives.record([0x606C], 0.5)[0x606C][:, 2].mean()
+        turned = (drives.machine.rotor_angle[2] - before) / (2.0 * np.pi) * 51_200
+        assert turned > 15_000 and shown == pytest.approx(turned / 0.5, rel=0.01)
+
+
 # Table 286: the edge that a method ends at, or from which on, and which way, it looks for an index.
 EDGES = {"left": -0.23, "right": 0.23, "home left": -0.06, "home right": -0.02}
 START, BELT, INDEX = -0.1, 0.032, 1.0  # m; m per turn; rad of the rotor from the start
@@ -391,7 +417,7 @@ def test_the_image_is_read_over_can_and_not_changed(wire, index):
     image = ProcessImage(wire.drives)
     for sub in (0, 1):
         assert wire.value(index, sub) == image.dictionary.port(index, sub).read()
-    assert wire.download(index, 0, 0, 1) == CANNOT_BE_STORED
+    assert wire.download(index, 0, 0, 1) == READ_ONLY
 
 
 def test_pdos_of_axis_0_are_those_of_cia_301_and_the_others_have_no_identifier(wire):

@@ -15,6 +15,7 @@ import pytest
 
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.ethercat.ethercat_objects import entries_on_ethercat
 
 EDS = Path(__file__).parents[1] / "drive_env" / "devices" / "tmcm3313" / "tmcm3313.eds"
 NODE, AXES = 5, 3
@@ -212,6 +213,10 @@ DECIDED = """
 6061:0 I8 ro ? 0/1/3/6/8/9/10 0               a display
 60FD:0 U32 ro yes - 0                         inputs
 6502:0 U32 ro no - 3A5h                       pp, pv, hm, csp, csv, cst: bits 0, 2, 5, 7, 8, 9
+2001:0 U16 rw no 1...65535 200                0 full steps make no scale of positions
+2020:0 U8 rw no 0...3 0                       what sections 4.2.17 and 1.6.2 know
+208C:0 U8 rw no 181 181                       units of the chip are not emulated
+60F2:0 U16 rw no 0...2 0                      table 248; 3 is reserved
 """
 # Numbers of entries that the manual has no row for, of objects that have a first one.
 UNPRINTED = {0x2002: 2, 0x200B: 3, 0x200C: 2, 0x200F: 3, 0x210B: 3, 0x2703: 2, 0x270E: 4, 0x607D: 2, 0x6099: 2}
@@ -257,12 +262,17 @@ def dictionary():
     return ObjectDictionary(EDS, NODE)
 
 
+@pytest.fixture(scope="module")
+def on_ethercat(dictionary):
+    return entries_on_ethercat(find_device("tmcm3313"), dictionary)
+
+
 @pytest.mark.parametrize("key", TAKEN)
-def test_an_entry_is_as_the_manual_prints_it_on_every_axis(dictionary, key):
+def test_an_entry_is_as_the_manual_prints_it_on_every_axis(on_ethercat, key):
     kind, access, mapping, limits, default = TAKEN[key]
     index, sub = split(key)
     for axis in range(AXES):
-        entry = dictionary.find((of_axis(index, axis), sub))
+        entry = on_ethercat.find((of_axis(index, axis), sub))
         assert (entry.access, entry.pdo_mappable) == (access, mapping in ("yes", "?"))
         if kind == "STR":
             assert entry.bits is None
@@ -301,6 +311,12 @@ def test_there_is_nothing_else_but_the_extension_for_can(dictionary):
         if key in counts:
             assert (entry.access, entry.low, entry.default, entry.high) == ("ro", *3 * (counts[key],))
     assert manual | set(counts) <= {(entry.index, entry.sub) for entry in dictionary}
+
+
+def test_in_the_eds_which_is_can_s_the_image_is_read_only(dictionary):
+    """Its maps are longer than a frame, and only EtherCAT has sync managers."""
+    image = [one for one in dictionary if one.index in (0x1600, 0x1A00, 0x1C00, 0x1C12, 0x1C13)]
+    assert len(image) == 29 and {one.access for one in image} == {"ro"}
 
 
 def test_the_extension_is_what_a_node_on_can_needs(dictionary):

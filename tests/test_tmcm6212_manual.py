@@ -42,6 +42,23 @@ def test_how_to_move_a_motor_in_pp(drives):
     assert drives.machine.rotor_angle[0] / (2 * np.pi) == pytest.approx(500_000 / TURN, abs=0.002)
 
 
+def test_its_maker_s_demonstration_of_pp():
+    """PyTrinamic's pp example for this module: of the ramp it writes 6083h alone, and waits for the position."""
+    with EmulatedDrives("tmcm6212", "inertia", num_machines=6, num_threads=1, commissioned=False) as drives:
+        wire = Wire(drives)
+        for index, raw, size in ((0x2005, 3, 4), (0x6040, 6, 2), (0x6040, 7, 2), (0x6060, 1, 1), (0x6040, 15, 2),
+                                 (0x607A, 50_000, 4), (0x6083, 20_000, 4)):  # fmt: skip
+            assert wire.download(index, 0, raw, size) == 0
+            wire.wait(2)
+        for target in (50_000, 0):
+            for index, raw, size in ((0x607A, target, 4), (0x6040, 15, 2), (0x6040, 31, 2)):
+                assert wire.download(index, 0, raw, size) == 0
+                wire.wait(2)
+            wire.wait(3400)  # 2 sqrt(50,000 / 20,000) s
+            assert wire.value(0x6064) == target
+        assert wire.value(0x6081) == 51_200
+
+
 def test_how_to_move_a_motor_in_pv(drives):
     write(drives, (0x2005, 3), (0x6060, 3), (0x6040, 6), (0x6040, 7), (0x6040, 15), (0x60FF, 100_000))
     drives.advance(0.5)

@@ -20,6 +20,7 @@ from drive_env.dictionary.aborts import (
     READ_ONLY,
     VALUE_RANGE,
     VALUE_TOO_HIGH,
+    VALUE_TOO_LOW,
     WRONG_STATE,
 )
 
@@ -93,8 +94,9 @@ def test_an_axis_has_its_own_objects(wire, axis):
         (0x1580, 1, 0, 4, NO_SUCH_OBJECT),
         (0x1440, 2, 1, 1, READ_ONLY),  # received PDOs are asynchronous for ever
         (0x1840, 2, 245, 1, VALUE_RANGE),
-        (0x8860, 0, 10, 1, VALUE_RANGE),  # cst
-        (0x2A01, 0, 0, 2, VALUE_RANGE),
+        (0x8860, 0, 10, 1, VALUE_TOO_HIGH),  # cst
+        (0x8860, 0, 2, 1, VALUE_RANGE),
+        (0x2A01, 0, 0, 2, VALUE_TOO_LOW),
         (0x1B40, 4, 0, 4, NO_SUCH_SUB_INDEX),  # a fourth object in a PDO
         (0x300E, 1, 0, 4, READ_ONLY),
         (0x1010, 9, 0, 4, CANNOT_BE_STORED),  # without the signature

@@ -34,6 +34,7 @@ class EtherCatBehaviour(NamedTuple):
         inputs: Address of sync manager 3.
         only_on_can: Objects whose names begin so are not there on EtherCAT; "": all are.
         can_indices: Ranges of indices, first and last, that are not there on EtherCAT either.
+        writable: Indices of objects that the EDS, which is CAN's, has read only, and that can be written on EtherCAT.
         shortest_cycle: Of SYNC0 [s].
         eeprom: Size [bytes].
     """
@@ -48,6 +49,7 @@ class EtherCatBehaviour(NamedTuple):
     shortest_cycle: float
     eeprom: int
     can_indices: tuple[tuple[int, int], ...] = ()
+    writable: tuple[int, ...] = ()
 
     def has(self, index: int, name: str) -> bool:
         """Return whether an object is there on EtherCAT."""
@@ -68,6 +70,7 @@ def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
         raise ValueError(f"ethercat lacks {', '.join(missing)}")
     row: dict[str, Any] = {key: Place(*value) if key in PLACES else value for key, value in data.items()}
     row["can_indices"] = tuple((first, last) for first, last in data.get("can_indices", ()))
+    row["writable"] = tuple(data.get("writable", ()))
     found = EtherCatBehaviour(**row)
     for name in PLACES:
         start, length = getattr(found, name)

@@ -1,4 +1,4 @@
-"""Objects that EtherCAT asks for, and that an EDS does not list: 1C00h, ready-made images, 1C32h and 1C33h.
+"""Objects that EtherCAT asks for, and that an EDS lists otherwise or not: 1C00h, images, 1C32h and 1C33h.
 
 By 1C00h a master reads what each sync manager does, by the object of an image what is in it (ETG.1000.6, 5.6.7.4), by
 1C32h and 1C33h how a slave is synchronised (ETG.1020, 22). They are there on EtherCAT alone.
@@ -6,11 +6,13 @@ By 1C00h a master reads what each sync manager does, by the object of an image w
 
 from __future__ import annotations
 
+import copy
+
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drive_env.devices import Device
 from drive_env.devices.image_rows import TYPES, FixedImage, fixed_images
-from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.dictionary.entries import ObjectDictionary, read_eds
 from drive_env.node.process_image import SYNC_MANAGER_TYPES, SYNCHRONISATION
 
 U8, U16, U32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
@@ -36,9 +38,11 @@ ROWS = (
 
 def ethercat_objects(device: Device) -> dict[int, ODArray | ODRecord]:
     """Return the objects that a device has on EtherCAT besides those of its EDS, or in place of them, by index."""
+    assert device.ethercat is not None, "it is asked for devices with EtherCAT"
     dictionary = device.new_dictionary()
     images = fixed_images(device.presets.parent)
     found = {index: _image(index, image, dictionary) for index, image in images.items()}
+    found |= {index: _written(read_eds(device.eds)[index]) for index in device.ethercat.writable}
     if not dictionary.has(SYNC_MANAGER_TYPES):
         found[SYNC_MANAGER_TYPES] = _object(
             ODArray("Sync manager type", SYNC_MANAGER_TYPES),
@@ -64,6 +68,14 @@ def _object(
         member.data_type, member.access_type, member.default = kind, access, default
         member.pdo_mappable = False
         item.add_member(member)
+    return item
+
+
+def _written(item: ODArray | ODRecord) -> ODArray | ODRecord:
+    """Return an object of the EDS as one that can be written."""
+    item = copy.deepcopy(item)
+    for member in item.values():
+        member.access_type = "rw"
     return item
 
 

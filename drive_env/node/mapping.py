@@ -24,6 +24,36 @@ def parse(raw: int) -> tuple[int, int, int]:
     return raw >> 16, raw >> 8 & 0xFF, raw & 0xFF
 
 
+def is_gap(raw: int) -> bool:
+    """Return whether a mapping entry is a gap: bits of a process image that belong to no object (ETG.1000.6)."""
+    return 0 < raw <= 0xFF
+
+
+def check_gaps(entry: Entry, raws: Sequence[int]) -> None:
+    """Check the gaps among these entries, written to sub-index 0; entries that are objects have whole bytes.
+
+    Raises:
+        ObjectAccessError: 06040041h if an object, or the mapping's end, does not lie on a byte's border; 06040042h for
+            a gap that is longer than any object.
+    """
+    bits = 0
+    for sub, raw in enumerate(raws, 1):
+        if not is_gap(raw) and bits % 8:
+            raise ObjectAccessError(
+                CANNOT_BE_MAPPED, f"{entry.label}: entry {sub} would begin within a byte; fill gaps up to whole bytes"
+            )
+        if is_gap(raw) and raw > MAX_BITS:
+            raise ObjectAccessError(
+                PDO_LENGTH_EXCEEDED,
+                f"{entry.label}: entry {sub} is a gap of {raw} bits; one gap has {MAX_BITS} at most",
+            )
+        bits += raw & 0xFF
+    if bits % 8:
+        raise ObjectAccessError(
+            CANNOT_BE_MAPPED, f"{entry.label}: {len(raws)} entries make {bits} bits; fill gaps up to whole bytes"
+        )
+
+
 def check_may_change(entry: Entry, is_on: bool, count: int) -> None:
     """Raise 06010000h for a change of a mapping while its PDO is on, or of an entry while the mapping is in use."""
     if is_on:

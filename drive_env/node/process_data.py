@@ -59,15 +59,22 @@ class MappedObjects:
     """Objects in the order in which they travel.
 
     Args:
-        ports: The ways to them.
+        fields: The ways to them; for a gap, its length [bits]. Objects begin on a byte.
 
     Attributes:
         size: Length of their data [bytes].
     """
 
-    def __init__(self, ports: Sequence[ObjectPort]) -> None:
-        letters = [mapping.LAYOUT[port.entry.bits or 0][port.entry.signed] for port in ports]
-        self._layout = struct.Struct("<" + "".join(letters))
+    def __init__(self, fields: Sequence[ObjectPort | int]) -> None:
+        letters, gap, ports = "<", 0, []
+        for field in fields:
+            if isinstance(field, int):
+                gap += field
+                continue
+            letters += f"{gap // 8}x{mapping.LAYOUT[field.entry.bits or 0][field.entry.signed]}"
+            gap = 0
+            ports.append(field)
+        self._layout = struct.Struct(f"{letters}{gap // 8}x")
         self.size = self._layout.size
         self._readers = [port.read for port in ports]
         self._fields = ReceivedFields(ports)

@@ -3,8 +3,9 @@
 Sync manager 2 carries what the master sends (outputs), sync manager 3 what the drive answers (inputs). 1C12h and 1C13h
 name the mapping objects that each carries, and those the objects, one behind the other without gaps. An image is not
 bound to the 8 bytes of a frame on CAN. Some devices have images that are ready-made (`fixed_images.py`), and no mapping
-objects: 1C12h and 1C13h name one of these. It is changed from the outside in: no assignment (1C12h:00 = 0), no entries
-(1600h:00 = 0), entries, their number, the assignment.
+objects: 1C12h and 1C13h name one of these. Entries change while their number is 0 (1600h:00), assignments while theirs
+is (1C12h:00). Whether a mapping is assigned meanwhile does not matter: some masters take the assignment away first,
+others write it last. An entry without an object (0000h:00) is a gap.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from drive_env.devices import Device
 from drive_env.devices.image_rows import fixed_images
 from drive_env.dictionary.aborts import (
     SUB_INDEX_ZERO_IN_USE,
-    UNSUPPORTED_ACCESS,
     VALUE_RANGE,
     WRONG_STATE,
     ObjectAccessError,
@@ -175,8 +175,10 @@ class ImageObjects:
         ready_made = next((self._fixed[index] for index in self._assigned(direction) if index in self._fixed), None)
         if ready_made is not None:
             return PackedFields(ready_made.fields, self._port_of)
-        mapped = [mapping.parse(raw) for _, raws in self.mapped(direction) for raw in raws]
-        return MappedObjects([self._port_of(index, sub) for index, sub, _ in mapped])
+        raws = [raw for _, mapped in self.mapped(direction) for raw in mapped]
+        return MappedObjects(
+            [raw if mapping.is_gap(raw) else self._port_of(raw >> 16, raw >> 8 & 0xFF) for raw in raws]
+        )
 
     def _assigned(self, direction: int) -> list[int]:
         return [self._values[direction, sub] for sub in range(1, self._values[direction, 0] + 1)]
@@ -208,16 +210,14 @@ class ImageObjects:
         return fixed.is_output == (direction == OUTPUTS) if fixed else self._mappings.get(index) == direction
 
     def _check_mapping(self, entry: Entry, raw: int) -> None:
-        direction = self._mappings[entry.index]
-        if entry.index in self._assigned(direction):
-            raise ObjectAccessError(
-                UNSUPPORTED_ACCESS, f"{entry.label} is in use; set {direction:04X}h:00 to 0 before changing its mapping"
-            )
         self._check_sub_index(entry)
-        transmit = direction == INPUTS
-        subs = range(1, raw + 1) if entry.sub == 0 else ()
-        for mapped in [self._values[entry.index, sub] for sub in subs] or ([raw] if entry.sub and raw else []):
-            mapping.check_mappable(entry, mapped, transmit, self._find)
+        is_count = entry.sub == 0
+        raws = [self._values[entry.index, sub] for sub in range(1, raw + 1)] if is_count else [raw] if raw else []
+        for mapped in raws:
+            if not mapping.is_gap(mapped):
+                mapping.check_mappable(entry, mapped, self._mappings[entry.index] == INPUTS, self._find)
+        if is_count:
+            mapping.check_gaps(entry, raws)
 
     def _check_sub_index(self, entry: Entry) -> None:
         count = self._values[entry.index, 0]

@@ -20,7 +20,8 @@ def encoder_position(drive, lane):
 def see_axis(drive):
     """Let an axis in a loop be where the encoder sees it.
 
-    Writes loop_deviation and encoder_shift; in a loop theta_meas, omega_meas, theta_encoder and position_actual.
+    Writes loop_deviation, encoder_shift and omega_shown; in a loop theta_meas, omega_meas, theta_encoder and
+    position_actual.
     """
     for lane in range(LANES):
         turned = encoder_position(drive, lane)
@@ -31,6 +32,8 @@ def see_axis(drive):
         drive.loop_deviation[lane] = drive.step_position[lane] - (turned + drive.loop_offset[lane])
         drive.theta_meas[lane] = shown if closed else drive.theta_meas[lane]
         drive.omega_meas[lane] = drive.omega_encoder[lane] if closed else drive.omega_meas[lane]
+        sees = drive.position_sensor[lane] > -0.5
+        drive.omega_shown[lane] = drive.omega_encoder[lane] if sees else drive.omega_meas[lane]
         drive.theta_encoder[lane] = shown if closed else drive.theta_encoder[lane]
         drive.position_actual[lane] = shown if closed else drive.position_actual[lane]
         drive.deviation[lane] = 0.0 if closed else drive.deviation[lane]  # theta_meas is the encoder's

@@ -40,6 +40,7 @@ STATE = (
     Field("loop_scale", "f8", "", "2033h: scale of the current now, 0...255", 255.0),
     Field("loop_initialised", "i4", "", "2120h: 1 once load angle control works"),
     Field("torque_current", "f8", "A", "6077h: current that makes torque"),
+    Field("omega_shown", "f8", "rad/s", "606Ch: speed by the encoder where there is one (606Ah), else of the steps"),
     # --- how the loop stands --------------------------------------------------------------------------------------
     Field("corrects", "f8", "", "1: a PID may move the field"),
     Field("settle_time", "f8", "s", "for which the initialisation has held the rotor"),

@@ -1,0 +1,117 @@
+"""What an EDS says of a node on CAN, as python-canopen reads it, is what the node does."""
+
+from __future__ import annotations
+
+import io
+import itertools
+
+import canopen
+import pytest
+from canopen.objectdictionary import ODVariable, datatypes
+from rigs.canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.devices import find_device
+from drive_env.dictionary.aborts import (
+    CANNOT_BE_STORED,
+    READ_ONLY,
+    VALUE_RANGE,
+    VALUE_TOO_HIGH,
+    VALUE_TOO_LOW,
+)
+from drive_env.dictionary.entries import eds_text
+
+DEVICES = ("tmcm1636", "tmcm1636_fw109", "tmcm3313", "tmcm6212")
+NODE = 5
+
+
+@pytest.fixture(scope="module", params=DEVICES)
+def name(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def variables(name):
+    """Return the variables of the EDS by index and sub-index."""
+    source = io.StringIO(eds_text(find_device(name).eds))
+    source.name = f"{name}.eds"
+    found = {}
+    for item in canopen.import_od(source, NODE).values():
+        for one in [item] if isinstance(item, ODVariable) else item.values():
+            found[one.index, one.subindex] = one
+    return found
+
+
+@pytest.fixture
+def wire(name):
+    """A node with factory values."""
+    axes = find_device(name).num_axes
+    with EmulatedDrives(name, "inertia", num_machines=axes, num_threads=1, commissioned=False) as drives:
+        yield Wire(drives, NODE)
+
+
+def numbers(variables):
+    """Return the integers."""
+    return [one for one in variables.values() if one.data_type in datatypes.INTEGER_TYPES]
+
+
+def test_both_limits_of_an_object_are_taken(wire, variables):
+    """Not in each state, and not each number between them: `[values]` of the device's data has the steps."""
+    ends = [(one, raw) for one in numbers(variables) if "w" in one.access_type for raw in (one.min, one.max)]
+    refused = {VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW, CANNOT_BE_STORED, READ_ONLY}
+    wrong = [
+        f"{one.index:04X}:{one.subindex} {raw}"
+        for one, raw in ends
+        if raw is not None and wire.download(one.index, one.subindex, raw, len(one) // 8) in refused
+    ]
+    assert len(ends) > 100 and wrong == []
+
+
+def test_the_limits_are_those_of_the_values_that_the_device_knows(name, variables):
+    device = find_device(name)
+    for key, known in device.allowed_values.items():
+        if key in variables and "w" in variables[key].access_type:
+            one = variables[key]
+            low = one.min if one.min is not None else 0
+            high = one.max if one.max is not None else 2 ** len(one) - 1
+            assert (low, high) == (min(known), max(known)), f"{key[0]:04X}h:{key[1]}"
+
+
+def test_what_can_be_written_has_a_service_behind_it_or_a_reason(name, wire, variables):
+    """Of the TMCM-3313 everything has: what EtherCAT alone can write is read only."""
+    device = find_device(name)
+    without = {
+        (one.index, one.subindex)
+        for one in numbers(variables)
+        if one.access_type in ("rw", "wo")
+        and one.index not in (0x1010, 0x1011)  # which take their signatures alone
+        and wire.download(one.index, one.subindex, int(one.default or 0), len(one) // 8) == CANNOT_BE_STORED
+    }
+    assert without <= device.unsupported.keys()
+    assert name != "tmcm3313" or without == set()
+
+
+def test_the_identity_is_that_of_the_eds(wire, variables):
+    """The emulated serial number is the node-ID."""
+    subs = [one for one in variables.values() if one.index == 0x1018]
+    assert len(subs) > 3
+    for one in subs:
+        assert wire.value(0x1018, one.subindex) == one.default, one.name
+
+
+def test_an_inhibit_time_has_the_unit_of_the_eds(wire, variables):
+    first = min(index for index, _ in variables if 0x1800 <= index < 0x1A00)
+    inhibit = variables[first, 3]
+    cob_id = variables[first, 1].default & 0x7FF
+    for index in {index for index, _ in variables if 0x1800 <= index < 0x1A00}:
+        assert wire.download(index, 1, 0xC0000000 | wire.value(index, 1), 4) == 0
+    assert wire.download(first, 3, 20, 2) == 0
+    assert wire.download(first, 1, 0x40000000 | cob_id, 4) == 0
+    wire.start()
+    times = []
+    for k in range(300):
+        assert wire.download(0x6040, 0, 6 * (k % 2), 2) == 0  # each changes the statusword
+        wire.wait(1)
+        times += [k for frame in wire.take() if frame.can_id == cob_id]
+    apart = {later - before for before, later in itertools.pairwise(times)}
+    assert (inhibit.unit, apart) == ("ms", {20})
