@@ -42,15 +42,15 @@ friction, stiffness, motor, power stage, and the delays of the bus.
 
 What is in the table: the best of some twenty policies that have learnt nothing (zero, random, bang-bang on the
 following error or by turns, nine constants; of Tracking eight pairs of gains on the errors of position and speed, of
-GainScheduling five constant sets of gains, the best of a search over 141 among them, of GainTuning 26 constant sets);
-the *cascade* that a drive or a master has anyway, in a tuning with the gains that it is commissioned with; the
-*expert*, which is what a motion engineer would program who knows the parameters of each machine; and agents, trained
-as `drive-agent benchmark --seeds 3` trains them. Baselines and agents have the same 64 held-out episodes; the figure
-is the interquartile mean, of agents with its 95 % interval and with the mean, which sees rare failures. Agents see
-only what the drives tell. An agent ships where it is better than the expert with 95 % confidence, and the Ms of
-its loops is at most 2 on 32 drawn machines: it then answers following errors by less than it had learnt
-(`drive-agent margins agent.npz --dynamics standard --out calm.npz`), which costs some of its score. Where none ships,
-take the expert.
+StepperRun eight speeds that are kept, of GainScheduling five constant sets of gains, the best of a search over 141
+among them, of GainTuning 26 constant sets); the *cascade* that a drive or a master has anyway, in a tuning with the
+gains that it is commissioned with; the *expert*, which is what a motion engineer would program who knows the
+parameters of each machine; and agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents
+have the same 64 held-out episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the
+mean, which sees rare failures. Agents see only what the drives tell. An agent ships where it is better than the expert
+with 95 % confidence, and the Ms of its loops is at most 2 on 32 drawn machines: it then answers following errors by
+less than it had learnt (`drive-agent margins agent.npz --dynamics standard --out calm.npz`), which costs some of its
+score. Where none ships, take the expert.
 
 """
 
@@ -66,7 +66,13 @@ def page() -> str:
             *rows,
         ]
     )
-    return INTRODUCTION + table + "\n\n" + "\n".join(_section(*item) for item in TASKS.items()) + _spaces()
+    return (
+        INTRODUCTION
+        + table
+        + "\n\n"
+        + "\n".join(_section(name, task, scores.get(name, {})) for name, task in TASKS.items())
+        + _spaces()
+    )
 
 
 def _row(name: str, task: SuiteTask, scores: dict[str, Any]) -> str:
@@ -94,7 +100,7 @@ def _ships(scores: dict[str, Any]) -> str:
     ) or "-"  # fmt: skip
 
 
-def _section(name: str, task: SuiteTask) -> str:
+def _section(name: str, task: SuiteTask, scores: dict[str, Any]) -> str:
     options = "\n".join(f"{key} = {_toml(value)}" for key, value in task.options.items() if not isinstance(value, dict))
     tables = "\n".join(
         f"{key} = {_toml({one: part for one, part in value.items() if part})}"
@@ -104,6 +110,10 @@ def _section(name: str, task: SuiteTask) -> str:
     first = str(inspect.getdoc(SUITE_TASKS[name]["expert"])).partition("\n")[0].rstrip(".")
     expert, curves = first.removeprefix("Return the "), CURVES.format(short_name(name))
     picture = f"assets/tasks/{short_name(name)}.webp"
+    if "oracle" in SUITE_TASKS[name]:
+        oracle = str(inspect.getdoc(SUITE_TASKS[name]["oracle"])).partition("\n")[0].rstrip(".")
+        known = scores["baselines"]["oracle"]
+        expert += f". An oracle, {oracle[0].lower()}{oracle[1:]}, has {known:.3f}"
     return "\n".join(
         [
             f"## {name.partition('/')[2]}\n",
