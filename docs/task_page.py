@@ -66,12 +66,21 @@ def page() -> str:
             *rows,
         ]
     )
-    return (
-        INTRODUCTION
-        + table
-        + "\n\n"
-        + "\n".join(_section(name, task, scores.get(name, {})) for name, task in TASKS.items())
-        + _spaces()
+    sections = "\n".join(_section(name, task, scores.get(name, {})) for name, task in TASKS.items())
+    return f"{INTRODUCTION}{table}\n\n{_verdict(scores)}\n\n{sections}{_spaces()}"
+
+
+def _verdict(scores: dict[str, Any]) -> str:
+    """Return on which tasks learning wins and where it loses to the expert, by the agents' 95 % intervals."""
+    found: dict[str, list[str]] = {"is better than": [], "loses to": [], "cannot be told from": []}
+    for name in TASKS:
+        expert = scores.get(name, {}).get("baselines", {}).get("expert", 0.0)
+        for policy, one in scores.get(name, {}).get("trained", {}).items():
+            is_better, is_worse = one["low"] > expert, one["high"] < expert
+            verdict = "is better than" if is_better else "loses to" if is_worse else "cannot be told from"
+            found[verdict].append(f"{name.partition('/')[2]} ({policy})")
+    return "\n".join(
+        f"- Learning {verdict} the expert on {', '.join(tasks)}." for verdict, tasks in found.items() if tasks
     )
 
 
