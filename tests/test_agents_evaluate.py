@@ -329,6 +329,12 @@ def test_drawn_machines_are_those_of_the_seed_and_number():
     assert {name: float(found[name][0]) for name in three[1].parameters} == pytest.approx(three[1].parameters)
 
 
+def test_machines_of_a_named_set_have_what_their_devices_machines_have():
+    config = make_environments("StepperRun", 1).config
+    (stepper,) = draw_machines(config, 1, 0)
+    assert "motor.L_s" in stepper.parameters and "motor.L_d" not in stepper.parameters
+
+
 def test_a_gap_is_found_and_told():
     one = Evaluation("p", "ServoDrive/Tracking-v0", {}, "emulator", [1, 2, 3], {SCORE: [1.0, 2.0, 3.0]}, {}, {})
     two = Evaluation("p", "ServoDrive/Tracking-v0", {}, "bus", [1, 2, 3], {SCORE: [1.5, 2.5, 3.5]}, {}, {})

@@ -15,7 +15,7 @@ from rigs.world_bus import WorldBus
 
 from agents.evaluation.evaluation import GivenDrives, as_on_a_bus, evaluate
 from agents.policies.deadline import Deadline, DeadlineError
-from agents.policies.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop
+from agents.policies.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop, unchanged
 from agents.policies.policy import PolicyError
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, motion
 from drive_env.bus.hub import Hub
@@ -419,3 +419,13 @@ def test_a_policy_that_nobody_holds_any_more_leaves_no_thread(threads):
     assert len(threads()) == 1
     del policy
     assert wait_for(lambda: not threads())
+
+
+def test_what_must_stay_of_a_stepper_is_what_it_has():
+    """It has no torque offset; its run current and the other offsets are put back."""
+    with EmulatedDrives("tmcm6212", "inertia", num_threads=1) as drives:
+        before = drives.read("Maximum current"), drives.read(0x60B1)
+        with unchanged(drives):
+            drives.write("Maximum current", 100)
+            drives.write(0x60B1, 7)
+        assert (drives.read("Maximum current"), drives.read(0x60B1)) == before

@@ -16,9 +16,10 @@ from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.envs import tracking_cycle as cycle
-from drive_env.envs.suite import TERMS
-from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, WEIGHTS, Tracking, TrackingConfig
+from drive_env.envs.highest_speed import highest_speeds
+from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, TERMS, WEIGHTS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
+from drive_env.phase_current import amplitude, rated_setting
 from mechanics.loads import LOADS as ALL_LOADS
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
@@ -58,6 +59,7 @@ def test_the_page_has_the_terms_of_the_reward_with_their_margins_and_weights():
         "carried": f"g(error of where the bob is, {margins['tracking']:g} amplitude); 0 of a load without sensor",
         "effort": "g(torque actual value, current limit)",
         "smoothness": f"g(change of the action, {margins['smoothness']:g})",
+        "pace": "(velocity / its highest)² forwards, at most 1; what the highest is stands below",
         "trip": "1 in the step in which a drive tripped or the pole fell",
     }
     assert tuple(rows) == TERMS
@@ -611,3 +613,33 @@ def test_a_stepper_has_the_modes_and_speeds_that_suit_it():
     config = TrackingConfig(device="tmcm3313", load="two_mass")
     assert (config.mode, config.speed, config.motor) == ("csp", 5.0, "qsh4218_51")
     assert TrackingConfig(load="two_mass").motor == "qbl4208"
+
+
+def test_the_pace_is_the_share_of_each_machine_s_own_highest_speed_squared():
+    run_up = {"mode": "csv", "action": "ramp", "trajectory": "run", "amplitude": 20.0, "speed": 14.0}
+    weights = dict.fromkeys(WEIGHTS, 0.0) | {"pace": 1.0}
+    with tracking(
+        4, device="tmcm6212", load="inertia", distributions="stepper_run", weights=weights, **run_up
+    ) as lanes:
+        _, info = lanes.reset(seed=5)
+        device, motor = lanes.drives.device, lanes.drives.motor
+        highest = highest_speeds(motor, amplitude(device, rated_setting(device, motor)), info["parameters"])
+        for k in range(100):
+            push = 0.1 if k else 0.0
+            _, reward, _, _, info = lanes.step(np.full((4, 1), push, np.float32))
+            speed = np.maximum(lanes._control.sampled[2, -1], 0) / 51_200.0  # 606Ch in the step's last cycle
+            np.testing.assert_allclose(reward, (speed * 2.0 * np.pi / highest) ** 2, rtol=1e-9)
+            np.testing.assert_array_equal(info["reward_terms"]["pace"], reward)
+        assert np.ptp(highest) > 5.0 and np.all(reward > 0.0)
+        for _ in range(120):
+            _, reward, _, _, _ = lanes.step(np.full((4, 1), -0.2, np.float32))
+        assert np.all(lanes.drives.read(0x606C) < 0) and np.all(reward == 0.0)
+
+
+def test_the_pace_of_a_machine_without_a_highest_speed_is_the_share_of_the_configured_one():
+    with tracking(1, load="inertia", mode="csv", speed=5.0, amplitude=5.0, weights={"pace": 1.0}) as lanes:
+        lanes.reset(seed=0)
+        for _ in range(300):
+            seen, _, _, _, info = lanes.step(np.full((1, 1), 0.4, np.float32))
+        assert seen[0, 3] == pytest.approx(0.5, abs=0.1)  # 0.4 of 1.25 times the speed
+        assert info["reward_terms"]["pace"][0] == pytest.approx(seen[0, 3] ** 2, rel=0.05)

@@ -17,6 +17,7 @@ PAIRS = ((4.0, 0.5), (6.0, 0.5), (8.0, 1.0), (16.0, 1.0), (16.0, 0.1), (32.0, 0.
 CONSTANTS = (-1.0, -0.5, -0.2, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)
 # Velocity P, velocity I and position P: the best of 141 constant sets of the payload tasks, and others near it.
 SETS = ((-0.575, -1.0, 0.05), (-0.41, -0.83, 0.06), (-0.49, -0.78, 0.17), (-0.45, -0.66, -0.07), (-0.25, -0.9, 0.0))
+SPEEDS = (0.3, 0.35, 0.4, 0.43, 0.46, 0.5, 0.55, 0.6)  # of the one that a run asks for
 CORNERS = (-2.0 / 3.0, 0.0, 2.0 / 3.0)  # of a tuning's actions, of which each entry is a gain of its own
 
 # Action of every entry from the errors of position and speed, shape (machines, entries), and a generator. In a tuning
@@ -26,6 +27,11 @@ Plain = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 def _constant(*values: float) -> Plain:
     return lambda error, speed, rng: np.zeros_like(error) + values
+
+
+def _steady(speed: float) -> Plain:
+    """Return the policy that goes to a speed, of the one that is asked for all the time, and keeps it."""
+    return lambda error, slow, rng: np.clip(5.0 * (slow - 1.0 + speed), -1.0, 1.0)
 
 
 def _pair(proportional: float, derivative: float) -> Plain:
@@ -50,6 +56,10 @@ POLICIES: dict[str, dict[str, Plain]] = {
         if any(corner)
     },
 }
+# Likewise, of a task beside those of its environment: of a stepper a speed is what one commands.
+OWN_POLICIES: dict[str, dict[str, Plain]] = {
+    "ServoDrive/StepperRun-v1": {f"speed {share:g}": _steady(share) for share in SPEEDS},
+}
 
 
 def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
@@ -58,7 +68,7 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
     Raises:
         ValueError: If a reward is not in 0...1.
     """
-    policies = POLICIES[environment_of(name)]
+    policies = POLICIES[environment_of(name)] | OWN_POLICIES.get(name, {})
     lanes = make_vector(len(policies) * machines, name=name, autoreset_mode="NextStep")
     try:
         entries = lanes.single_action_space.shape[0]  # type: ignore[index]

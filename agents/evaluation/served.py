@@ -62,8 +62,9 @@ def draw_machines(config: Any, count: int, seed: int) -> list[Machine]:
     with EmulatedDrives(config.device, config.load, config.motor, count, num_threads=1) as drives:
         axes, laws = drives.load.num_axes, config.distributions
         if laws is None:
-            known = drives.machine.parameters
-            laws = laws_of(config.load, drives.device, known) if config.load in shipped() else {"parameters": {}}
+            laws = config.load if config.load in shipped() else {"parameters": {}}
+        if isinstance(laws, str) and laws in shipped():
+            laws = laws_of(laws, drives.device, drives.machine.parameters)
         random = RandomMachines(drives, Distributions.load(laws))
         random.redraw([np.random.default_rng((seed, k)) for k in range(count)])
         drawn = [name for name in random.distributions.laws if name not in BESIDE]

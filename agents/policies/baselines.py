@@ -15,7 +15,9 @@ import numpy as np
 from agents.policies.experts import (
     CarriageServo,
     ComputedTorque,
+    HighestSpeed,
     LeadAndFeedback,
+    LoadAngle,
     MarginDesign,
     PayloadSchedule,
     Pendulum,
@@ -150,6 +152,7 @@ SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
     "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
     "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": LeadAndFeedback},
+    "ServoDrive/StepperRun-v1": {"rest": nothing, "expert": LoadAngle, "oracle": HighestSpeed},
     "ServoDrive/PayloadScheduling-v1": {"cascade": nothing, "expert": PayloadSchedule},
     "ServoDrive/KnownPayload-v1": {"cascade": nothing, "expert": PayloadSchedule},
     "ServoDrive/ServoTuning-v1": {"cascade": nothing, "expert": MarginDesign},

@@ -16,7 +16,9 @@ import numpy as np
 from drive_env.devices import find_device
 from drive_env.devices.gains import Rule, rule_gains
 from drive_env.envs.gain_scheduling import base_inertia
+from drive_env.envs.highest_speed import highest_speeds
 from drive_env.motors import find_motor
+from drive_env.phase_current import amplitude, rated_setting
 from mechanics.arrays import Floats, Singles
 from mechanics.loads import find_load
 
@@ -206,6 +208,45 @@ class PayloadSchedule(Expert):
         base = rule_gains(device, motor, base_inertia(configuration))[:, columns]
         action = np.log(wanted / base) / configuration.span
         return np.broadcast_to(action, (len(rows), action.shape[1]))
+
+
+class LoadAngle(Expert):
+    """A step rate that grows while the rotor lags less behind its steps than is safe at that rate, and else falls.
+
+    The load angle as in closed-loop control (Acarnley, Stepping Motors, 4th edition, chapter 7). The safe lag grows
+    with the rate, since currents lag behind voltages, and the encoder's sample is late; both numbers were found by
+    trying, the same for every machine.
+    """
+
+    LAG, LAG_OF_SPEED = 0.75, 0.077  # full steps, full steps of 1 rev/s
+    GAIN = 1.0  # of the greatest change of the rate, of a full step
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the step rate, of the greatest."""
+        safe = self.LAG + self.LAG_OF_SPEED * self.configuration.speed * rows[:, SPEED]
+        return np.asarray(self.GAIN * (safe - rows[:, TORQUE]))[:, None]
+
+
+class HighestSpeed(Expert):
+    """A step rate just below the highest that each machine's pull-out torque allows.
+
+    It must be told the machine, and refuses where none is known, on a bus.
+    """
+
+    SHARE, GAIN = 0.96, 3.0  # of the highest; of the greatest change of the rate, of `speed`
+
+    def actions(self, rows: Floats) -> Floats:
+        """Return the change of the step rate, of the greatest."""
+        if not self._machine:
+            raise ValueError("the oracle must be told the true machine, which no bus tells; take the expert")
+        speed = self.SHARE * self._highest / (2.0 * np.pi * self.configuration.speed)
+        return np.asarray(self.GAIN * (speed - rows[:, SPEED]))[:, None]
+
+    def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
+        """Find the highest speeds of machines that begin."""
+        super().told(parameters, mask)
+        device, motor = find_device(self.configuration.device), find_motor(self.configuration.motor)
+        self._highest = highest_speeds(motor, amplitude(device, rated_setting(device, motor)), self._machine)
 
 
 class CarriageServo(Expert):

@@ -195,7 +195,9 @@ class GuardedPolicy:
 @contextmanager
 def unchanged(drives: Drives) -> Iterator[None]:
     """Put gains, offsets, profile velocity and mode back as they were when the block ends; log failures."""
-    before = {name: drives.read(name) for name in (*device_of(drives).gains.keys, *KEPT)}
+    device = device_of(drives)
+    kept = [name for name in KEPT if name in device.bindings]  # a stepper has no torque offset
+    before = {name: drives.read(name) for name in (*device.gains.keys, *kept)}
     try:
         yield
     finally:

@@ -24,11 +24,12 @@ from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
+from drive_env.envs.highest_speed import highest_speeds
 from drive_env.envs.pictures import Pictures
-from drive_env.envs.suite import TERMS
 from drive_env.envs.trajectories import TRAJECTORIES, Trajectory, checked, draw
 from drive_env.envs.vector_environment import Info, Observation, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.motors import Motor, find_motor
+from drive_env.phase_current import amplitude, rated_setting
 from drive_env.randomisation.random_machines import Distributions, RandomMachines, laws_of, shipped
 from mechanics.arrays import Floats, Mask, Singles, Texts
 from mechanics.loads import find_load
@@ -46,7 +47,9 @@ SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, ci
 # Of a stepper, which is not asked for a current: how far the rotor is behind its steps tells the torque.
 SAMPLED_OF_STEPPERS = (*SAMPLED[:3], cia402.POSITION_DEMAND)
 ENCODER, ENCODER_OFF = 0, -1  # of 606Ah
-WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "carried": 0.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
+WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "carried": 0.0, "effort": 0.05, "smoothness": 0.05, "pace": 0.0,
+           "trip": 10.0}  # fmt: skip
+TERMS = tuple(WEIGHTS)
 RATES = (500, 1000)
 WITHIN_TRAVEL = 0.8  # of an axis' travel to its end stops: what a trajectory uses at most
 ACTIONS = ("direct", "offset", "ramp")
@@ -273,11 +276,15 @@ class Tracking(VectorEnvironment):
     | carried | g(error of where the bob is, 0.25 amplitude); 0 of a load without sensor | 0 |
     | effort | g(torque actual value, current limit) | 0.05 |
     | smoothness | g(change of the action, 1) | 0.05 |
+    | pace | (velocity / its highest)² forwards, at most 1; what the highest is stands below | 0 |
     | trip | 1 in the step in which a drive tripped or the pole fell | 10, subtracted |
 
     A stepper is observed by its encoder (606Ah = 0, written where the drives are emulated). Demand less position (6062h
     - 6064h) stands for its torque actual value, a full step for its current limit: so far behind it gives the most
     torque that it has; beyond two it loses steps, and 6065h trips.
+
+    The highest velocity of a pace with a weight is that at which an emulated stepper just stays in step with a disc
+    (load inertia; drive_env/envs/highest_speed.py); of other drives and loads, and on a bus, it is `speed`.
 
     `terminated`: a drive tripped, its machine left physics, or the pole fell; `truncated`: time ran out.
 
@@ -396,6 +403,7 @@ class Tracking(VectorEnvironment):
             played=self._control.played,
             sampled=self._control.sampled,
             angles=np.zeros(n),
+            fastest=config.speed * self._speed_counts,
             arm=np.zeros(n),
             weights=np.array([config.weights[name] for name in TERMS], float),
             margins=np.array([config.margins[name] for name in cycle.MARGINS], float),
@@ -451,6 +459,7 @@ class Tracking(VectorEnvironment):
                 self.drives.write(cia402.SENSOR_SELECTION, ENCODER, where=axes)
             motion.enable(self.drives, mode=self.config.mode, where=axes)
             self._tilt(mask)
+            self._find_fastest(mask)
         else:
             self._return_to_start(axes)
         self._take_emergencies()
@@ -498,6 +507,17 @@ class Tracking(VectorEnvironment):
             for lane in np.flatnonzero(mask):
                 angles[lane] = self.rngs[lane].uniform(low, high)
             emulated_of(self.drives).machine.place(joint, angles, mask)
+
+    def _find_fastest(self, mask: Mask) -> None:
+        """Find the speeds that a pace is a share of, where they are the machines' own."""
+        config, device = self.config, device_of(self.drives)
+        if not (config.weights["pace"] and device.gains.is_open_loop and find_load(config.load).name == "inertia"):
+            return
+        assert self._machines is not None
+        motor = find_motor(config.motor)
+        own = {name: values[mask] for name, values in self._machines.values.items()}
+        found = highest_speeds(motor, amplitude(device, rated_setting(device, motor)), own)
+        self._episodes.fastest[mask] = found / (2.0 * np.pi) * self._speed_counts[mask]
 
     def _act(self, action: Any) -> bool:
         """Make a step; return whether any drive went into fault or a pole fell."""

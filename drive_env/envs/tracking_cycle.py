@@ -68,8 +68,9 @@ class Episodes(Bundle):
     played: NumberCube  # written: with an offset the profile's set-points, then the actions', (1 or 2, cycles, axes)
     sampled: NumberCube  # statusword, position, velocity, torque or position demand, (4, cycles, axes)
     angles: Vector  # the pendulums' [rad], (n,)
+    fastest: Vector  # speed that the pace is a share of [606Ch], (axes,)
     arm: Vector  # how far the bob is beside the axis at a right angle [inc], (n,)
-    weights: Vector  # of TERMS
+    weights: Vector  # of the terms
     margins: Vector  # of MARGINS
     observation: Annotated[NDArray[np.float32], types.float32[:, ::1]]  # written, (n, entries)
     reward: Vector  # written, (n,)
@@ -197,7 +198,7 @@ def observe(address, first, count):
         lane = lanes[k]
         begun = lane.step * cycles
         tripped = False
-        tracking, slow, carried, effort, smooth = 0.0, 0.0, 0.0, 0.0, 0.0
+        tracking, slow, carried, effort, smooth, pace = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         at = min(begun + cycles - 1, length - 1)
         for c in range(cycles):
             for a in range(axes):
@@ -218,6 +219,7 @@ def observe(address, first, count):
             felt = torque(own.lags, sampled[3, c, axis], sampled[1, c, axis])
             effort += tolerance(felt / scales[axis, 2], margins[3])
             smooth += tolerance(last[axis, 0] - last[axis, 1], margins[4])
+            pace += min(max(velocity / own.fastest[axis], 0.0), 1.0) ** 2
         fallen = abs(angles[k]) > own.fall
         lane.fallen = 1 if fallen else 0
         terms[0, k] = tracking / axes
@@ -226,11 +228,12 @@ def observe(address, first, count):
         terms[3, k] = carried / axes if has_angle else 0.0
         terms[4, k] = effort / axes
         terms[5, k] = smooth / axes
-        terms[6, k] = 1.0 if tripped or fallen else 0.0
+        terms[6, k] = pace / axes
+        terms[7, k] = 1.0 if tripped or fallen else 0.0
         total = 0.0
         for term in range(terms.shape[0] - 1):
             total += weights[term] * terms[term, k]
-        reward[k] = total - weights[6] * terms[6, k]
+        reward[k] = total - weights[7] * terms[7, k]
         lane.step += 1
         ended[0, k] = tripped or fallen
         ended[1, k] = lane.step >= lane.steps
