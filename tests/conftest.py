@@ -90,7 +90,7 @@ def quick_designs(monkeypatch):
     short_designs(monkeypatch.setattr)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="session")
 def no_numpy_warnings():
     with np.errstate(all="raise", under="ignore"):
         yield

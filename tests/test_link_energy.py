@@ -87,6 +87,7 @@ def identified(num_machines, seed, how=identify):
     return target, found
 
 
+@pytest.mark.slow
 def test_a_vertical_axis_does_not_fall_while_it_is_identified():
     """It fell by 50 turns: the quick way to where its moves begin, downwards, fed back more than the link holds."""
     target, (found,) = identified(1, GUARD_SEED)

@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 
 import pytest
+from rigs.tables import every_row
 
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
@@ -257,7 +258,7 @@ def dictionary():
     return ObjectDictionary(EDS, NODE)
 
 
-@pytest.mark.parametrize("key", TAKEN)
+@every_row("key", TAKEN)
 def test_an_entry_is_as_the_manual_prints_it_on_every_axis(dictionary, key):
     kind, access, mapping, limits, default = TAKEN[key]
     index, sub = split(key)
