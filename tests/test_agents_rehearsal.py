@@ -174,7 +174,6 @@ def test_an_emulated_drive_is_rehearsed_as_well(tmp_path, monkeypatch):
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.every(2)
 @pytest.mark.parametrize(("pace", "of_demand"), [("lockstep", "6062h, 6077h"), ("real-time", "is computed from")])
 def test_a_drive_of_two_axes_on_ethercat_is_rehearsed(pace, of_demand):
     with EmulatedSegment("tgz_d", load="inertia", num_machines=2) as segment:

@@ -523,7 +523,6 @@ def test_a_dry_run_writes_no_object_sends_no_image_and_goes_to_pre_op_at_most(tm
             assert [one for one in sent if writes_an_object(one)], "a run that is not dry is seen so"
 
 
-@pytest.mark.slow
 def test_programs_that_sample_and_move_in_real_time_over_udp(tmp_path):
     with EmulatedSegment(load="inertia", num_machines=3) as segment:
         segment.world.lockstep = False

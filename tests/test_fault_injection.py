@@ -206,7 +206,6 @@ def test_a_signal_at_many_frames_leaves_no_axis_running(emulated, programs, name
 
 
 # --- the harness finds what it is for -------------------------------------------------------------------------------
-@pytest.mark.slow
 @posix_only
 def test_the_verdict_sees_a_program_without_an_envelope_that_is_killed(emulated, programs):
     found = run_and_signal(emulated, programs, "cst_play", "SIGKILL", 150, 1, safety=False, within=0.5)

@@ -148,7 +148,6 @@ def test_a_set_that_is_interrupted_says_what_it_wrote(served_node, monkeypatch):
     assert "6081h:00 Profile velocity may be 7777 by now; drive-env get '6081' shows it\n" in done.stderr
 
 
-@pytest.mark.slow
 def test_a_commissioning_that_is_interrupted_says_what_it_wrote(served_node, monkeypatch):
     machine, bus = served_node
     before = int(machine.read(VELOCITY)[0])

@@ -74,7 +74,6 @@ def test_identification_blames_neither_encoder_nor_wiring_for_late_syncs(late):
         assert not found.wiring, "nothing is to be written for a check that says nothing"
 
 
-@pytest.mark.slow
 def test_auto_names_late_syncs_and_writes_no_wiring(late, tmp_path):
     with late.open() as target:
         before = target.drives.read((0x2080, 1))
@@ -85,7 +84,6 @@ def test_auto_names_late_syncs_and_writes_no_wiring(late, tmp_path):
     assert any(LATE in one for one in axis.reservations)
 
 
-@pytest.mark.slow
 def test_a_response_or_the_envelope_that_stops_it_names_late_syncs_first(late):
     """The envelope stopped it for a travel that it would never have left in time."""
     with late.open() as target:

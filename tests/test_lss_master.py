@@ -114,7 +114,6 @@ def test_a_node_gets_another_node_id_with_its_reset(serve):
     assert served.restart() == [9, 6]
 
 
-@pytest.mark.slow
 def test_a_node_named_by_its_identity_has_a_new_node_id_no_sooner_than_one_named_by_its_old(serve):
     served = serve(5, 6)
     identity = show(FIRST._replace(serial=5))
@@ -144,7 +143,6 @@ def test_a_node_that_does_not_boot_is_told(serve, monkeypatch, node, new, argume
     assert (found[0], said in found[1].replace("\n", " ")) == (1, True), found
 
 
-@pytest.mark.slow
 def test_a_bit_rate_is_stored_for_the_next_power_on(serve):
     served = serve(5, 6)
     code, said = served.run("bit-rate", "500000", "--node", "5", "--yes")
@@ -154,7 +152,6 @@ def test_a_bit_rate_is_stored_for_the_next_power_on(serve):
     assert [node.bit_rate for node in served.nodes] == [500, 1000]
 
 
-@pytest.mark.slow
 def test_an_activated_bit_rate_takes_the_node_off_this_bus(serve):
     served = serve(5, 6)
     assert served.run("bit-rate", "250000", "--node", "5", "--yes", "--no-store", "--activate", "0.02") == (
@@ -170,7 +167,6 @@ def test_an_activated_bit_rate_takes_the_node_off_this_bus(serve):
     assert served.nodes[0].bit_rate == 1000
 
 
-@pytest.mark.slow
 def test_what_a_node_refuses_is_said(serve):
     served = serve(5, 6)
     code, said = served.run("bit-rate", "20000", "--node", "5", "--yes")

@@ -131,7 +131,6 @@ def turned(world, speed=FAST):
 
 
 # --- left running without a watchdog ------------------------------------------------------------------------------
-@pytest.mark.slow
 def test_ctrl_c_in_a_recording_whose_rows_enable(emulated):
     rows = {0x6040: np.concatenate([TO_ENABLE, np.full(440, 0x0F)]), 0x60FF: np.repeat([0, 10 * TURN], [80, 420])}
     with bench(emulated) as (world, bus):
@@ -154,7 +153,6 @@ def test_ctrl_c_in_a_recording_whose_rows_enable(emulated):
             turned(world, 10 * TURN)
 
 
-@pytest.mark.slow
 def test_the_answer_to_the_enabling_write_is_lost(emulated):
     with bench(emulated) as (world, bus):
         lost = []
@@ -173,7 +171,7 @@ def test_the_answer_to_the_enabling_write_is_lost(emulated):
         ended_well(world)
 
 
-@pytest.mark.slow
+@pytest.mark.every(2)
 @pytest.mark.parametrize("lost", ["the first two", "all"])
 def test_stop_controlwords_are_lost(emulated, lost):
     with bench(emulated) as (world, bus):
@@ -195,7 +193,7 @@ def test_stop_controlwords_are_lost(emulated, lost):
         turned(world, SLOW)
 
 
-@pytest.mark.slow
+@pytest.mark.every(2)
 @pytest.mark.parametrize("end", ["close", "death"])
 def test_a_controlword_that_disables_nothing_is_no_stop(emulated, end):
     """8Fh has the bits of enable operation and that of fault reset: the drive stays enabled."""
@@ -213,7 +211,7 @@ def test_a_controlword_that_disables_nothing_is_no_stop(emulated, end):
         turned(world, SLOW)
 
 
-@pytest.mark.slow
+@pytest.mark.every(3)
 @pytest.mark.parametrize("after", [1, 5, 20])
 def test_ctrl_c_pressed_again_while_it_stops(emulated, after):
     """The second and the third come some frames after the first, while the first is being worked on."""
@@ -251,7 +249,7 @@ def test_three_ctrl_c_two_milliseconds_apart(emulated, programs):
     assert not any(found.values()), found
 
 
-@pytest.mark.slow
+@pytest.mark.every(3)
 @pytest.mark.parametrize("doing", ["records", "advances", "computes"])
 def test_another_thread_stops_what_the_program_does(emulated, doing):
     """`Envelope.stop_at_once`: the button of a page, while a job of the same program is under way."""
@@ -287,7 +285,6 @@ def test_another_thread_stops_what_the_program_does(emulated, doing):
         turned(world, SLOW)
 
 
-@pytest.mark.slow
 def test_a_stop_from_another_thread_while_nothing_is_enabled_does_nothing(emulated):
     with bench(emulated) as (world, bus):
 
@@ -301,7 +298,7 @@ def test_a_stop_from_another_thread_while_nothing_is_enabled_does_nothing(emulat
         turned(world, SLOW)
 
 
-@pytest.mark.slow
+@pytest.mark.every(2)
 @pytest.mark.parametrize("when", ["as it is enabled", "while it turns"])
 def test_the_second_of_two_axes_falls_silent(when):
     with EmulatedDrives(load="inertia", num_machines=2, num_threads=1) as two, bench(two, (1, 2)) as (world, bus):
@@ -361,7 +358,6 @@ def test_lockstep_on_a_bus_in_real_time(emulated):
         assert error is not None
 
 
-@pytest.mark.slow
 def test_another_masters_pre_operational_and_then_death(emulated):
     """In pre-operational this drive sees no loss of heartbeats."""
     with bench(emulated) as (world, bus):
@@ -494,7 +490,6 @@ def test_the_travel_is_kept_whatever_the_program_does(emulated, script):
             raise error
 
 
-@pytest.mark.slow
 def test_the_position_cannot_be_mapped(emulated, tmp_path):
     text = find_device("tmcm1636").eds.read_text(encoding="utf-8")
     section = re.search(r"(?ms)^\[6064\].*?(?=^\[)", text)[0]
@@ -559,7 +554,7 @@ def stacked_relative_moves(drives):
     read_on(drives, 1.5)
 
 
-@pytest.mark.slow
+@pytest.mark.every(3)
 @pytest.mark.parametrize("script", [
     coarser_scale, coarser_scale_in_torque, home_and_move_again, offset_in_csp, offset_by_sdo, stacked_relative_moves,
 ], ids=lambda script: script.__name__)  # fmt: skip
@@ -607,7 +602,6 @@ def test_a_stop_does_not_depend_on_what_the_program_wrote(emulated, settings, en
         ended_well(world, LIVING_MASTER)
 
 
-@pytest.mark.slow
 def test_after_our_stop_another_master_enables(emulated):
     with bench(emulated) as (world, bus):
         other = OtherMaster(bus.channel)
@@ -644,7 +638,7 @@ def too_fast(drives):
     drives.record([0x606C], 0.3, play={0x6071: np.full(300, 800)})
 
 
-@pytest.mark.slow
+@pytest.mark.every(4)
 @pytest.mark.parametrize("end", [
     close_at_speed, exception_at_speed, ctrl_c_at_speed, too_fast,
 ], ids=lambda end: end.__name__)  # fmt: skip

@@ -116,7 +116,6 @@ def replay(*arguments, timeout=0.05):
     return result.exit_code, result.stdout, result.stderr
 
 
-@pytest.mark.every(3)
 @pytest.mark.parametrize("frames", [enabled_by_sdo(), BY_RPDO, [START, *enabled_by_sdo()]], ids=["SDO", "RPDO", "both"])
 def test_what_is_enabled_at_the_end_is_stopped_and_said(bus, tmp_path, frames):
     drive = Turning()

@@ -210,7 +210,6 @@ def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back(module):
         assert cob_ids(bus) == before
 
 
-@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("nodes", "more", "says"),
     [

@@ -63,7 +63,6 @@ def test_an_axis_on_its_way_to_operation_enabled_is_called_off_at_the_end(emulat
     assert np.ptp(truth.theta()) < 0.1
 
 
-@pytest.mark.slow
 def test_one_that_is_waited_for_is_watched(emulated):
     """It turns once it is there, and its limits hold."""
 

@@ -237,7 +237,6 @@ def wait(desk, condition, patience=300.0):
         time.sleep(0.01)
 
 
-@pytest.mark.every(2)
 @pytest.mark.parametrize("when", ["identifying", "designing gains on digital twins"])
 def test_auto_is_stopped_and_everything_is_as_before(desk, tmp_path, when):
     before = all_parameters(desk)
@@ -297,7 +296,6 @@ def test_an_agent_tunes_trial_by_trial(desk, tmp_path):
     assert run.verdicts[0].verdict in ("accepted", "accepted with reservations", "rejected")
 
 
-@pytest.mark.slow
 def test_rules_are_side_by_side_once_an_axis_is_identified(desk):
     from tuning.rules.rules_by_name import RULES
     from tuning.studio.rules_card import identified_rows

@@ -125,7 +125,6 @@ def channel():
     world.close()
 
 
-@pytest.mark.every(4)
 @pytest.mark.parametrize(("command", "code"), [
     (("scan", "--last", "2", "--timeout", "3"), 0),
     (("monitor", "-n", "1", "-n", "2", "--duration", "0.01"), 0),

@@ -441,7 +441,6 @@ def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
         assert problems(world.truth, reaction=DEAD_MASTER) == []
 
 
-@pytest.mark.slow
 def test_python_canopen_moves_it_in_pp_and_is_ignored_with_another_d_mode(inside):
     with served(inside) as (world, channel):
         network = canopen.Network()

@@ -118,7 +118,6 @@ SESSIONS = {
 }
 
 
-@pytest.mark.every(3)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     truth, frames, ended = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)

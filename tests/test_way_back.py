@@ -229,7 +229,6 @@ def test_what_a_process_says_at_its_end_is_so(tmp_path, command, how):
 
 
 # --- images of EtherCAT -------------------------------------------------------------------------------------------
-@pytest.mark.slow
 def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
     """A mapping is changed while no sync manager carries it: `undo` was refused 1A00h:01 with 0601 0000h."""
     from rigs.ethercat_served import served
