@@ -1,6 +1,8 @@
 import functools
+import gc
 import signal
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -50,6 +52,25 @@ def pytest_collection_modifyitems(config, items):
         items[:] = [item for item in items if item not in gone]
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session):
+    """Collect tests without the garbage collector: of what is imported nothing goes."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def quick_realtime_sections():
+    """A section in real time freezes what there is, uncollected: with all tests in memory that takes half a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        kept = SimpleNamespace(collect=lambda: None, freeze=gc.freeze, unfreeze=gc.unfreeze)
+        patch.setattr("drive_env.realtime_section.gc", kept)
+        yield
+
+
 @pytest.fixture(scope="session")
 def emulated():
     """Drives of a device by its name, as many as it has axes, made once: what the conformance tests share."""
@@ -90,7 +111,7 @@ def quick_designs(monkeypatch):
     short_designs(monkeypatch.setattr)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="session")
 def no_numpy_warnings():
     with np.errstate(all="raise", under="ignore"):
         yield

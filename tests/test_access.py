@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs.tables import every_row
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
@@ -369,7 +370,7 @@ RANGES = {"1/65536 turn": (-(2**15), 2**15 - 1), "counter": (-(2**31), 2**31 - 1
 
 
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_every_unit_makes_the_round_trip(unit, data):
     scaler = data.draw(st.sampled_from([65536.0, 1.0, 4096.0, 1e6, 2147483647.0, -65536.0]))
@@ -381,7 +382,7 @@ def test_every_unit_makes_the_round_trip(unit, data):
 
 
 @pytest.mark.parametrize("unit", sorted(name for name, row in units.UNITS.items() if not row.period))
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=10, deadline=None, derandomize=True)
 @given(value=st.floats(-1e12, 1e12))
 def test_what_is_encoded_is_rounded_and_saturates(unit, value):
     row = code(unit, -1000, 2000)
@@ -421,7 +422,7 @@ def test_arrays_single_values_and_compiled_code_read_a_row_alike(unit, data):
         assert compiled[0, 0, 0] == found
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("unit", "raw", "si"),
     [  # by hand
         ("mA", 3500, 3.5),

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from rigs.tables import every_row
 from rigs.world_bus import on_a_bus
 
 from drive_env import EmulatedDrives, ObjectAccessError
@@ -106,8 +107,8 @@ def drives(request):
             yield found
 
 
-@pytest.mark.parametrize("value", VALUES, ids=str)
-@pytest.mark.parametrize("name", [0x607A, 0x6040, 0x6081, (0x2042, 1)], ids=str)
+@every_row("value", VALUES)
+@every_row("name", [0x607A, 0x6040, 0x6081, (0x2042, 1)])
 def test_write_takes_whole_numbers_alone(name, value, drives):
     before = drives.read(name)
     with pytest.raises(ObjectAccessError):
@@ -115,7 +116,7 @@ def test_write_takes_whole_numbers_alone(name, value, drives):
     assert drives.read(name) == before
 
 
-@pytest.mark.parametrize("value", VALUES, ids=str)
+@every_row("value", VALUES)
 def test_play_takes_whole_numbers_alone(value, drives):
     rows = [value, value] if isinstance(value, list) else [value] * 3
     before = drives.read(0x607A)
@@ -124,7 +125,7 @@ def test_play_takes_whole_numbers_alone(value, drives):
     assert drives.read(0x607A) == before
 
 
-@pytest.mark.parametrize("value", VALUES, ids=str)
+@every_row("value", VALUES)
 def test_play_that_repeats_takes_whole_numbers_alone(value, drives):
     """The same call again goes a shorter way."""
     for _ in range(3):

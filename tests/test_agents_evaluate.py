@@ -358,6 +358,7 @@ def test_a_gap_is_found_and_told():
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_command_on_both_sides_and_the_gap(tmp_path, served):
     channel, emulated = served
     path = agent(tmp_path / "agent.npz")
@@ -564,6 +565,7 @@ def test_the_gap_as_a_command(tmp_path):
 
 
 # --- ONNX -------------------------------------------------------------------------------------------------------------
+@pytest.mark.every(5)
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
 @pytest.mark.parametrize(("activation", "output"), [("tanh", "clip"), ("relu", "tanh"), ("elu", "clip"),
                                                     ("silu", "tanh"), ("leaky_relu", "clip")])  # fmt: skip

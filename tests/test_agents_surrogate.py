@@ -146,6 +146,7 @@ def test_training_learns_to_foresee_from_other_trials_and_to_judge_a_trial_by_it
 
 
 # --- what it proposes -------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_next_trial_is_the_best_of_all_candidates_wherever_the_incumbent_is(policy, monkeypatch):
     best = np.array([0.4, -1.5, 1.2], np.float32)
     monkeypatch.setattr(policy, "_ask", says(lambda gains: np.abs(gains - best).sum(axis=-1)))
@@ -307,7 +308,7 @@ def test_training_from_nothing_makes_a_tuner_repeats_and_goes_on_from_kept_trial
     assert training.judge(one, policy_of(first), 2, 5).ratio.shape == (1, 2)
 
 
-@pytest.mark.every(4)
+@pytest.mark.slow
 @pytest.mark.parametrize("device", sorted(RECIPES))
 def test_a_recipe_makes_a_tuner_of_its_device_with_figures(device, tmp_path, monkeypatch):
     """From the command line, of its first row's machines."""

@@ -127,7 +127,7 @@ def test_what_is_left_of_a_run(tmp_path):
     assert json.dumps(bundle.card)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_bundle_acts_as_the_model(algorithm, tmp_path):
     bundle = train(tiny(algorithm=algorithm), tmp_path)
@@ -250,6 +250,7 @@ def test_small_errors_cost_thousandths_of_the_amplitude():
 
 
 # --- hyper-parameters -------------------------------------------------------------------------------------------------
+@pytest.mark.every(5)
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_there_are_hyperparameters_for_every_environment_and_algorithm(environment, algorithm, tmp_path):
@@ -262,7 +263,7 @@ def test_there_are_hyperparameters_for_every_environment_and_algorithm(environme
     env.close()
 
 
-@pytest.mark.every(5)
+@pytest.mark.every(10)
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
 def test_every_environment_trains(environment, algorithm, tmp_path):
@@ -270,6 +271,7 @@ def test_every_environment_trains(environment, algorithm, tmp_path):
     assert AgentFile.load(tmp_path / AGENT).environment == bundle.environment
 
 
+@pytest.mark.slow
 def test_an_asymmetric_critic_sees_the_machine_and_the_actor_does_not(tmp_path):
     bundle = train(tiny("gain_tuning", timesteps=32), tmp_path)
     lanes = make_environments("gain_tuning", 1, {"privileged": True})

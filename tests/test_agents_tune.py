@@ -318,7 +318,7 @@ def test_what_shakes_on_with_the_incumbent_is_calmed(monkeypatch):
     assert audit.violations[KINDS.index("oscillated")].tolist() == [0]  # never for 100 ms
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_trial_that_a_fault_ends_names_the_emergency(tmp_path, monkeypatch, number):
     """The rule's trial as well as one of the agent's."""
@@ -387,6 +387,7 @@ def test_it_starts_from_any_gains():
     assert np.all(best < 5.0)
 
 
+@pytest.mark.slow
 def test_as_a_tuner_of_the_comparison_it_tells_its_costs():
     with emulated("tmcm1636", "inertia", "qbl4208", num_machines=2) as target:
         outcome = surrogate(target, np.random.default_rng(0))

@@ -28,6 +28,7 @@ def test_rules_show_gains_margins_and_what_a_relay_measured():
     assert axis["dynamics"] == "standard"
 
 
+@pytest.mark.slow
 def test_rules_say_which_of_them_keep_the_dynamics_asked_for():
     kept = {}
     for dynamics in ("soft", "40/7/2.2"):
@@ -122,6 +123,7 @@ def test_auto_ends_with_1_and_says_why_where_it_changed_nothing(tmp_path, monkey
     assert "axis 0 was not tuned: the travel is too short" in " ".join(done.stdout.split())
 
 
+@pytest.mark.slow
 def test_rules_write_one_of_them_and_leave_the_way_back(tmp_path):
     file = tmp_path / "before.toml"
     done = drive_tune("rules", "cascade", "--load", "inertia", "--apply", "cascade", "--snapshot", file, "--yes")

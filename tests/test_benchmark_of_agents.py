@@ -103,6 +103,7 @@ def test_seeds_of_two_purposes_never_meet():
     assert len(seeds.TEST) >= runs.EPISODES
 
 
+@pytest.mark.slow
 def test_everything_has_the_seeds_of_its_purpose(tmp_path, monkeypatch):
     """A training's, a search's, the benchmark's, and those of `drive-agent evaluate` and of a training's card."""
     met = []
@@ -355,6 +356,7 @@ def test_a_python_function_is_submitted_and_checked(tmp_path):
     assert run("--check", path, "--trust").exit_code == 0
 
 
+@pytest.mark.slow
 def test_a_file_with_pickles_needs_trust(tmp_path):
     from stable_baselines3 import PPO
 

@@ -14,6 +14,7 @@ import can
 import numpy as np
 import pytest
 from rigs.scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.tables import every_row
 
 from drive_env import CanDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
@@ -630,7 +631,7 @@ def test_a_dry_run_prints_frames_and_opens_nothing(capsys):
 KNOWN = find_device("tmcm1636").new_dictionary()
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("name", "text", "raw"),
     [
         (0x6081, "1000 rpm", 1_092_267),

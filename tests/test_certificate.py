@@ -242,6 +242,7 @@ class Page(HTMLParser):
         self.words.append(data.strip())
 
 
+@pytest.mark.slow
 def test_the_report_needs_nothing_from_anywhere(certificate):
     text = to_html(certificate)
     page = Page(text)
@@ -304,6 +305,7 @@ def test_the_report_says_everything_that_the_certificate_holds(certificate):
 DOUBT = "no margins <yet>"
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("accepted", "reservations", "verdict", "colour", "words"), [
     (True, (), "accepted", "accepted", "new gains in the drive"),
     (True, (DOUBT,), "accepted with reservations", "reserved", "new gains in the drive, with reservations"),
@@ -366,6 +368,7 @@ def test_a_load_that_is_not_known_is_said_to_be_none():
     assert math.isnan(found.value) and found.reason == "it does not turn"
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("ratio", "told"), [(0.5, False), (0.51, True), (math.nan, False)])
 def test_a_position_loop_near_the_velocity_loop_is_pointed_out(certificate, ratio, told):
     axis = certificate.axes[0]

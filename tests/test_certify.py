@@ -48,6 +48,7 @@ def result(axis, **known):
     })  # fmt: skip
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("load", list(GAINS))
 def test_crossovers_are_those_of_the_true_linear_machine(load):
     gains = np.array([GAINS[load]])

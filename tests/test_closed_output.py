@@ -52,6 +52,7 @@ def test_both_closed_end_quietly(broken):
     assert run(("drive_env", "get"), stdout=broken, stderr=broken).returncode == 141
 
 
+@pytest.mark.slow
 def test_a_mistake_keeps_its_code_where_nothing_was_printed(broken):
     found = run(("drive_agent", "evaluate", "nothing.npz"), stdout=broken, stderr=subprocess.PIPE)
     assert found.returncode == 2 and "there is no file" in found.stderr
@@ -63,6 +64,7 @@ def test_without_an_output_a_command_does_its_work():
     assert (found.returncode, found.stderr) == (0, "")
 
 
+@pytest.mark.every(2)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_full_disk_is_told(unbuffered):
@@ -72,6 +74,7 @@ def test_a_full_disk_is_told(unbuffered):
     assert found.stderr.endswith("No space left on device\n") and found.stderr.count("\n") == 1
 
 
+@pytest.mark.every(4)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
 @pytest.mark.parametrize("arguments", [("esi", "tmcm3313"), ("eds", "tmcm1636_fw109")])
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 from docs_pages import DOCS, ROOT, SHELL, SNIPPET, Block, blocks, compare, follow, pages, port_is_free
+from rigs.tables import every_row
 
 PROGRAMS = {"drive-env": "drive_env.commands.cli", "drive-tune": "tuning.commands.cli",
             "drive-agent": "agents.commands.cli"}  # fmt: skip
@@ -159,7 +160,7 @@ def said(page: Path):
         yield line
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
+@every_row("page", PAGES)
 def test_every_command_and_option_of_a_page_exists(page, every_command):
     for line in said(page):
         for program, rest in re.findall(r"\b(drive-env|drive-tune|drive-agent)((?: [^|&;]+)?)", line):
@@ -194,7 +195,7 @@ def test_every_option_that_a_how_to_names_exists(program, every_command):
             assert option in known, f"{heading and heading[1]}: {option}"
 
 
-@pytest.mark.parametrize("page", WRITTEN_HERE, ids=name)
+@every_row("page", WRITTEN_HERE)
 def test_words_that_stopped_readers_are_gone(page):
     text = re.sub(r"^```text.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)  # programs' own words
     assert not [word for word in OLD_WORDS if word in text]

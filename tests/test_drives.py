@@ -166,6 +166,7 @@ def test_importing_the_package_loads_neither_compiler_nor_physics():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_the_example_of_one_drive_runs():
     script = Path(__file__).parent.parent / "examples" / "one_drive.py"
     done = subprocess.run([sys.executable, script, "--machines", "2"], capture_output=True, text=True)

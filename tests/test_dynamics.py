@@ -148,7 +148,7 @@ def three_margins(L):
     return min(phase), min(gains), float((1.0 / np.abs(1.0 + L)).max())
 
 
-@pytest.mark.every(5)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["soft", "standard", "stiff", "50/9/1.7", "30/10/3"])
 def test_the_clearance_is_at_least_1_exactly_when_all_margins_are_kept(name):
     """Where it is within 0.5 % of 1 both may differ by how they interpolate."""

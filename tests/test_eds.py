@@ -8,6 +8,7 @@ from pathlib import Path
 import canopen
 import pytest
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
+from rigs.tables import every_row
 
 EDS = Path(__file__).parents[1] / "drive_env" / "devices" / "tmcm1636" / "tmcm1636.eds"
 NODE = 5
@@ -296,10 +297,9 @@ OD = read(NODE)  # read once: the tests below only look
 MAPPINGS = [*range(0x1600, 0x1604), *range(0x1A00, 0x1A04)]
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("index", "sub", "name", "data_type", "access", "low", "high", "default", "unit", "mappable", "table"),
     ENTRIES,
-    ids=[f"{row[0]:04X}sub{row[1]}-table{row[-1]}" for row in ENTRIES],
 )
 def test_entry_is_as_in_the_manual(index, sub, name, data_type, access, low, high, default, unit, mappable, table):
     found = entry(OD, index, sub)
@@ -312,7 +312,7 @@ def test_entry_is_as_in_the_manual(index, sub, name, data_type, access, low, hig
     assert found.pdo_mappable is bool(mappable)
 
 
-@pytest.mark.parametrize(("index", "name", "kind"), GROUPS, ids=[f"{index:04X}" for index, *_ in GROUPS])
+@every_row(("index", "name", "kind"), GROUPS)
 def test_record_or_array_is_as_in_the_manual(index, name, kind):
     assert type(OD[index]) is kind
     assert OD[index].name == name

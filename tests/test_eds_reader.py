@@ -10,6 +10,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 from rigs.small_eds import FOLDER, entry
+from rigs.tables import every_row
 
 from drive_env.dictionary.eds_file import parse_eds
 from drive_env.dictionary.eds_values import node_id_sum, number_of
@@ -29,7 +30,7 @@ def read(tmp_path, text, encoding="utf-8"):
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
+@every_row(
     ("text", "number"),
     [
         ("32", 32), ("0x20", 32), ("0X20", 32), ("20h", 32), ("&H20", 32), ('"32"', 32), ("032", 32), ("32.0", 32),
@@ -78,7 +79,7 @@ def test_what_is_no_sum_with_the_node_id_is_none(text):
 
 
 # --- entries ----------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
+@every_row(
     ("section", "default", "told"),
     [
         (entry(DefaultValue="1000"), 1000, ""),
@@ -228,6 +229,7 @@ def test_an_eds_of_8_kb_cannot_describe_more_entries_than_drives_have():
         parse_eds(HEAD + "".join(f"[{0x2000 + k // 16:04X}sub{k % 16:X}]\n" for k in range(20_001)))
 
 
+@pytest.mark.slow
 def test_an_eds_below_100_kb_is_read_within_seconds(tmp_path):
     """Keys that nobody knows took 15 s and 1.3 GB, handed down to each member; objects of further axes had no end."""
     unknown = "".join(f"k{k}=\n" for k in range(200))

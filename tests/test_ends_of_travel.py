@@ -56,6 +56,7 @@ def mode_and_target_played(drives, turns):
     drives.record([0x6064], 0.5, play={0x6060: np.full(500, CSP), 0x607A: np.full(500, round(turns * TURN))})
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("session", "turns"), [(written, 2.5), (played, 2.9), (written, 3.0), (mode_and_target_played, 2.5)]
 )

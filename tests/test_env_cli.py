@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import uuid
 from contextlib import contextmanager, suppress
 
@@ -539,7 +540,7 @@ def mappings(channel):
         network.disconnect()
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("what", FOREIGN)
 def test_scope_is_refused_where_another_master_commands_the_drive(run, shared, tmp_path, what):
     before = mappings(shared[0])
@@ -586,6 +587,7 @@ def breaks_off(monkeypatch, error, after):
     monkeypatch.setattr(CanDrives, "record", broken)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("error", "code", "says"),
     [(KeyboardInterrupt(), INTERRUPTED, "interrupted"), (BusError("the bus is gone"), REFUSED, "the bus is gone")],
@@ -638,19 +640,20 @@ def test_a_channel_whose_name_ends_in_a_large_number_is_logged(tmp_path, monkeyp
             self.left = [can.Message(arbitration_id=0x181, data=b"\1\2", channel="0cac0e67637", is_extended_id=False)]
 
         def recv(self, timeout):
-            return self.left.pop() if self.left else None
+            return self.left.pop() if self.left else time.sleep(timeout)
 
         def shutdown(self):
             pass
 
     monkeypatch.setattr("drive_env.master.can.port.open_bus", lambda *_, **__: Bus())
     file = tmp_path / f"session.{ending}"
-    done = CliRunner().invoke(app, ["log", str(file), "--duration", "1"])
+    done = CliRunner().invoke(app, ["log", str(file), "--duration", "0.1"])
     assert done.exit_code == 0, done.exception
     with can.LogReader(str(file)) as reader:
         assert [(one.arbitration_id, bytes(one.data)) for one in reader] == [(0x181, b"\1\2")]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("ending", ["log", "blf"])
 def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, ending):
     file = tmp_path / f"session.{ending}"

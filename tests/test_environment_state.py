@@ -122,6 +122,7 @@ def test_a_state_continues_in_another_process(kind, options):
     assert_same(pickle.loads(done.stdout), expected)
 
 
+@pytest.mark.every(4)
 @A_FEW_CASES
 @pytest.mark.parametrize(
     "duplicate", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))], ids=["copy", "pickle"]

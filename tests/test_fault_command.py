@@ -95,6 +95,7 @@ def test_a_fault_is_given_to_a_running_server_listed_and_cleared():
             ask(control, "faults")
 
 
+@pytest.mark.slow
 def test_a_fault_that_serve_begins_with():
     order = "enable_lost when=enabled at=0.01"
     with served("tmcm1636", "--load", "inertia", "--fault", order) as (_, channel, control):
@@ -146,6 +147,7 @@ def test_a_mistake_of_serve_is_one_line(arguments, message):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_control_port_that_is_taken_is_told():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs.tables import every_row
 
 from drive_env import EmulatedDrives, motion
 from drive_env.faults.effects import CHANGES, MOMENTS
@@ -58,7 +59,7 @@ def test_every_fault_of_a_machine_has_an_effect_and_every_effect_a_row():
     assert {row.group for row in FAULTS.values()} == set(GROUPS)
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@every_row("name", FAULTS)
 def test_a_row_is_whole(name):
     row = FAULTS[name]
     text = "".join((Path(__file__).parent / name).read_text(encoding="utf-8") for name in TESTS)

@@ -226,6 +226,7 @@ def test_noise_is_not_coherent():
     assert np.isfinite(response.open_loop).all()
 
 
+@pytest.mark.slow
 def test_friction_on_a_short_way_is_told_and_is_not_coherent_either():
     # 0.3 turns: the motion reverses, and what dry friction answers depends on the wave.
     target = emulated(load="vertical_screw", travel=(-0.3 * math.pi, 0.3 * math.pi))
@@ -284,6 +285,7 @@ def test_an_offset_of_the_user_changes_nothing():
     assert np.abs(target.drives.read(0x6064)).max() < 0.5 * 65536
 
 
+@pytest.mark.slow
 def test_axes_of_one_machine_are_shaken_one_after_the_other():
     target = emulated(load="gantry")
     response = measure(target, signal=Signal(high=100.0))
@@ -332,6 +334,7 @@ def test_a_resonance_that_a_weaker_shaking_confirms_is_told(looked_at):
     assert found.low < plant.resonance < found.high
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("factor", [0.85, 0.95, 1.1])
 def test_a_resonance_that_moves_with_the_strength_of_the_shaking_is_refused(looked_at, factor):
     """As with backlash: neither of the two is the axis's."""
@@ -345,12 +348,14 @@ def test_a_resonance_that_moves_with_the_strength_of_the_shaking_is_refused(look
     assert estimates["velocity_filter"].is_known
 
 
+@pytest.mark.slow
 def test_by_what_it_moves_a_little_the_interval_is_wider(looked_at):
     seen, fit, _ = looked_at
     alike, other = (fit(seen(), seen(factor)).estimates["resonance"] for factor in (1.0, 1.015))
     assert other.high - other.low > 1.5 * (alike.high - alike.low)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_confirmed_is_refused(looked_at):
     seen, fit, _ = looked_at
     assert "only 8 frequencies are coherent" in fit(seen(), seen(lines=8)).estimates["resonance"].reason

@@ -125,6 +125,7 @@ def told_and_inside(target, axes, names):
     return {name: tuple(map(int, row)) for name, row in counts.items()}
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("load", "seed", "least"), [("vertical_screw", 3, 3), ("ball_screw", 2, 4)])
 def test_what_a_screw_loses_is_no_inertia_of_its_load(monkeypatch, load, seed, least):
     """Of four machines: a loss is not taken for inertia, nor what repeats on a short way for a load that changes."""
@@ -151,6 +152,7 @@ def test_intervals_hold_behind_screws_and_gears(monkeypatch, load, motor):
 
 
 # --- mains ------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_loops_of_a_response_overcome_dead_time():
     """On mains, dead time of 2 us is 22 V: in a slow current loop an open phase, or a resonance that moves."""
     with drawn("tgz_d", "two_mass", 1, 1) as target:
@@ -257,6 +259,7 @@ def test_the_suite_is_identified_briefly_and_what_is_told_holds(seed):
     assert "inertia" in outside(found, share=1e-3)
 
 
+@pytest.mark.slow
 def test_what_a_tuner_works_with_is_not_what_is_told():
     target = emulated(load="inertia", num_threads=1)
     one = identify_briefly(target)[0]
@@ -296,12 +299,14 @@ def test_with_backlash_a_resonance_is_refused_with_that_reason():
     assert "coherent" in resonance.reason or "backlash" in resonance.reason
 
 
+@pytest.mark.slow
 def test_the_ripple_that_samples_hide_is_made_up_for():
     """Samples come at the lowest point of the current's millisecond ripple, 1.4 % below its mean here."""
     target = emulated(load="inertia", ideal=True, num_threads=1)
     assert identify(target)[0].value("inertia") == pytest.approx(truth(target.drives, 0, 0.0)["inertia"], rel=0.005)
 
 
+@pytest.mark.slow
 def test_gravity_and_a_vertical_axis():
     target = emulated(load="vertical_screw", num_threads=1)
     drives = target.drives
@@ -311,6 +316,7 @@ def test_gravity_and_a_vertical_axis():
     assert abs(found.value("offset")) == pytest.approx(held, rel=0.05)
 
 
+@pytest.mark.slow
 def test_one_direction_says_less_of_friction_than_of_gravity():
     """The intervals are honest about what they are: each holds the value and has a width."""
     found = identify(emulated(load="inertia", num_threads=1))[0]
@@ -321,6 +327,7 @@ def test_one_direction_says_less_of_friction_than_of_gravity():
     assert set(found.estimates) == set(NAMES)
 
 
+@pytest.mark.slow
 def test_sensors_that_are_wrong_altogether_are_in_the_intervals():
     """A gain error of the current sensors shows nowhere: R, J/K_t and friction are off by it, as the intervals know."""
     wrong = {"stage.adc_gain_error_a": 0.015, "stage.adc_gain_error_b": 0.015}
@@ -359,6 +366,7 @@ def test_a_rigid_axis_has_no_resonance():
     assert "no resonance between" in found.estimates["resonance"].reason
 
 
+@pytest.mark.slow
 def test_a_brushed_motor_has_no_pole_pairs():
     found = identify(emulated(load="inertia", motor="re_35", num_threads=1))[0]
     assert "brushed" in found.estimates["pole_pairs"].reason
@@ -562,6 +570,7 @@ def test_what_axes_push_for_one_another_is_told_apart_by_the_ways_they_go():
     assert pushed_inertia(ways[:1], moves[:1]).tolist() == np.diag([4.2, 3.0, 1.2]).tolist()
 
 
+@pytest.mark.slow
 def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own_inertia():
     """An end of a gantry that is shaken alone moves all of the bridge, twice what it moves otherwise."""
     with emulated(load="gantry", num_threads=1) as target:
@@ -619,6 +628,7 @@ class Clock:
         return self.now
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step", "told"), [(0.001, True), (0.0016, False)])
 def test_reads_out_of_step_with_the_drive_give_no_inductance(monkeypatch, step, told):
     clock = Clock()

@@ -190,6 +190,7 @@ def test_the_loop_that_measures_a_winding_is_the_same_on_both(folder):
     assert own_i == known_i
 
 
+@pytest.mark.slow
 def test_a_design_on_twins_stays_within_its_ranges(device):
     assert gain_bounds(device)[0].tolist() == [1, 1, 20, 1, 1]  # a T_i of 0.65 s
     known = Known(RIGID, 10.0, 0.1, 1e-4)
@@ -210,6 +211,7 @@ def test_the_agent_that_ships_tunes_it(folder):
     assert np.all(found[0, outer] > np.array(rule)[outer] / 30) and np.all(found[0, outer] < np.array(rule)[outer] * 30)
 
 
+@pytest.mark.slow
 def test_the_command_shows_what_rules_propose_at_its_objects(folder, tmp_path):
     line = ["rules", "simc", "--device", folder, "--load", "inertia", "--apply", "simc", "--yes", "--snapshot"]
     done = CliRunner().invoke(app, [*line, str(tmp_path / "before.toml")])

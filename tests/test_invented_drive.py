@@ -151,6 +151,7 @@ def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
     assert {row["note"] for row in rows if row["tuner"] == "simc"} == {f"ValueError: {NO_MODEL}"}
 
 
+@pytest.mark.slow
 def test_a_tuner_that_returns_the_gains_of_another_drive_has_failed():
     def of_another(target, rng):
         n = target.num_axes
@@ -175,6 +176,7 @@ def test_an_agent_tunes_them_as_an_episode():
         GainTuning(1, device=INVENTED, gains=("torque_p",))
 
 
+@pytest.mark.slow
 def test_a_trained_tuner_changes_them_by_the_parts_that_they_play():
     """It was trained on another drive, on gains over those of the baseline rule: names and units are nothing to it."""
     with emulated(INVENTED, "inertia", num_threads=1) as target:

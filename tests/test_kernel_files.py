@@ -14,6 +14,7 @@ import pytest
 from numba import njit
 from numba.core.errors import TypingError
 from numba.extending import overload
+from rigs.tables import every_row
 from rigs.thinning import STRIDE
 
 from drive_env import EmulatedDrives
@@ -81,6 +82,7 @@ def kernels(cache: Path) -> list[Path]:
     return sorted(cache.rglob("*.kernel"))
 
 
+@pytest.mark.slow
 def test_another_program_finds_the_kernels_of_this_one(cache):
     found = run(SMALL, cache)
     assert (found.stdout, found.stderr) == ("compiled 0 kept 1\n", "")
@@ -192,7 +194,7 @@ KERNELS = [
 ] + [(kernel, stages) for kernel in FIRMWARE if hasattr(kernel, "py_func") and hasattr(kernel._cache, "flush")]
 
 
-@pytest.mark.parametrize(("kernel", "module"), KERNELS, ids=[kernel.__name__ for kernel, _ in KERNELS])
+@every_row(("kernel", "module"), KERNELS)
 def test_a_kernel_is_keyed_by_every_file_that_it_calls_and_by_no_command(kernel, module):
     known = sources(module)
     assert compiled_from(kernel) <= known.keys()

@@ -94,6 +94,7 @@ class Served:
         time.sleep(duration)
 
 
+@pytest.mark.slow
 def test_monitor_tells_it(monkeypatch):
     drives = EmulatedDrives(load="inertia", num_threads=1)
     world = World(lockstep=False)

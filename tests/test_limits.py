@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from rigs.tables import every_row
 
 from drive_env import Limits
 from drive_env.drives.limits import given
@@ -36,8 +37,8 @@ def test_what_is_no_travel(position):
         Limits(position=position)
 
 
-@pytest.mark.parametrize("name", ["velocity", "current", "following_error"])
-@pytest.mark.parametrize(("value", "holds"), [
+@every_row("name", ["velocity", "current", "following_error"])
+@every_row(("value", "holds"), [
     (1e-9, True), (None, True), (math.inf, True), ((1, None), True), (0, False), (-1, False), (math.nan, False),
     ((1, 0), False), ((None, -1), False),
 ])  # fmt: skip
@@ -69,10 +70,8 @@ def test_a_silence_that_a_drive_can_count(silence, holds):
         Limits(silence=silence)
 
 
-@pytest.mark.parametrize("name", ["velocity", "current", "following_error", "position", "position's upper end"])
-@pytest.mark.parametrize(
-    ("count", "axes", "holds"), [(1, 3, True), (3, 3, True), (2, 3, False), (4, 3, False), (2, 1, False)]
-)
+@every_row("name", ["velocity", "current", "following_error", "position", "position's upper end"])
+@every_row(("count", "axes", "holds"), [(1, 3, True), (3, 3, True), (2, 3, False), (4, 3, False), (2, 1, False)])
 def test_one_value_for_all_axes_or_one_each(name, count, axes, holds):
     values = tuple(range(1, count + 1))
     given_as = {"position": {"position": (values, 9)}, "position's upper end": {"position": (0, values)}}

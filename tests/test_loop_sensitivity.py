@@ -50,6 +50,7 @@ def test_loops_without_an_agent_are_those_of_the_linear_model(load):
     assert found.ms[:, 0] == pytest.approx(np.abs(exact).max(), rel=0.08)
 
 
+@pytest.mark.slow
 def test_an_agent_that_answers_errors_too_much_is_brought_within_margins():
     hot, stiff = linear("inertia", ERROR, 16.0), find_dynamics("stiff")
     with pytest.raises(NotKeptError, match=r"stiff allows 2\.5"):
@@ -62,6 +63,7 @@ def test_an_agent_that_answers_errors_too_much_is_brought_within_margins():
     assert policy_of(agent).act(rows) == pytest.approx(card["answer to errors"] * policy_of(hot).act(rows), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_feedback_that_is_not_of_errors_is_not_reduced():
     with pytest.raises(NotKeptError, match=r"even with 0\.3 of its answer to errors"):
         within(linear("inertia", SPEED, 0.9), find_dynamics("stiff"))

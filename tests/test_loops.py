@@ -670,6 +670,7 @@ def count_arithmetic(kernel, records, rates):
     return tuple(len(re.findall(pattern, code)) for pattern in INSTRUCTIONS[architecture])
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(
     ("stage", "least"),
     [
@@ -684,6 +685,7 @@ def test_compiled_stages_hold_packed_arithmetic(stage, least):
     assert packed > 10 * scalar
 
 
+@pytest.mark.slow
 def test_compiled_window_of_all_stages_together_holds_packed_arithmetic():
     packed, scalar = count_arithmetic(window, FIRMWARE.layout.new_records(LANES), rates_of(find_device("tmcm1636"), 1))
     assert packed >= 200

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigs.tables import every_row
 
 from drive_env.emulator import machine_numbers as of_many
 from drive_env.emulator.machine_numbers import machine_numbers
 
 
-@pytest.mark.parametrize("few", [0, of_many._FEW])
-@pytest.mark.parametrize("seed", [0, 1, 2**32 - 1, 2**32, 2**40 + 5, 2**96, 2**130 + 17])
-@pytest.mark.parametrize(
+@every_row("few", [0, of_many._FEW])
+@every_row("seed", [0, 1, 2**32 - 1, 2**32, 2**40 + 5, 2**96, 2**130 + 17])
+@every_row(
     "machines",
     [
         range(40),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from rigs.stepped_load import stepped
+from rigs.tables import every_row
 
 from drive_env import EmulatedDrives, motion
 from mechanics.loads import LOADS, find_load
@@ -311,8 +312,8 @@ def test_the_refusal_names_the_machine():
             drives.machine.set("load.stiffness", 60.0, where=where)
 
 
-@pytest.mark.parametrize("name", ["inertia", "stiffness", "damping", "coulomb", "breakaway", "viscous"])
-@pytest.mark.parametrize("value", [-1e-6, np.nan, np.inf])
+@every_row("name", ["inertia", "stiffness", "damping", "coulomb", "breakaway", "viscous"])
+@every_row("value", [-1e-6, np.nan, np.inf])
 def test_a_load_parameter_that_cannot_be_is_refused(name, value):
     load = machines("two_mass", 2)
     before = state(load)
@@ -327,11 +328,11 @@ def test_no_body_without_inertia():
         load.set("inertia", np.zeros(1), np.ones(1, bool))
 
 
-@pytest.mark.parametrize(
+@every_row(
     "name",
     ["motor.inertia", "motor.coulomb", "motor.viscous", "motor.R_s", "motor.L_d", "load.inertia", "load.stiffness"],
 )
-@pytest.mark.parametrize("value", [-1e-6, np.nan, np.inf])
+@every_row("value", [-1e-6, np.nan, np.inf])
 def test_a_machine_parameter_that_cannot_be_is_refused(name, value):
     with EmulatedDrives(load="two_mass", num_machines=2) as drives:
         before = {key: values.tolist() for key, values in drives.machine.parameters.items()}

@@ -100,11 +100,12 @@ def told():
 
 def literals(tree):
     """Return the texts of a module that are no docstrings and no assertions, with … for each value."""
-    docstrings = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
-    docstrings |= {id(n.msg) for n in ast.walk(tree) if isinstance(n, ast.Assert)}
-    inner = {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
+    nodes = list(ast.walk(tree))
+    docstrings = {id(n.value) for n in nodes if isinstance(n, ast.Expr)}
+    docstrings |= {id(n.msg) for n in nodes if isinstance(n, ast.Assert)}
+    inner = {id(v) for n in nodes if isinstance(n, ast.JoinedStr) for v in n.values}
     others = docstrings | inner
-    for node in ast.walk(tree):
+    for node in nodes:
         if id(node) not in others and isinstance(node, ast.Constant | ast.JoinedStr) and text_of(node):
             yield node.lineno, text_of(node)
 

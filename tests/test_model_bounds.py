@@ -84,6 +84,7 @@ def test_gains_that_may_be_unstable_within_the_intervals_have_no_bound():
         assert np.isnan(at_least_by_model(target.device, plant, identified, gains)["velocity"]).all()
 
 
+@pytest.mark.slow
 def test_a_model_that_is_none_gives_no_bound_and_says_why():
     with emulated(load="inertia", num_threads=1) as target:
         (identified,) = identify_briefly(target)

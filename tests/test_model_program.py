@@ -255,6 +255,7 @@ def test_what_the_supervisor_does_is_told_step_by_step(situation, told):
 
 
 # --- what was explored ------------------------------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("rules", "assumptions", "states", "transitions", "lengths"),
     [

@@ -72,6 +72,7 @@ def test_a_mesh_from_outside_the_model_s_folder_is_refused_with_the_remedy(more,
         find_load(path)
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize(
     "more",
     [ASSET.format(file="assets/box.obj"), '<compiler meshdir="assets"/>' + ASSET.format(file="box.obj"),
@@ -111,6 +112,7 @@ def test_a_missing_file_a_document_type_a_plug_in_are_refused(tmp_path):
             find_load(write(tmp_path, more))
 
 
+@pytest.mark.slow
 def test_the_scan_for_files_takes_time_that_grows_as_the_text_does(tmp_path):
     """A million letters: milliseconds."""
     for more in ('<a "' * 250_000, "<!--" * 250_000, "<" * 10**6, "<a " + "b" * 10**6, "<a " + "b = " * 250_000):
@@ -132,6 +134,7 @@ LARGE = {
 }  # fmt: skip
 
 
+@pytest.mark.every(4)
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 @pytest.mark.parametrize("kind", LARGE)
 def test_what_a_short_file_asks_for_has_limits(kind, tmp_path, monkeypatch):

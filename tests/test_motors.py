@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from rigs.tables import every_row
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
@@ -54,6 +55,7 @@ def test_there_are_motors_from_20_w_to_1_kw_with_and_without_brushes():
     assert max(b / a for a, b in itertools.pairwise(ordered)) < 3.0
 
 
+@every_row("motor", MOTORS.values())
 def test_names_are_plain_and_sources_tell_where_numbers_are_from(motor):
     assert re.fullmatch(r"[a-z0-9_]+", motor.name)
     assert find_motor(motor.name) is motor
@@ -63,6 +65,7 @@ def test_names_are_plain_and_sources_tell_where_numbers_are_from(motor):
     assert motor.kind in ("pmsm", "dc")
 
 
+@every_row("motor", MOTORS.values())
 def test_rated_power_is_that_of_the_class_in_the_title(motor):
     watts = float(re.search(r"([0-9]+) W$", motor.title)[1])
     volts = float(re.search(r"([0-9]+) V,", motor.title)[1])
@@ -71,17 +74,20 @@ def test_rated_power_is_that_of_the_class_in_the_title(motor):
     assert motor.voltage == volts
 
 
+@every_row("motor", MOTORS.values())
 def test_rated_torque_is_torque_constant_times_rated_current(motor):
     assert motor.torque_constant == pytest.approx(torque_per_ampere(motor), rel=1e-12)
     assert motor.rated_torque == pytest.approx(torque_per_ampere(motor) * motor.rated_current, rel=0.05)
 
 
+@every_row("motor", MOTORS.values())
 def test_no_load_speed_lies_above_the_rated_speed(motor):
     no_load = largest_voltage(motor) / (motor.n_p * motor.psi_m)
     assert no_load >= 1.05 * motor.rated_speed
     assert no_load <= 2.5 * motor.rated_speed  # a motor is wound for its speed
 
 
+@every_row("motor", MOTORS.values())
 def test_the_supply_suffices_for_the_rated_point(motor):
     """The winding's voltage at rated speed and current, u = R i + w psi along q and w L i along d."""
     omega_e = motor.n_p * motor.rated_speed
@@ -90,6 +96,7 @@ def test_the_supply_suffices_for_the_rated_point(motor):
     assert math.hypot(u_d, u_q) <= largest_voltage(motor)
 
 
+@every_row("motor", MOTORS.values())
 def test_time_constants_are_those_of_servo_motors(motor):
     assert 1e-4 <= motor.L_q / motor.R_s <= 1e-2
     assert motor.L_d == motor.L_q  # surface magnets, all of them
@@ -100,6 +107,7 @@ def test_time_constants_are_those_of_servo_motors(motor):
     assert 5e-3 <= motor.inertia * motor.rated_speed / motor.rated_torque <= 0.1
 
 
+@every_row("motor", MOTORS.values())
 def test_friction_and_cogging_are_small_against_the_rated_torque(motor):
     drag = motor.coulomb + motor.viscous * motor.rated_speed
     assert 0.0 < drag < 0.12 * motor.rated_torque
@@ -109,10 +117,12 @@ def test_friction_and_cogging_are_small_against_the_rated_torque(motor):
         assert motor.cogging_order % (2 * motor.n_p) == 0
 
 
+@every_row("motor", MOTORS.values())
 def test_encoders_fit_the_object_and_the_drive(motor):
     assert 1000 <= motor.encoder_counts <= 65535  # 2080h:02 is unsigned 16 bit
 
 
+@every_row("motor", MOTORS.values())
 def test_the_rated_current_warms_the_winding_by_80_k(motor):
     phases = 1.0 if dc(motor) else 1.5
     hot = motor.R_s * (1.0 + 0.00393 * 80.0)
@@ -167,6 +177,7 @@ def test_what_is_written_is_for_a_motor_that_the_rule_serves_otherwise():
         assert DEVICE.preset(MOTORS[name]) != rule(DEVICE, MOTORS[name], table), f"{name}: the rule says the same"
 
 
+@every_row("motor", MOTORS.values())
 def test_preset_gains_are_those_of_its_bandwidths(motor):
     gains = gains_from_bandwidths(DEVICE, motor, 3.0 * motor.inertia, current_hz=1000, velocity_hz=20, position_hz=5)
     objects = DEVICE.preset(motor)
@@ -180,6 +191,7 @@ def test_preset_gains_are_those_of_its_bandwidths(motor):
     assert np.all(np.abs(np.subtract(written, gains)) <= 1)
 
 
+@every_row("motor", MOTORS.values())
 def test_preset_describes_the_motor(motor):
     objects = DEVICE.preset(motor)
     assert objects["Motor Type"] == (1 if dc(motor) else 3)
@@ -189,6 +201,7 @@ def test_preset_describes_the_motor(motor):
     assert objects["Maximum Current"] == pytest.approx(min(2000.0 * motor.rated_current, 45_000), rel=0.03)
 
 
+@every_row("motor", MOTORS.values())
 def test_preset_motions_are_within_the_motors_reach(motor):
     objects = DEVICE.preset(motor)
     assert 0.35 <= objects["Profile velocity"] / INC / motor.rated_speed <= 0.6

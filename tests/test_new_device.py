@@ -139,6 +139,7 @@ def select(node, mode):
     until(lambda: node.sdo[0x6061].raw == mode)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", SOME)
 def test_python_canopen_moves_it(folders, name):
     folder = folders[name].folder

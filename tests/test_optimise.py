@@ -393,6 +393,7 @@ def safely():
     return found, audit
 
 
+@pytest.mark.slow
 def test_a_safe_search_begins_with_gains_that_are_proved(safely):
     found, _ = safely
     first = [row for row in found.rows if row.number == 0]
@@ -433,6 +434,7 @@ def test_a_safe_search_ends_with_gains_that_were_never_stopped_and_are_better(sa
         assert kept.cost < rows[0].cost
 
 
+@pytest.mark.slow
 def test_a_safe_search_shakes_the_axes_less_than_a_bold_one(safely):
     found, audit = safely
     machines = [m for m in load_suite() if m.load == "two_mass" and m.motor == "qbl4208"]

@@ -18,7 +18,8 @@ MACHINES = {machine.name: machine for machine in load_suite(seed=0)}
 RIGID, ELASTIC = MACHINES["inertia-qbl4208-0"], MACHINES["two_mass-qbl4208-0"]
 
 
-@pytest.mark.parametrize("machine", [RIGID, pytest.param(ELASTIC, marks=pytest.mark.slow)], ids=["rigid", "elastic"])
+@pytest.mark.slow
+@pytest.mark.parametrize("machine", [RIGID, ELASTIC], ids=["rigid", "elastic"])
 def test_nothing_near_the_oracle_keeps_the_constraints_and_is_better(machine):
     best = search_oracle(machine)
     rng = np.random.default_rng(5)

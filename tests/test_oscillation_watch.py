@@ -114,6 +114,7 @@ def test_a_motor_that_is_not_the_one_named_oscillates_and_is_said():
     assert set(found.estimates) == set(NAMES)
 
 
+@pytest.mark.slow
 def test_an_axis_that_swings_is_identified_with_softer_gains():
     target = emulated(load="two_mass", parameters=SWINGING, num_threads=1)
     found = identify(target)[0]

@@ -95,8 +95,9 @@ LOOP = """
 
 
 @pytest.fixture
-def file(tmp_path):
-    """Write a model to a file and return its path."""
+def file(tmp_path, monkeypatch):
+    """Write a model to a file and return its path. It counts as ours: compiled here, in no process of its own."""
+    monkeypatch.setattr("mechanics.model.MODELS", tmp_path)
 
     def write(text, name="machine.xml"):
         (tmp_path / name).write_text(text)
@@ -297,6 +298,7 @@ def swing(load, chosen, copies, duration=0.6):
     return qpos.reshape(n, len(chosen), -1)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("kind", MODELS)
 @pytest.mark.parametrize("copies", [8, 32])
 def test_packed_copies_with_constraints_equal_those_alone_within_the_bound(file, kind, copies):
@@ -334,6 +336,7 @@ def test_a_limit_of_a_joint_holds_and_is_felt_by_the_drive(file):
     assert trace[0x6077][-1, 0] == pytest.approx(7000, rel=0.01)  # mA, the drive's limit
 
 
+@pytest.mark.slow
 def test_a_model_holds_as_many_copies_as_there_are_contact_bits(file):
     def load(text, **options):
         return Load(file(text), joints=("shoulder", "elbow"), **options)
@@ -355,6 +358,7 @@ def test_every_copy_has_contact_bits_of_its_own(file):
     assert np.array_equal(model.geom_conaffinity, model.geom_contype)
 
 
+@pytest.mark.slow
 def test_more_machines_than_one_model_holds(file):
     """40 machines with contacts are two models; all live."""
     with EmulatedDrives(load=Load(file(LIMITS), joints=("shoulder", "elbow"), gear=10.0), num_machines=40) as drives:

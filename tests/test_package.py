@@ -87,6 +87,7 @@ def test_an_environment_for_stable_baselines_without_it_says_the_pip_line(tmp_pa
     assert "pip install 'drive-env[agents]'" in done.stdout, done.stderr
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("arguments", [
     ("drive-agent", "evaluate", "--help"), ("drive-agent", "train", "--help"), ("drive-tune", "sweep", "--help"),
     ("drive-env", "list"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
+from rigs.tables import every_row
 
 ROOT = Path(__file__).parent.parent
 PAPERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -19,7 +19,7 @@ def named(text):
             yield found
 
 
-@pytest.mark.parametrize("paper", PAPERS, ids=[str(path.relative_to(ROOT)) for path in PAPERS])
+@every_row("paper", PAPERS)
 def test_every_file_that_a_paper_names_exists(paper):
     missing = []
     for name in named(paper.read_text(encoding="utf-8")):

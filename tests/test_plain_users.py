@@ -47,7 +47,7 @@ def test_a_name_that_is_none_is_told_with_the_nearest():
         make_vec_env("ServoDrive/Traking-v0")
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PPO, A2C, SAC])
 def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path, caplog):
     env = make_vec_env(TRACKING, 1, load="inertia", **SHORT)

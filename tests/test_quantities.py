@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from rigs.held_objects import HeldObjects
+from rigs.tables import every_row
 
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.quantities import (
@@ -31,7 +32,7 @@ def entry(unit, low=-(2**31), high=2**31 - 1):
     return Entry(0x6081, 0, "a quantity", 32, "rw", low, high, 0, unit, True, True)
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("unit", "dimension", "value"),
     [
         ("rev", "angle", 1.0), ("deg", "angle", 1 / 360), ("rad", "angle", 1 / (2 * math.pi)),
@@ -57,7 +58,7 @@ def test_increments_follow_the_scale_and_are_no_unit_where_it_is_not_known():
     assert find_unit("furlong", TURN) is None
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("text", "unit", "raw"),
     [
         ("17", "pps", 17), ("-17", "pps", -17), ("0x10", "pps", 16), ("0b101", "pps", 5), (" 5 ", "pps", 5),

@@ -192,6 +192,7 @@ def test_a_tuner_that_breaks_is_scored_by_what_it_left_and_the_others_go_on():
     assert next(row for row in found.tuners if row.tuner == "broken").failed == 4
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     "gains", [np.ones((4, 4), int), np.full((4, 5), np.nan), np.full((4, 5), 10.5)], ids=["shape", "nan", "fraction"]
 )
@@ -470,6 +471,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_optimise_prints_and_writes_what_it_found(tmp_path):
     folder = tmp_path / "out"
     result = run("optimise", "--load", "inertia", "--trials", 6, "--copies", 3, "--safe", "--out", folder)

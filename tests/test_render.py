@@ -223,6 +223,7 @@ def test_mistakes_that_the_drive_finds_are_told(row, says):
     assert says in str(error.value)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("travel", "switches", "expected"),
     [
@@ -268,6 +269,7 @@ def test_mistakes_in_recording_are_told(axis, mistake, says):
 
 
 # --- the machine ------------------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @needs_gl
 @pytest.mark.parametrize("load", ["inertia", "two_mass", "belt"])  # those with orange parts
 def test_machine_fills_its_picture_and_stays_inside(load):
@@ -302,6 +304,7 @@ def test_up_is_up(arm):
     assert high < low - 5, "rows count from above"
 
 
+@pytest.mark.slow
 @needs_gl
 def test_scenes_do_not_disturb_each_other(arm):
     with Scene(LOADS["belt"].mjcf, 200, 160) as one:
@@ -401,6 +404,7 @@ def test_frames_show_the_machine_beside_the_scope(belt_run):
     assert all(later >= earlier - 25 for earlier, later in pairwise(blue))  # the cursor hides a few
 
 
+@pytest.mark.slow
 @needs_gl
 def test_a_picture_draws_any_machine_again_and_again(arm):
     run = a_recording(arm, joints=3, axes=3)

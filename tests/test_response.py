@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs.tables import every_row
 
 from drive_env.trials.response import _reversals, current_metrics, disturbance_metrics, oscillation, step_metrics
 
@@ -482,7 +483,7 @@ IN_RECORD = "lies outside the record of 0 s to 0.3 s; choose"
 FRACTION = "must lie in (0, 1); give a fraction, 0.02 for 2 %"
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("call", "text"),
     [
         (lambda: step_metrics([0, 1, 1], [0, 1, 1], 1, t_step=0), "t is not strictly increasing: t[1]=1 s, t[2]=1 s;"),

@@ -269,6 +269,7 @@ def test_a_sweep_goes_on_from_its_own_copy_though_the_file_is_gone(own):
     assert "inputs/motor/mine.toml was changed since the run was made with it" in result.output
 
 
+@pytest.mark.slow
 def test_settings_of_a_sweep_repeat_it_from_its_folder_alone(own, decoys, monkeypatch):
     """Before: whatever lay at the path in the present folder."""
     experiment = load_experiment(write(own / "grid.toml", own_grid(motor="mine.toml", load="arm/arm.xml")))
@@ -404,6 +405,7 @@ def test_a_comparison_is_not_resumed_with_a_file_that_was_changed(own, monkeypat
     )
 
 
+@pytest.mark.slow
 def test_a_suite_is_the_same_wherever_its_folder_lies_and_whoever_reads_it(own, decoys, monkeypatch):
     (here,) = load_suite("machines.toml")
     assert here.name == "arm-mine-0"
@@ -452,6 +454,7 @@ def test_a_sweep_elsewhere_has_the_files_of_here(own, decoys):
         np.testing.assert_array_equal(there.columns[name], column, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_search_elsewhere_has_the_files_of_here(own, decoys, tmp_path):
     from tuning.runs.shard_log import ShardLog
 
@@ -469,6 +472,7 @@ def test_a_comparison_elsewhere_has_the_files_of_here(own, decoys):
     assert compare(machines, tuners).rows == compare(machines, tuners, pool=Away(own, decoys)).rows
 
 
+@pytest.mark.slow
 def test_episodes_elsewhere_have_the_files_of_here(own, decoys):
     options = {"load": "arm/arm.xml", "motor": "mine.toml", "distributions": "spread.toml", "mode": "csp",
                "action": "offset", "duration": 0.05}  # fmt: skip
@@ -504,6 +508,7 @@ def test_worker_processes_open_what_was_sent(own, decoys, monkeypatch):
     assert motor.R_s == find_motor("qbl4208").R_s
 
 
+@pytest.mark.slow
 def test_a_cluster_opens_what_was_sent_though_its_worker_has_a_file_of_that_name(own, decoys):
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 0, "protocol": "tcp://", "dashboard_address": "127.0.0.1:0"}
@@ -537,6 +542,7 @@ def own_training():
     return run
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_and_its_agent_acts_with_the_load_that_it_had(own, decoys, monkeypatch):
     pytest.importorskip("stable_baselines3")
     agent = train(own_training(), own / "out")

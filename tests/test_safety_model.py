@@ -291,6 +291,7 @@ def follow(drives, event_of, steps):
     return trace
 
 
+@pytest.mark.slow
 def test_the_emulated_node_and_the_model_agree_on_random_walks(drives):
     choose = random.Random(1)
     trace = follow(drives, lambda drive: choose.choice(EVENTS), 3000)

@@ -207,6 +207,7 @@ def test_a_pool_gives_every_result_with_its_number(workers):
             in_order(pool, fails, [3])
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_told_with_the_remedy():
     with open_pool(1) as pool, pytest.raises(PoolError, match=r"worker process ended unexpectedly.*--resume"):
         in_order(pool, dies, [1])
@@ -590,6 +591,7 @@ def test_an_interrupt_says_what_is_kept_and_the_run_goes_on_from_its_own_setting
     assert contents(out) == expected
 
 
+@pytest.mark.slow
 def test_a_run_is_not_resumed_with_another_experiment(config, tmp_path):
     with shard_log(tmp_path / "run", GRID, resume=False) as log:
         log.append(0, {"x": np.zeros(1)})
@@ -599,6 +601,7 @@ def test_a_run_is_not_resumed_with_another_experiment(config, tmp_path):
     assert done.stderr.startswith("drive-tune: ")
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("more", "code", "message"), [
     (("--workers", 0), 2, "--workers 0 is below 1"),
     (("--workers", 1, "--cluster", "tcp://x:1"), 2, "choose one"),

@@ -34,6 +34,7 @@ def drive_tune(*arguments):
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])
 @pytest.mark.parametrize("safe", [False, True])
 def test_what_breaks_margins_by_the_true_machine_never_reaches_a_drive(load, safe, monkeypatch):
@@ -91,6 +92,7 @@ def test_where_nothing_keeps_the_dynamics_the_drives_keep_their_gains(safe, says
     assert says in note and note.endswith("the drives keep those of before")
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_from_its_journal_with_what_was_not_tried(tmp_path):
     settings = replace(FEW, journal=tmp_path / "journal")
 
@@ -108,6 +110,7 @@ def test_a_search_goes_on_from_its_journal_with_what_was_not_tried(tmp_path):
         found(8)
 
 
+@pytest.mark.slow
 def test_several_axes_of_a_machine_keep_them_each():
     with emulated(load="gantry", **MACHINE | {"num_machines": 2}) as target:
         found = optimise(target, replace(FEW, trials=3), shared=True, anew=True)
@@ -140,6 +143,7 @@ def test_dynamics_that_cannot_be_asked_for_are_refused(tmp_path):
     assert refused.exit_code == 2 and "phase margin/gain margin/Ms" in refused.output and not out.exists()
 
 
+@pytest.mark.slow
 def test_gains_of_a_search_bear_the_load_inertia_that_was_asked_for(tmp_path, monkeypatch):
     asked = []
 
@@ -158,6 +162,7 @@ def test_gains_of_a_search_bear_the_load_inertia_that_was_asked_for(tmp_path, mo
     assert asked == [("standard", (0.2, 5.0))] * 2
 
 
+@pytest.mark.slow
 def test_a_journal_of_another_range_of_load_inertia_is_refused(tmp_path):
     journal = tmp_path / "search.journal"
     arguments = ("optimise", "--trials", 1, "--copies", 1, "--load", "inertia", "--journal", journal)
@@ -166,6 +171,7 @@ def test_a_journal_of_another_range_of_load_inertia_is_refused(tmp_path):
     assert refused.exit_code == 2 and "give another --journal" in refused.output, refused.output
 
 
+@pytest.mark.slow
 def test_the_command_asks_for_standard_dynamics_and_says_whose_margins_it_prints(tmp_path):
     arguments = ("optimise", "--trials", 2, "--copies", 2)
     found = drive_tune(*arguments, "--out", tmp_path / "one")

@@ -53,6 +53,7 @@ def test_it_prints_two_lines_that_join_the_bus(tmp_path):
     assert re.search(r"\d+ frames in 0\.000 s of the drives' time, 0 error frames, 0 lost", output)
 
 
+@pytest.mark.slow
 def test_a_token_is_made_printed_and_asked_for(tmp_path, monkeypatch):
     monkeypatch.delenv("DRIVE_ENV_TOKEN", raising=False)
     with served("--token", "auto", "--lockstep", cwd=tmp_path) as (process, channel):

@@ -87,6 +87,7 @@ def states(drives, cycles):
     return np.array(rows)[:, 0], np.array(rows)[:, 1]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_move_is_its_closed_form_every_millisecond(sign):
     distance = 60_000

@@ -7,6 +7,7 @@ from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
+from rigs.tables import every_row
 
 from drive_env.safety.stopping import ANSWER, LONGEST_FOLLOWING, AxisStop, Phase, Sample, Stop
 
@@ -75,7 +76,7 @@ def swing(share, lasting):
     return speed
 
 
-@pytest.mark.parametrize(
+@every_row(
     ("speed", "ramp", "why", "earliest", "latest"),
     [
         # It slows down well enough: the voltage goes at rest, without a reason to tell.
@@ -111,7 +112,7 @@ def swing(share, lasting):
         (down(0.55 * RAMP, to=-0.21 * SPEED), RAMP, "it does not slow down by its ramp", 0.2, 0.27),
     ],
 )
-@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@every_row("sense", [1.0, -1.0])
 def test_an_axis_keeps_its_voltage_while_it_slows_down(speed, ramp, why, earliest, latest, sense):
     axis = Axis(speed)
     axis.sense = sense

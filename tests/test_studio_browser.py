@@ -43,18 +43,14 @@ def at_rest(tab):
 
 # --- every page ---------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("path", PAGES)
-def test_a_page_opens_without_an_error_and_from_this_computer_alone(tab, path):
+def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)
     time.sleep(0.5)
-    assert tab.errors() == []
-    script = "return performance.getEntriesByType('resource').map((one) => one.name)"
-    loaded = tab.driver.execute_script(script)
-    foreign = [one for one in loaded if not one.startswith((tab.served.page(""), "data:", "blob:"))]
-    assert foreign == []
+    assert (tab.errors(), tab.foreign(), tab.nameless()) == ([], [], [])
     assert tab.one(".studio-stop").is_displayed()
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):
@@ -65,23 +61,6 @@ def test_nothing_is_wider_than_the_window(tab, path, width):
     assert wide <= width
     box = tab.one(".studio-stop").rect
     assert box["x"] >= 0 and box["x"] + box["width"] <= width
-
-
-@pytest.mark.parametrize("path", PAGES)
-def test_every_control_has_a_name(tab, path):
-    """What a screen reader reads: a label, a text or an aria-label."""
-    tab.open(path)
-    script = """
-    const nameless = [];
-    for (const one of document.querySelectorAll("button, input, select, textarea, a, [role=button]")) {
-      if (one.closest("[aria-hidden=true]") || one.type === "file" || one.type === "hidden") continue;
-      const text = one.getAttribute("aria-label") || one.textContent.trim();
-      const label = text || (one.closest("label") || {}).textContent;
-      if (!label || !label.trim()) nameless.push(one.outerHTML.slice(0, 160));
-    }
-    return nameless;
-    """
-    assert tab.driver.execute_script(script) == []
 
 
 def test_navigation_by_keyboard_alone(tab):
@@ -123,6 +102,7 @@ def test_a_move_of_an_axis_that_is_off_says_what_to_do(tab):
     until(lambda: any("enable it first" in line for line in tab.told()), f"the remedy; told: {tab.told()}")
 
 
+@pytest.mark.slow
 def test_transitions_are_pressed_in_the_diagram(tab):
     at_rest(tab)
     for transition, state in (("2", "Ready to switch on"), ("3", "Switched on"), ("6", "Ready to switch on")):
@@ -136,7 +116,7 @@ def test_transitions_are_pressed_in_the_diagram(tab):
     assert lit == "Ready to switch on"
 
 
-@pytest.mark.every(5)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("way", ["button", "space", "space, with a button focused", "control and space in a text"])
 @pytest.mark.parametrize("path", PAGES)
 def test_quick_stop_from_every_page(tab, path, way):
@@ -168,6 +148,7 @@ def test_the_space_bar_in_a_text_is_a_space(tab):
     assert tab.state == "Operation enabled"
 
 
+@pytest.mark.slow
 def test_a_jog_lasts_as_long_as_its_button_is_held(tab):
     at_rest(tab)
     tab.type("jog-speed", "300 rpm")
@@ -183,6 +164,7 @@ def test_a_jog_lasts_as_long_as_its_button_is_held(tab):
     raise AssertionError(f"it was stopped instead of released: {tab.told()}")
 
 
+@pytest.mark.slow
 def test_two_pages_at_once(tab, served):
     """Both see the same axis; one stops what the other moves."""
     at_rest(tab)
@@ -201,6 +183,7 @@ def test_two_pages_at_once(tab, served):
 
 
 # --- scope --------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
     at_rest(tab)
     tab.press("enable")
@@ -223,6 +206,7 @@ def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
     assert "rise" in told, told
 
 
+@pytest.mark.slow
 def test_twenty_frames_a_second(tab):
     tab.open("/scope")
     until(lambda: tab.driver.execute_script("return studioScope.frames") > 5, "frames")
@@ -284,6 +268,7 @@ def shown(tab, name):
     return found[0].text if found else ""
 
 
+@pytest.mark.slow
 def test_favourites_stay_in_the_browser(tab):
     tab.open("/dictionary")
     tab.driver.execute_script("localStorage.setItem('studio-favourites', '[]')")

@@ -62,6 +62,7 @@ def bus():
         yield channel
 
 
+@pytest.mark.slow
 def test_every_page_answers_for_a_drive_that_is_known_by_its_eds_alone(bus, tmp_path):
     """The page Tune was an error 500 with a traceback."""
     eds = tmp_path / "vendor.eds"
@@ -72,6 +73,7 @@ def test_every_page_answers_for_a_drive_that_is_known_by_its_eds_alone(bus, tmp_
         check_pages(made)
 
 
+@pytest.mark.slow
 def test_every_page_answers_on_a_bus(bus):
     with studio("--channel", bus) as made:
         check_pages(made)
@@ -144,7 +146,7 @@ def framing(inside):
         server.shutdown()
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize("path", ["/axes", "/nothing", "/studio/assets/studio.js"])
 def test_a_page_of_another_port_shows_nothing_of_the_studio_in_a_frame(made, path):

@@ -79,6 +79,7 @@ def stands_within(world, seconds):
     assert world.truth.stands().all()
 
 
+@pytest.mark.slow
 def test_a_button_that_is_released_ends_the_jog(driver, bench):
     world, _ = bench
     tab = turning(driver, bench)
@@ -118,7 +119,7 @@ def fetch(url):
         urllib.request.urlopen(url, timeout=BUSY + 20.0).close()
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["button", "space", "request"])
 def test_quick_stop_does_not_wait_for_a_page_that_computes(driver, bench, way):
     """A settings.toml of 40 kB kept the quick stop for 47 s."""
@@ -157,6 +158,7 @@ def test_a_release_does_not_wait_for_a_page_that_computes(driver, bench):
         assert still()
 
 
+@pytest.mark.slow
 def test_a_jog_ends_with_its_browser_though_a_page_computes(driver, bench):
     world, made = bench
     turning(driver, bench)
@@ -186,6 +188,7 @@ def test_the_studio_ends_though_a_page_computes(driver, bench, number):
 
 
 # --- pages that are gone --------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_move_ends_with_its_page_though_another_one_is_there(driver, bench):
     """900 revolutions: it ran on, 60 of them, until somebody stopped it."""
     world, made = bench
@@ -253,6 +256,7 @@ def test_the_page_is_closed(driver, bench):
     until(lambda: not world.truth.is_on().any(), "the voltage off, since no page is there", 10.0)
 
 
+@pytest.mark.slow
 def test_the_browser_sleeps(driver, bench):
     """No beat comes any more, though its connection stays."""
     world, _ = bench
@@ -280,7 +284,7 @@ def test_the_studio_is_killed(driver, bench):
     driver.get("about:blank")
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_studio_is_ended_by_a_signal(driver, bench, number):
     world, made = bench

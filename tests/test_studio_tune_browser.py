@@ -21,17 +21,6 @@ pytestmark = needs_chromium
 PAGES = ("/tune", "/machine", "/runs")
 WIDTHS = (360, 1280, 2560)
 COLUMN = 2  # of velocity P
-NAMELESS = """
-const nameless = [];
-for (const one of document.querySelectorAll("button, input, select, textarea, a, [role=button], [role=slider]")) {
-  if (one.closest("[aria-hidden=true]") || one.type === "file" || one.type === "hidden") continue;
-  const around = one.closest("[aria-label]");
-  const text = one.getAttribute("aria-label") || one.textContent.trim() || (around && around.ariaLabel);
-  const label = text || (one.closest("label") || {}).textContent;
-  if (!label || !label.trim()) nameless.push(one.outerHTML.slice(0, 160));
-}
-return nameless;
-"""
 
 
 @pytest.fixture(scope="module")
@@ -94,17 +83,13 @@ def parameters(emulated):
 
 # --- every page ---------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("path", PAGES)
-def test_a_page_opens_without_an_error_and_from_this_computer_alone(tab, path):
+def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)
     time.sleep(1.0)
-    assert tab.errors() == []
-    script = "return performance.getEntriesByType('resource').map((one) => one.name)"
-    foreign = [one for one in tab.driver.execute_script(script)
-               if not one.startswith((tab.served.page(""), "data:", "blob:"))]  # fmt: skip
-    assert foreign == []
+    assert (tab.errors(), tab.foreign(), tab.nameless()) == ([], [], [])
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):
@@ -112,13 +97,6 @@ def test_nothing_is_wider_than_the_window(tab, path, width):
     tab.open(path)
     time.sleep(0.5)
     assert tab.driver.execute_script("return document.documentElement.scrollWidth") <= width
-
-
-@pytest.mark.parametrize("path", PAGES)
-def test_every_control_has_a_name(tab, path):
-    tab.open(path)
-    time.sleep(0.5)
-    assert tab.driver.execute_script(NAMELESS) == []
 
 
 # --- tune ---------------------------------------------------------------------------------------------------------
@@ -163,6 +141,7 @@ def test_a_slider_writes_the_gain_of_a_drive_on_the_bus_and_undo_takes_it_back(d
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_everything_goes_back_to_the_state_before(driver, bench, emulated):
     _, made = bench
     before = parameters(emulated)
@@ -176,6 +155,7 @@ def test_everything_goes_back_to_the_state_before(driver, bench, emulated):
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_a_step_is_recorded_on_the_bus_within_its_travel(driver, bench, emulated):
     world, made = bench
     tab = Tab(driver, made).open("/tune")
@@ -214,6 +194,7 @@ def test_quick_stop_in_the_middle_of_auto_on_the_bus(driver, bench, emulated):
     assert parameters(emulated) == before
 
 
+@pytest.mark.slow
 def test_a_machine_on_a_bus_has_no_page(driver, bench):
     _, made = bench
     tab = Tab(driver, made).open("/machine")
@@ -221,6 +202,7 @@ def test_a_machine_on_a_bus_has_no_page(driver, bench):
     driver.get("about:blank")
 
 
+@pytest.mark.slow
 def test_margins_follow_a_slider_after_a_response(tab):
     tab.open("/tune")
     now = gain(tab)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.tables import every_row
 
 from drive_env import EmulatedDrives, motion
 from drive_env.own_packages import ForeignPackageError, check_own
@@ -391,7 +392,7 @@ def test_pictures_of_a_grid_without_a_usable_pair(small):
 TEXT = DEFAULT.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
+@every_row(("old", "new", "message"), [
     ('device = "tmcm1636"', 'device = "abc"', "no device is named 'abc'; there are tgz_d, tgz_s"),
     ('motor = "qbl4208"', 'motor = "abc"', "no motor is named 'abc'; there are am3033_e, am3041_e"),
     ('load = "two_mass"', 'load = "abc"', "no load is named 'abc'; there are arm, ball_screw, belt, cart_pendulum"),

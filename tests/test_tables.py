@@ -106,7 +106,7 @@ SLOW = [
 ]
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize("command", [*EMULATED, *(pytest.param(row, marks=pytest.mark.slow) for row in SLOW)],
                          ids=lambda row: " ".join(row[:3]))  # fmt: skip
 def test_what_a_command_prints_is_whole_at_80_columns(given, tmp_path, monkeypatch, command):
@@ -143,6 +143,7 @@ def test_what_a_command_prints_of_a_bus_is_whole_at_80_columns(given, channel, t
     check(CliRunner().invoke(APPS["drive-env"], command), given, code)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", APPS)
 def test_helps_are_whole_at_80_columns(name, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(WIDTH))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
+from rigs.tables import every_row
 from rigs.tgz_images import SIZES, rows, structure
 
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
@@ -138,8 +139,8 @@ def two_axes(**options):
 
 
 # --- the dictionary ---------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("row", rows(PROFILE), ids=lambda row: row[0])
+@every_row("axis", [0, 1])
+@every_row("row", rows(PROFILE))
 def test_an_object_of_the_profile_is_there_for_both_axes(row, axis):
     entries = find_device("tgz_d").new_dictionary()
     index = int(row[0], 16) + 0x800 * axis
@@ -157,7 +158,7 @@ def test_an_object_of_the_profile_is_there_for_both_axes(row, axis):
         assert entries.find((index, 0)).default == int(last)
 
 
-@pytest.mark.parametrize("row", [*rows(PROFILE), *rows(OTHERS)], ids=lambda row: row[0])
+@every_row("row", [*rows(PROFILE), *rows(OTHERS)])
 def test_a_pdo_carries_what_the_column_of_its_direction_says_and_nothing_else(row):
     """Over the wire, both ways: another one is refused with 06040041h, and the default mapping stays."""
     index = int(row[0], 16)

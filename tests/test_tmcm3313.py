@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
+from rigs.tables import every_row
 from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, motion
@@ -359,7 +360,7 @@ TABLE_380 = {
 }
 
 
-@pytest.mark.parametrize(("code", "first"), TABLE_380)
+@every_row(("code", "first"), TABLE_380)
 def test_an_emergency_is_as_table_380_has_it(code, first):
     row = find_device("tmcm3313").emergencies[TABLE_380[code, first]]
     whole_module = code in (0x5441, 0x6320)

@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 
 import pytest
+from rigs.tables import every_row
 
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
@@ -267,7 +268,7 @@ def on_ethercat(dictionary):
     return entries_on_ethercat(find_device("tmcm3313"), dictionary)
 
 
-@pytest.mark.parametrize("key", TAKEN)
+@every_row("key", TAKEN)
 def test_an_entry_is_as_the_manual_prints_it_on_every_axis(on_ethercat, key):
     kind, access, mapping, limits, default = TAKEN[key]
     index, sub = split(key)

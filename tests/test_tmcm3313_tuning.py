@@ -73,6 +73,7 @@ def test_a_sweep_of_two_currents_has_a_point_for_each_pair(tmp_path):
     assert unmeasured(find_device("tmcm6212")) == "no 6077h"
 
 
+@pytest.mark.slow
 def test_optimise_finds_currents_of_three_axes_again_to_the_digit():
     settings = Settings(trials=4, seed=3)
     found = []
@@ -118,6 +119,7 @@ def test_auto_commissions_and_certifies_load_detection_and_closed_loop(tmp_path,
     assert any(axis["after"][name] != axis["before"][name] for name in LOOP_GAINS)
 
 
+@pytest.mark.slow
 def test_gains_that_won_by_noise_are_not_kept(tmp_path, monkeypatch):
     """A search that praises a tenth of the commissioned gains: in trials that are made again they are no better."""
 
@@ -139,6 +141,7 @@ def test_gains_that_won_by_noise_are_not_kept(tmp_path, monkeypatch):
     assert "none of 24 others that were tried was better" in result.output
 
 
+@pytest.mark.slow
 def test_a_closed_loop_whose_every_trial_is_stopped_is_not_certified(tmp_path, monkeypatch):
     """The axis is, with its loop open; a J of stopped trials is no figure."""
 
@@ -366,6 +369,7 @@ VARIED = {"p": (4000, 30_000), "i": (1, 8000), "d": (1, 100_000), "limit": (2000
           "divider": (200, 2)}  # fmt: skip
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("prefix", "without"),
     [
@@ -459,6 +463,7 @@ def test_gain_tuning_and_its_robust_cost_tell_gains_of_the_pid_apart(prefix, slo
         env.close()
 
 
+@pytest.mark.slow
 def test_a_sweep_of_the_pid_measures_no_current_and_says_so(tmp_path):
     shipped = load_experiment(closed_loop=PID_ON_RAMP)
     few = replace(shipped, sweep=(replace(shipped.sweep[0], count=3), replace(shipped.sweep[1], count=2)))

@@ -13,6 +13,7 @@ import re
 from pathlib import Path
 
 import pytest
+from rigs.tables import every_row
 
 from drive_env.dictionary.entries import ObjectDictionary
 
@@ -325,7 +326,7 @@ def number(text, signed, bits):
     return value - 2**bits if signed and value >= 2 ** (bits - 1) else value
 
 
-@pytest.mark.parametrize("key", TABLE, ids=lambda key: f"{key[0]:04X}-{key[1]:X}")
+@every_row("key", TABLE)
 def test_an_entry_is_as_its_maker_has_it_on_every_axis(dictionary, key):
     kind, access, mappable, default, limits = TABLE[key]
     for axis in range(AXES):

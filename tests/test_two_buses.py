@@ -81,6 +81,7 @@ def program(name, *arguments):
     return [sys.executable, "-c", code, *map(str, arguments)]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("more", "says"),
     [

@@ -93,8 +93,8 @@ def test_scan_and_get_tell_of_them(twins, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_INTERFACE", "virtual")
     monkeypatch.setenv("DRIVE_ENV_CHANNEL", channel)
     with Server(twins, CanPort(can.Bus(interface="virtual", channel=channel))):
-        scanned = CliRunner().invoke(app, ["scan", "--last", "3", "--timeout", "3"])
-        rows = CliRunner().invoke(app, ["scan", "--last", "3", "--timeout", "3", "--json"])
+        scanned = CliRunner().invoke(app, ["scan", "--last", "1", "--timeout", "3"])
+        rows = CliRunner().invoke(app, ["scan", "--last", "1", "--timeout", "3", "--json"])
         got = CliRunner().invoke(app, ["get", "6041", "--timeout", "20"])
     assert scanned.stdout.startswith(f"node 1  {SAID}")
     assert [(row["node"], row["answers"]) for row in json.loads(rows.stdout)] == [(1, 2)]

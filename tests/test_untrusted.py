@@ -266,6 +266,7 @@ def test_arrays_that_are_not_what_they_say(kind, tmp_path, memory):
         episode_log.load(path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_bomb_is_refused_before_it_is_unpacked(bomb, memory):
     assert bomb.stat().st_size < 10_000_000
@@ -407,6 +408,7 @@ def test_a_certificate_within_limits(tmp_path):
         certificate_files.is_unchanged(tmp_path / "certificate.json")
 
 
+@pytest.mark.slow
 def test_a_device_without_end_is_no_file_of_anybody(tmp_path):
     """In a process of its own: today's code takes all the memory there is."""
     if not Path("/dev/zero").exists():
@@ -469,6 +471,7 @@ def blf_bomb(path, megabytes):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 def test_a_log_of_frames_that_unpacks_without_end_is_refused(tmp_path, monkeypatch):
     """600 kB that unpack to 600 MB: of 500 MB that are read 500 GB could come."""
@@ -490,6 +493,7 @@ def test_a_recorded_move_has_lines_of_a_length(tmp_path):
         read_log(tmp_path / "move.csv")
 
 
+@pytest.mark.every(2)
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 @pytest.mark.parametrize(("kind", "told"), [("numbers", "more than 2 GB of memory"), ("rounds", "more than 1 s")])
 def test_an_onnx_model_acts_once_within_limits_before_it_is_loaded(kind, told, tmp_path, monkeypatch):

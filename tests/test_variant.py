@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
+from rigs.tables import every_row
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
@@ -105,7 +106,7 @@ def drives():
 
 
 # --- the dictionary ---------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("row", ROWS, ids=[f"{row[0]:04X}:{row[1]}" for row in ROWS])
+@every_row("row", ROWS)
 def test_an_object_is_as_the_makers_eds_has_it(row):
     index, sub, kind, access, default, unit = row
     entry = ENTRIES[index, sub]
@@ -164,7 +165,7 @@ def test_data_of_a_variant_replace_values_and_not_tables():
     assert merged(base, {"a": 5, "table": {"c": [7]}}) == {"a": 5, "table": {"b": 2, "c": [7]}, "other": {"d": 3}}
 
 
-@pytest.mark.parametrize("motor", BASE.motors)
+@every_row("motor", BASE.motors)
 def test_a_preset_is_the_devices_in_other_units(motor):
     base, own = BASE.preset(find_motor(motor)), VARIANT.preset(find_motor(motor))
     assert list(own) == list(base)

@@ -318,6 +318,7 @@ def test_auto_finds_a_reversed_encoder_on_a_bus_inside_the_envelope(tmp_path, mo
         assert drives.read(ENCODER_DIRECTION)[0] == 1
 
 
+@pytest.mark.slow
 def test_the_fields_of_a_gantry_turn_the_same_way_so_that_its_ends_do_not_block_each_other():
     # Drawn once: its ends stood so that one had more room forwards and the other backwards, and neither followed.
     (machine,) = (row for row in load_suite("public", 822) if row.name == "seed822-24-gantry-qbl4208")

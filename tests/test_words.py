@@ -6,6 +6,7 @@ import ast
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -22,18 +23,23 @@ COMMENT = re.compile(r"(?:^|  )# (.*)")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
+@lru_cache(maxsize=1)  # a source is asked for twice in a row
+def nodes_of(source: str) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(source)))
+
+
 def texts(source: str, *, private: bool = False) -> Iterator[tuple[int, str]]:
     """Yield line and text of strings with a space, which people read; of `private` docstrings if asked for."""
-    tree = ast.parse(source)
+    nodes = nodes_of(source)
     hidden = {
         id(node.body[0].value)
-        for node in ast.walk(tree)
+        for node in nodes
         if not private
         and isinstance(node, DOCUMENTED)
         and getattr(node, "name", "").startswith("_")
         and isinstance(node.body[0], ast.Expr)
     }
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in hidden:
             text = " ".join(node.value.split())
             if " " in text:

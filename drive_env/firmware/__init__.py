@@ -20,6 +20,7 @@ def firmware_names() -> list[str]:
     return sorted(path.parent.name for path in _FOLDER.glob("*/stages.py"))
 
 
+@cache
 def checked_firmware(name: str) -> str:
     """Return a name of a list of stages; ValueError for one that there is not, with those there are."""
     if name not in firmware_names():

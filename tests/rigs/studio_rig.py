@@ -35,6 +35,17 @@ FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage",
 )  # fmt: skip
+NAMELESS = """
+const nameless = [];
+for (const one of document.querySelectorAll("button, input, select, textarea, a, [role=button], [role=slider]")) {
+  if (one.closest("[aria-hidden=true]") || one.type === "file" || one.type === "hidden") continue;
+  const around = one.matches("[role=slider]") && one.closest("[aria-label]");
+  const text = one.getAttribute("aria-label") || one.textContent.trim() || (around && around.ariaLabel);
+  const label = text || (one.closest("label") || {}).textContent;
+  if (!label || !label.trim()) nameless.push(one.outerHTML.slice(0, 160));
+}
+return nameless;
+"""
 PATIENCE = 120.0  # s: a cold cache compiles for a minute
 
 
@@ -205,3 +216,13 @@ class Tab:
     def errors(self):
         """Return what went wrong in the browser: scripts that failed, requests that were refused."""
         return [row for row in self.driver.get_log("browser") if row["level"] == "SEVERE"]
+
+    def foreign(self):
+        """Return what the page has loaded from elsewhere than this studio."""
+        script = "return performance.getEntriesByType('resource').map((one) => one.name)"
+        ours = self.served.page(""), "data:", "blob:"
+        return [one for one in self.driver.execute_script(script) if not one.startswith(ours)]
+
+    def nameless(self):
+        """Return the controls for which a screen reader has no words: a label, a text or an aria-label."""
+        return self.driver.execute_script(NAMELESS)
