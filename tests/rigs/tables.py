@@ -28,7 +28,8 @@ def every_row(names: str | tuple[str, ...], rows: Iterable[Any]) -> Callable[[Ch
                     check(**fixtures, **values)
                 except (Exception, pytest.fail.Exception) as error:
                     wrong.append(f"{values}: {type(error).__name__}: {error}")
-            assert not wrong, f"{len(wrong)} of {len(table)} rows are wrong:\n" + "\n".join(wrong)
+            if wrong:
+                pytest.fail(f"{len(wrong)} of {len(table)} rows are wrong:\n" + "\n".join(wrong), pytrace=False)
 
         given = inspect.signature(check)
         left = [one for name, one in given.parameters.items() if name not in words]
