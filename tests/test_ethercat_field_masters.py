@@ -21,6 +21,7 @@ from drive_env.master.ethercat.ethercat_master import ImageSizes, Sync0
 from drive_env.master.ethercat.frame_master import FrameMaster
 from drive_env.master.ethercat.frame_ways import CallWay
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
+from drive_env.master.parameters import parameters
 
 CYCLES, SETTLING = 150, 200
 TSHARK = shutil.which("tshark")
@@ -147,6 +148,8 @@ def test_our_master_works_where_another_left_its_mapping_and_puts_it_back(pre_op
         targets = start + np.minimum(np.arange(CYCLES + 50), CYCLES)[:, None] * 4
         trace = drives.record([0x6041, 0x6064], (CYCLES + 50) * 0.001, {0x607A: targets})
         np.testing.assert_allclose(trace[0x6064][-1] - start, CYCLES * 4, atol=40)
+        backed_up = {(entry.index, entry.sub) for entry in parameters(drives)}
+        assert {(index, 1) for index in objects} <= backed_up, "on EtherCAT they are parameters"
     pre_op.bring_to(AlState.PRE_OP)
     assert [pre_op.upload(index, complete=True) for index in objects] == left
 

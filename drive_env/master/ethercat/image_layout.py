@@ -66,9 +66,7 @@ class ImagePlanner:
         self._by_key = {(entry.index, entry.sub): (entry, 0) for entry in known} | {
             key: (entry, axis) for key, (entry, axis) in description.of_further_axes().items()
         }
-        device = description.device
-        self._writable = () if device is None or device.ethercat is None else device.ethercat.writable
-        images = {} if device is None else fixed_images(device.presets.parent)
+        images = {} if description.device is None else fixed_images(description.device.presets.parent)
         self._ready_made: dict[int, list[ImageLayout]] = {OUTPUTS: [], INPUTS: []}
         for pdo, image in images.items():
             fields = [(None if one.is_name else one.key, TYPES[one.type][1]) for one in image.fields]
@@ -83,7 +81,7 @@ class ImagePlanner:
             if layout.pdo == pdo:
                 return layout
         known = self._description.dictionary
-        if known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const") and pdo not in self._writable:
+        if known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const"):
             keys = [((raw >> 16, raw >> 8 & 0xFF) if raw >> 16 else None, raw & 0xFF) for raw in mapped]
             return self._of_fields(pdo, keys)
         entries = []
