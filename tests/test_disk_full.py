@@ -56,16 +56,17 @@ def quick(monkeypatch):
     monkeypatch.setattr(tuning_run, "make_trials", lambda bench, basis, policy, show: RecordedGains.only(NEW.copy()))
 
 
-def tune(program, bus, out):
-    name = ["auto", "--bus"] if program is drive_tune else ["tune", "--node", "1"]
-    return CliRunner().invoke(program, [*name, *bus, "--travel", "-5:5", "--yes", "--out", str(out), "--json"])
+def tune(by, bus, out):
+    return CliRunner().invoke(
+        drive_tune, ["auto", "--by", by, "--bus", *bus, "--travel", "-5:5", "--yes", "--out", str(out), "--json"]
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("program", [drive_tune, drive_agent], ids=["auto", "agent"])
+@pytest.mark.parametrize("by", ["design", "agent"])
 @pytest.mark.parametrize("file", ["certificate.json", "report.html", "before.toml"])
-def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, monkeypatch, program, file):
+def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, monkeypatch, by, file):
     """before.toml is written twice: before anything is changed, and before the drive is to keep the gains."""
     out = tmp_path / "run"
     collect = auto_module.collect
@@ -78,7 +79,7 @@ def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, 
     monkeypatch.setattr(auto_module, "collect", disk_is_full)
     with node() as (machine, bus):
         before = gains(machine)
-        done = tune(program, bus, out)
+        done = tune(by, bus, out)
         assert (done.exit_code, done.stdout.count("{")) == (2, 0), done.output
         said = done.stderr.strip().splitlines()[-1]
         assert f"{out / file}: " in said and SAID in said

@@ -27,8 +27,7 @@ COMMANDS = [
         for command in ("auto", "identify", "response", "rules", "optimise")
         for travel in ("-1e300:1e300", f"-{HUGE}:{HUGE}", "nan:nan", "-1:1e300")
     ),
-    ("drive-agent", ("tune", "--travel", "-1e300:1e300"), "a travel of .* rad is impossible"),
-    ("drive-agent", ("tune", "--trials", HUGE), "--trials .* and 10000 at most"),
+    ("drive-tune", ("auto", "--by", "agent", "--trials", HUGE), "--trials .* and 10000 at most"),
     *(
         ("drive-tune", (command, option, number), rf"{option} must be (1 or more|65536 at most), not {number}")
         for command, option in (("identify", "--machines"), ("response", "--machines"), ("rules", "--machines"),

@@ -19,7 +19,6 @@ from rigs.life import Life
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
-from agents.commands.cli import app as agent_app
 from agents.tuner.tune_target import gains_for, surrogate
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
@@ -211,10 +210,10 @@ def test_what_needs_a_linear_model_says_that_it_has_none(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("program", "command"), [(app, "auto"), (app, "rules"), (agent_app, "tune")])
-def test_commands_that_need_a_linear_model_end_with_that_line_and_leave_nothing(tmp_path, program, command):
-    out = [] if command == "rules" else ["--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(program, [command, "--device", INVENTED, "--load", "inertia", *out])
+@pytest.mark.parametrize("command", [("auto",), ("rules",), ("auto", "--by", "agent"), ("auto", "--by", "rule")])
+def test_commands_that_need_a_linear_model_end_with_that_line_and_leave_nothing(tmp_path, command):
+    out = [] if command == ("rules",) else ["--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*command, "--device", INVENTED, "--load", "inertia", *out])
     assert done.exit_code == 2, done.output
     assert done.stderr.strip().endswith(NO_MODEL)
     assert list(tmp_path.iterdir()) == []

@@ -48,7 +48,7 @@ def _from_file(context: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
-@takes(DriveOptions)
+@takes
 def optimise(
     drive: DriveOptions,
     config: Annotated[
