@@ -57,7 +57,7 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
     [
         (("rules", "ziegler"), "no rule is named 'ziegler'; there are modulus_optimum"),
         (("auto", "--by", "rule", "--rule", "nichols"), "no rule is named 'nichols'"),
-        (("auto", "--by", "luck"), "no method is named 'luck'; there are design, agent, rule"),
+        (("auto", "--by", "luck"), "no method is named 'luck'; there are design, agent, tpe"),
         (("auto", "--rule", "simc"), "--rule has no meaning with --by design; leave it out, or choose --by rule"),
         (("auto", "--by", "rule", "--agent", "x"), "--agent has no meaning with --by rule"),
         (
@@ -78,8 +78,11 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
         (("auto", "--inertia-range", "2/0.5"), "the least lies between 0.2 and 1, the greatest between 1 and 5"),
         (("auto", "--device", "tmcm3313", "--dynamics", "soft"), "no linear model of its loops; leave --dynamics out"),
         (("auto", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
-        (("optimise", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
-        (("optimise", "--inertia-range", "2/0.5"), "the least lies between 0.2 and 1, the greatest between 1 and 5"),
+        (("auto", "--by", "tpe", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
+        (
+            ("auto", "--by", "tpe", "--inertia-range", "2/0.5"),
+            "the least lies between 0.2 and 1, the greatest between 1 and 5",
+        ),
         (("rules", "--inertia-range", "1"), "give the least and the greatest load inertia"),
         (("auto", "--bus", "--yes"), "--travel is missing"),
     ],

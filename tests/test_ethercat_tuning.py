@@ -57,7 +57,7 @@ def test_an_agent_tunes_a_tgz(tmp_path):
 def test_an_agent_for_servos_tunes_no_stepper(tmp_path):
     with served("tmcm3313") as (port, _):
         code, printed = run("tmcm3313", port, tmp_path / "agent", "--by", "agent")
-    assert code == 2 and "tmcm3313 has no P of the velocity loop" in printed and "drive-tune optimise" in printed
+    assert code == 2 and "tmcm3313 has no P of the velocity loop" in printed and "drive-tune auto --by tpe" in printed
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ INVENTED = str(FOLDER)
 NAMES = ("speed_gain", "speed_integrator", "position_gain")
 NO_MODEL = (
     f"{INVENTED}: this drive has no linear model of its loops: its gains.toml has no P of the current loop, no I of "
-    "the current loop; drive-tune sweep and optimise need none, and find gains by trials"
+    "the current loop; drive-tune sweep and auto --by tpe need none, and find gains by trials"
 )
 SPEED_GAIN, SPEED_INTEGRATOR = "3200h:01", "3200h:02"
 
@@ -108,8 +108,8 @@ def test_a_search_finds_gains_within_its_ranges():
 
 
 def test_the_command_writes_them_by_their_names(tmp_path):
-    line = ["optimise", "--device", INVENTED, "--load", "inertia", "--sampler", "random", "--trials", "2",
-            "--copies", "2", "--out", str(tmp_path / "found")]  # fmt: skip
+    line = ["auto", "--by", "random", "--device", INVENTED, "--load", "inertia", "--trials", "2",
+            "--machines", "2", "--out", str(tmp_path / "found")]  # fmt: skip
     done = CliRunner().invoke(app, line)
     assert done.exit_code == 0, done.output
     head = (tmp_path / "found" / "trials.csv").read_text(encoding="utf-8").splitlines()[0]
@@ -240,7 +240,10 @@ def test_without_a_cascade_there_is_no_rule_and_every_method_says_so(tmp_path):
     out = str(tmp_path / "out")
     for line, says in (
         (["auto", "--device", str(folder), "--load", "inertia", "--out", out], "its gains.toml names no cascade"),
-        (["optimise", "--device", str(folder), "--load", "inertia", "--out", out], "names no cascade of its loops"),
+        (
+            ["auto", "--by", "tpe", "--device", str(folder), "--load", "inertia", "--out", out],
+            "names no cascade of its loops",
+        ),
         (["rank", "--suite", str(suite), "-t", "factory", "--out", out], "names no cascade of its loops"),
     ):
         done = CliRunner().invoke(app, line)

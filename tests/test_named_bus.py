@@ -178,7 +178,7 @@ def test_these_commands_may_act_on_a_bus():
     """That the programs are read rightly: a command that is lost from this list is looked at by nobody."""
     assert {str(one) for one in ON_A_BUS} >= {
         *(f"drive-env {one}" for one in ("scan", "get", "set", "jog", "scope", "export", "serve", "lss node-id")),
-        *(f"drive-tune {one}" for one in ("identify", "response", "rules", "optimise", "auto", "undo")),
+        *(f"drive-tune {one}" for one in ("identify", "response", "rules", "auto", "undo")),
         "drive-agent evaluate",
     }
     for one in ON_A_BUS:
@@ -259,7 +259,7 @@ def test_a_bus_in_the_environment_alone_turns_no_motor(monkeypatch):
 def test_the_settings_of_a_search_on_a_bus_are_repeated_on_no_emulated_machine(monkeypatch):
     """A motor turns only if --bus is said again; without it the search is refused, not made elsewhere."""
     monkeypatch.setattr(EmulatedDrives, "__init__", emulated)
-    command = next(one for one in ON_A_BUS if str(one) == "drive-tune optimise")
+    command = next(one for one in ON_A_BUS if str(one) == "drive-tune auto")
     for where in ('channel = "can0"', 'interface = "socketcan"', "nodes = [1]"):
         Path("settings.toml").write_text(f'sampler = "tpe"\n[machine]\ndevice = "tmcm1636"\n{where}\n')
         found = run(command, line(command, "--config", "settings.toml"))

@@ -67,7 +67,7 @@ def given(monkeypatch):
         "drive_env.commands.fault",
         "drive_env.commands.scan",
         "agents.commands.evaluate",
-        *(f"tuning.commands.{name}" for name in ("auto", "rank", "optimise", "response", "rules", "sweep", "dry_run")),
+        *(f"tuning.commands.{name}" for name in ("auto", "rank", "search", "response", "rules", "sweep", "dry_run")),
     ):
         monkeypatch.setattr(f"{module}.print_lines", note_lines)
     monkeypatch.setattr("drive_env.commands.tables.terminal_width", lambda: WIDTH)
@@ -92,8 +92,8 @@ EMULATED = [
     ("drive-tune", "rank", "--list"),
     ("drive-tune", "rules", "--load", "inertia"),
     ("drive-tune", "response", "--load", "gantry"),
-    ("drive-tune", "optimise", "--load", "gantry", "--trials", "3", "--copies", "3", "--objective", "speed",
-     "--objective", "robustness", "--objective", "current", "--out", "found"),
+    ("drive-tune", "auto", "--by", "tpe", "--load", "gantry", "--trials", "3", "--machines", "3",
+     "--objective", "speed", "--objective", "robustness", "--objective", "current", "--out", "found"),
 ]  # fmt: skip
 SLOW = [
     ("drive-tune", "identify", "--load", "gantry"),

@@ -147,6 +147,8 @@ def _corrected(
     # Of machines that failed their move no loop was looked at yet; one looked at and not seen asks for more margin.
     looked_at = bench.going & bench.whole_machines(recorded.failed == "")
     blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
+    if not worth and not blind.any() and not any(_short(bench, recorded, int(k)) for k in np.flatnonzero(bench.going)):
+        return gains, why
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
         asked = find_dynamics("soft", bench.dynamics.inertia_range)

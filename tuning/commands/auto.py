@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.dry_run import tell_plan
-from tuning.commands.methods import DESIGN, By, MethodOptions, OpenedMethod, open_method
+from tuning.commands.methods import DESIGN, SEARCHES, By, MethodOptions, OpenedMethod, open_method
 from tuning.commands.options import (
     REFUSED,
     DynamicsOption,
@@ -71,6 +73,9 @@ def auto(
         from tuning.way_back import way_back
 
         method.check(by)
+        if by in SEARCHES:
+            _search(by, drive, method, dynamics, inertia_range, out=out, store=store, dry_run=dry_run, json=json)
+            return
         asked = asked_dynamics(dynamics, drive.device, inertia_range)  # before anything is done
         tell: Callable[[str], None] = (lambda line: None) if json else print
         how = open_method(by, method, drive.device, dynamics, None if drive.bus else drive.load, tell)
@@ -107,6 +112,55 @@ def _run(
         )  # fmt: skip
     _report(target, result, folder, json)
     return result
+
+
+def _search(
+    by: str,
+    drive: TargetOptions,
+    method: MethodOptions,
+    dynamics: str | None,
+    inertia_range: str | None,
+    *,
+    out: Path | None,
+    store: bool,
+    dry_run: bool,
+    json: bool,
+) -> None:
+    """Tune drives by a search, and print the result; where no certificate is possible, it is the search alone."""
+    from tuning.auto_to_files import BEFORE, auto_to_files
+    from tuning.commands.search import open_search
+    from tuning.runs import provenance, unfinished
+    from tuning.way_back import way_back
+
+    search = open_search(by, drive, method, dynamics=dynamics, inertia_range=inertia_range, out=out)
+    folder = search.folder
+    if dry_run:
+        drive.check_linear_model()
+        with drive.open_to_read() as target:
+            how = OpenedMethod(search.plan, math.inf, lambda target: search.method(folder))
+            tell_plan(target, how, folder, keep=store, json=json)
+        return
+    if not search.is_certified:
+        search.alone(json)
+        return
+    asked = asked_dynamics(dynamics, drive.device, inertia_range)
+    before = folder / BEFORE if drive.bus else None
+    place = nullcontext(folder) if drive.bus else provenance.new_folder(folder)
+    with unfinished.telling_what_is_kept(folder), search.telling_what_is_lost(), way_back(before, "drive-tune"):
+        if not drive.bus:
+            search.on_machine()
+        with replace(drive, machines=None).open() as target:
+            with place as here, progress_bar(search.plan) as show:
+                result = auto_to_files(
+                    target, here, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=asked,
+                    method=search.method(here),
+                )  # fmt: skip
+            if not json:
+                search.print(before)
+            _report(target, result._replace(file=folder / BEFORE), folder, json, {"search": search.as_dict(before)})
+    unfinished.discard(folder)
+    if not result.accepted.all():
+        raise typer.Exit(REFUSED)
 
 
 def _report_stepper(target: Target, result: StepperResult, folder: Path, json: bool) -> None:
@@ -156,7 +210,7 @@ def _not_kept(target: Target) -> str:
     return "; the drive has no 1010h: it has the settings until it is switched off (`drive-env backup` keeps them)"
 
 
-def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
+def _report(target: Target, result: Result, folder: Path, json: bool, search: Mapping[str, Any] | None = None) -> None:
     from drive_env.devices.gains import cascade_columns
 
     if json:
@@ -179,7 +233,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         summary = {"drive seconds": result.drive_seconds.tolist(), "stored": result.kept}
         written = {"certificate": "certificate.json", "report": "report.html"}
         files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in written.items()}
-        print_json({"axes": rows} | summary | files)
+        print_json({"axes": rows} | summary | files | dict(search or {}))
         return
     columns = (
         Column("axis"), Column("", "name"), Column("torque\nP, I", "name"), Column("velocity\nP, I", "name"),
@@ -207,9 +261,11 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         lines += [f"axis {k}: {note}" for note in axis.notes]
     kept = "; the gains are stored in the drive" if result.kept else _not_kept(target)
     stopped = int(result.aborts.sum())
-    trials = f"{stopped} trial{'s' * (stopped != 1)} stopped"
-    lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {trials}{kept}")
-    lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
+    lines.append(
+        f"{result.drive_seconds.max():.1f} s of drive time, {stopped} trial{'s' * (stopped != 1)} stopped{kept}"
+    )
+    trials = "" if search is None else ", trials.csv, trials.png, settings.toml"
+    lines.append(f"written to {folder}: before.toml, certificate.json, report.html{trials}")
     if target.bus:
         lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)

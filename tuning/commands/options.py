@@ -110,7 +110,10 @@ ChosenAxis = Annotated[
         show_default="all",
     ),
 ]
-Machines = Annotated[int, typer.Option("--machines", help="Number of emulated machines.")]
+Machines = Annotated[
+    int | None,
+    typer.Option("--machines", help="Number of emulated machines.", show_default="1; 8 for a search by trials"),
+]
 Randomise = Annotated[bool, typer.Option("--randomise", help="Draw random parameters for every machine.")]
 Workers = Annotated[
     int | None,
@@ -223,17 +226,22 @@ class DriveOptions:
 class TargetOptions(DriveOptions):
     """The same, and how many emulated machines."""
 
-    machines: Machines = 1
+    machines: Machines = None
     randomise: Randomise = False
+
+    @property
+    def count(self) -> int:
+        """How many emulated machines there are, 1 unless told otherwise."""
+        return 1 if self.machines is None else self.machines
 
     def check(self) -> None:
         """Raise ValueError for a number that cannot be."""
         super().check()
-        check_machines("--machines", self.machines)
+        check_machines("--machines", self.count)
 
     def machine(self) -> dict[str, Any]:
         """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
-        return super().machine() | {"num_machines": self.machines, "randomise": self.randomise}
+        return super().machine() | {"num_machines": self.count, "randomise": self.randomise}
 
 
 def takes(command: Callable[..., None]) -> Callable[..., None]:
