@@ -17,6 +17,7 @@ CLOSED = 141  # as the shell has it of programs that SIGPIPE ends: 128 + 13
 # What ends a program from outside: a service that is stopped, a terminal that is closed. What a drive was told must be
 # taken back then, too, as after Ctrl-C.
 ENDS = ("SIGTERM", "SIGHUP")
+METHODS = {"agent": "agents.tuner.auto_method"}  # of `drive-tune auto --by`, outside of `tuning`
 
 
 def drive_tune() -> None:
@@ -32,6 +33,16 @@ def drive_env() -> None:
 def drive_agent() -> None:
     """Run `drive-agent`, if the packages that Python finds are ours."""
     _run("drive-agent", "agents.commands.cli", "drive_env", "mechanics", "tuning", "agents")
+
+
+def import_method(name: str) -> Any:
+    """Return the module of a tuning method that a package above `tuning` has, if that package is ours.
+
+    `agents` takes seconds to import, and most runs need none of it.
+    """
+    module = METHODS[name]
+    check_own(module.partition(".")[0])
+    return importlib.import_module(module)
 
 
 def _run(command: str, module: str, *packages: str) -> None:

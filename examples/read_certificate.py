@@ -23,7 +23,7 @@ def listed(figures: dict[str, float]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", help="certificate.json of drive-tune auto or drive-agent tune")
+    parser.add_argument("file", help="certificate.json of drive-tune auto")
     options = parser.parse_args()
     certificate, unchanged = load_certificate(options.file)
     if not unchanged:

@@ -310,7 +310,7 @@ def judged(recipe: Recipe, made: AgentFile, machines: int) -> AgentFile:
     answers = of[DEFAULT]
     figures = {
         "what": f"robust cost of the answer over that of {recipe.rule}, {TRIALS} trials, machines not trained on; "
-        "standard dynamics; of the agent alone, without the check of margins that drive-agent tune adds",
+        "standard dynamics; of the agent alone, without the check of margins that drive-tune auto --by agent adds",
         "machines": answers.ratio.size,
         "seed": UNSEEN,
         **figures_of(answers.ratio),

@@ -136,7 +136,7 @@ _TMCM3313 = Recipe(
     ),
     dynamics=(DEFAULT,),
     rule="the values it is commissioned with",
-    limits=("the corrections of load angle control only", "drive-agent tune does not take it", _NOT_COMPARED),
+    limits=("the corrections of load angle control only", "drive-tune auto --by agent does not take it", _NOT_COMPARED),
 )  # fmt: skip
 
 RECIPES = {recipe.device: recipe for recipe in (_TMCM1636, _TGZ, _TGZ._replace(device="tgz_s"), _TMCM3313)}

@@ -10,7 +10,7 @@ from rigs.commands import drive_tune
 from drive_env.devices.gains import RAW_MAX
 from tuning.auto import settings as auto_settings
 from tuning.auto.one_button import BUDGET
-from tuning.certificate.certificate_files import is_unchanged
+from tuning.certificate.certificate_files import is_unchanged, load_certificate
 from tuning.snapshot import load_snapshot
 
 
@@ -57,9 +57,10 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
     ("arguments", "words"),
     [
         (("rules", "ziegler"), "no rule is named 'ziegler'; there are modulus_optimum"),
-        (("rules", "--apply", "nichols"), "no rule is named 'nichols'"),
-        (("rules", "--store"), "add --apply RULE"),
-        (("rules", "--snapshot", "before.toml"), "add --apply RULE"),
+        (("auto", "--by", "rule", "--rule", "nichols"), "no rule is named 'nichols'"),
+        (("auto", "--by", "luck"), "no method is named 'luck'; there are design, agent, tpe"),
+        (("auto", "--rule", "simc"), "--rule has no meaning with --by design; leave it out, or choose --by rule"),
+        (("auto", "--by", "rule", "--agent", "x"), "--agent has no meaning with --by rule"),
         (
             ("rules", "--bus", "--travel", "-1:1"),
             "will turn. Is its way clear? There is no terminal to ask; confirm with --yes",
@@ -78,8 +79,11 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
         (("auto", "--inertia-range", "2/0.5"), "the least lies between 0.2 and 1, the greatest between 1 and 5"),
         (("auto", "--device", "tmcm3313", "--dynamics", "soft"), "no linear model of its loops; leave --dynamics out"),
         (("auto", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
-        (("optimise", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
-        (("optimise", "--inertia-range", "2/0.5"), "the least lies between 0.2 and 1, the greatest between 1 and 5"),
+        (("auto", "--by", "tpe", "--device", "tmcm3313", "--inertia-range", "0.5/3"), "leave --inertia-range out"),
+        (
+            ("auto", "--by", "tpe", "--inertia-range", "2/0.5"),
+            "the least lies between 0.2 and 1, the greatest between 1 and 5",
+        ),
         (("rules", "--inertia-range", "1"), "give the least and the greatest load inertia"),
         (("auto", "--bus", "--yes"), "--travel is missing"),
     ],
@@ -124,9 +128,10 @@ def test_auto_ends_with_1_and_says_why_where_it_changed_nothing(tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_rules_write_one_of_them_and_leave_the_way_back(tmp_path):
-    file = tmp_path / "before.toml"
-    done = drive_tune("rules", "cascade", "--load", "inertia", "--apply", "cascade", "--snapshot", file, "--yes")
+def test_the_gains_of_a_rule_are_tried_and_certified(tmp_path):
+    done = drive_tune("auto", "--by", "rule", "--rule", "margin_55", "--load", "inertia", "--out", tmp_path / "run")
     assert done.exit_code == 0, done.output
-    assert "written" in done.stdout
-    assert load_snapshot(file).axes[0][0x2042, 1] == 445
+    assert load_snapshot(tmp_path / "run" / "before.toml").axes[0][0x2042, 1] == 445
+    certificate, unchanged = load_certificate(tmp_path / "run" / "certificate.json")
+    (axis,) = certificate.axes
+    assert unchanged and certificate.tuner == "rule margin_55" and axis.accepted and axis.after != axis.before

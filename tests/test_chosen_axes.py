@@ -87,7 +87,7 @@ def test_auto_on_the_axes_that_have_motors_is_accepted_and_lets_the_others_alone
 
 
 @pytest.mark.every(2)
-@pytest.mark.parametrize("command", [("auto",), ("optimise", "--trials", "1", "--sampler", "random")], ids=" ".join)
+@pytest.mark.parametrize("command", [("auto",), ("auto", "--by", "random", "--trials", "1")], ids=" ".join)
 def test_axes_without_a_motor_are_named_before_anything_moves(served, tmp_path, command):
     """It wrote 6060h and ramps of all axes, and failed with advice on 6085h of one that has no motor."""
     drives, _, options = served
@@ -107,7 +107,16 @@ def test_axes_without_a_motor_are_named_before_anything_moves(served, tmp_path, 
     assert (drives.read(cia402.STATUSWORD) & 0x4F == 0x40).all()
 
 
-@pytest.mark.parametrize("command", [("auto",), ("optimise",), ("identify",), ("response",), ("rules",)])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("auto",),
+        ("auto", "--by", "tpe"),
+        ("identify",),
+        ("response",),
+        ("rules",),
+    ],
+)
 def test_an_axis_that_is_not_there_names_which_there_are(command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     done = drive_tune(*command, "--device", "tmcm6212", "--node", "1", "--travel", "free", "--yes", "--axis", "6")

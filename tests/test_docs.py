@@ -121,6 +121,8 @@ def commands_of(program: str) -> dict[str, set[str]]:
 
     def walk(group, before):
         for key, command in group.commands.items():
+            if command.hidden:  # an old name
+                continue
             if hasattr(command, "commands"):
                 walk(command, f"{before}{key} ")
             else:

@@ -1,4 +1,4 @@
-"""`drive-tune auto` and `drive-agent tune` over EtherCAT: in lockstep over UDP, in real time over a virtual cable."""
+"""`drive-tune auto`, by design and by an agent, on EtherCAT: in lockstep by UDP, in real time by a virtual cable."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ from rigs.ethercat_served import served
 from rigs.namespaces import first_line, inside, needs_namespaces, spaces  # noqa: F401
 from typer.testing import CliRunner
 
-import agents.commands.cli
-import tuning.commands.cli
 from drive_env.master.ethercat_drives import EtherCatDrives
+from tuning.commands.cli import app
 from tuning.search.trial_bench import leave_oscillations_to_trials
 from tuning.stepper.commissioning import commission
 
 pytestmark = pytest.mark.usefixtures("quick_designs")
 
 
-def run(app, command, device, port, out):
+def run(device, port, out, *more):
     """Return what a command printed as JSON, with its exit code."""
     bus = ["--device", device, "--interface", "ethercat-udp", "--channel", port, "--node", "0", "--lockstep"]
-    done = CliRunner().invoke(app, [command, *bus, "--travel", "-5:5", "--yes", "--out", str(out), "--json"])
+    done = CliRunner().invoke(app, ["auto", *more, *bus, "--travel", "-5:5", "--yes", "--out", str(out), "--json"])
     return done.exit_code, json.loads(done.stdout) if done.stdout.strip() else done.output
 
 
@@ -35,7 +34,7 @@ def run(app, command, device, port, out):
 def test_drive_tune_auto_tunes_a_tgz(tmp_path):
     """Both axes are accepted with their new gains; in lockstep always the same."""
     with served("tgz_d") as (port, drives):
-        _, printed = run(tuning.commands.cli.app, "auto", "tgz_d", port, tmp_path / "auto")
+        _, printed = run("tgz_d", port, tmp_path / "auto")
         found = np.stack([drives.read(key) for key in drives.device.gains.keys], axis=1)
     axes = printed["axes"]
     assert [axis["verdict"] for axis in axes] == ["accepted"] * 2, axes
@@ -46,9 +45,9 @@ def test_drive_tune_auto_tunes_a_tgz(tmp_path):
 
 
 @pytest.mark.slow
-def test_drive_agent_tune_tunes_a_tgz(tmp_path):
+def test_an_agent_tunes_a_tgz(tmp_path):
     with served("tgz_d") as (port, drives):
-        code, printed = run(agents.commands.cli.app, "tune", "tgz_d", port, tmp_path / "agent")
+        code, printed = run("tgz_d", port, tmp_path / "agent", "--by", "agent")
     assert code == 0, printed
     # By the noise there may be reservations: in half of the runs margins are measured at too few lines.
     assert drives.num_axes == 2 and "'accepted': True" in str(printed) and "rejected" not in str(printed)
@@ -57,8 +56,8 @@ def test_drive_agent_tune_tunes_a_tgz(tmp_path):
 @pytest.mark.slow
 def test_an_agent_for_servos_tunes_no_stepper(tmp_path):
     with served("tmcm3313") as (port, _):
-        code, printed = run(agents.commands.cli.app, "tune", "tmcm3313", port, tmp_path / "agent")
-    assert code == 2 and "tmcm3313 has no P of the velocity loop" in printed and "drive-tune optimise" in printed
+        code, printed = run("tmcm3313", port, tmp_path / "agent", "--by", "agent")
+    assert code == 2 and "tmcm3313 has no P of the velocity loop" in printed and "drive-tune auto --by tpe" in printed
 
 
 @pytest.mark.slow
@@ -79,19 +78,19 @@ FIRST = ["chrt", "-f", "10"] if shutil.which("chrt") and hasattr(os, "geteuid") 
 LATE = ("SYNCs were more than a cycle late", "the program made no call for", "too busy")
 
 
-def tuned_in_real_time(spaces, device, program, command, out, *more):  # noqa: F811
+def tuned_in_real_time(spaces, device, out, *more):  # noqa: F811
     """Tune as `tuned_once` does; once more where that was rejected or stopped, as it may be on a busy computer."""
     try:
-        found = tuned_once(spaces, device, program, command, out, *more)
+        found = tuned_once(spaces, device, out, *more)
         if "'rejected'" not in str(found):
             return found
     except AssertionError as error:
         if not any(text in str(error) for text in LATE):
             raise
-    return tuned_once(spaces, device, program, command, out.with_name("again"), *more)
+    return tuned_once(spaces, device, out.with_name("again"), *more)
 
 
-def tuned_once(spaces, device, program, command, out, *more):  # noqa: F811
+def tuned_once(spaces, device, out, *more):  # noqa: F811
     """Tune a drive that is served in one namespace from the other; return exit code and what was printed as JSON."""
     pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
     server = subprocess.Popen(
@@ -100,8 +99,8 @@ def tuned_once(spaces, device, program, command, out, *more):  # noqa: F811
     )  # fmt: skip
     try:
         assert first_line(server) == "1 slave\n"
-        words = [command, "--device", device, "--interface", "ethercat", "--channel", spaces.master_interface]
-        script = f"from drive_env.programs import {program}; {program}()"
+        words = ["auto", "--device", device, "--interface", "ethercat", "--channel", spaces.master_interface]
+        script = "from drive_env.programs import drive_tune; drive_tune()"
         done = subprocess.run(
             FIRST
             + inside(spaces.master, "-c", script, *words, "--position", 0, "--yes", "--out", out, "--json", *more),
@@ -123,7 +122,7 @@ def is_too_busy(axis):
 @pytest.mark.slow
 @needs_namespaces
 def test_drive_tune_auto_tunes_a_tgz_in_real_time(spaces, tmp_path):  # noqa: F811
-    found = tuned_in_real_time(spaces, "tgz_d", "drive_tune", "auto", tmp_path / "auto", "--travel", "-5:5")
+    found = tuned_in_real_time(spaces, "tgz_d", tmp_path / "auto", "--travel", "-5:5")
     for axis in found["axes"]:
         assert is_too_busy(axis) or (axis["accepted"] and axis["after"] != axis["before"]), axis
         assert any("6062h) is in no process data" in note and "not recorded" in note for note in axis["notes"])
@@ -133,7 +132,7 @@ def test_drive_tune_auto_tunes_a_tgz_in_real_time(spaces, tmp_path):  # noqa: F8
 @needs_namespaces
 def test_drive_tune_auto_commissions_a_stepper_in_real_time(spaces, tmp_path):  # noqa: F811
     """Its image has room for three objects of each axis: position, demand, current; the statusword is asked for."""
-    found = tuned_in_real_time(spaces, "tmcm3313", "drive_tune", "auto", tmp_path / "auto", "--travel", "-20:20")
+    found = tuned_in_real_time(spaces, "tmcm3313", tmp_path / "auto", "--travel", "-20:20")
     assert len(found["axes"]) == 3
     for axis in found["axes"]:
         assert is_too_busy(axis) or axis["verdict"] != "rejected", axis
@@ -141,6 +140,6 @@ def test_drive_tune_auto_commissions_a_stepper_in_real_time(spaces, tmp_path):  
 
 @pytest.mark.slow
 @needs_namespaces
-def test_drive_agent_tunes_a_tgz_in_real_time(spaces, tmp_path):  # noqa: F811
-    found = tuned_in_real_time(spaces, "tgz_d", "drive_agent", "tune", tmp_path / "agent", "--travel", "-5:5")
+def test_an_agent_tunes_a_tgz_in_real_time(spaces, tmp_path):  # noqa: F811
+    found = tuned_in_real_time(spaces, "tgz_d", tmp_path / "agent", "--by", "agent", "--travel", "-5:5")
     assert "'verdict':" in str(found) and "6062h) is in no process data" in str(found)

@@ -142,22 +142,6 @@ def test_a_run_that_ends_well_leaves_the_drive_as_the_file_says_and_tells_it(tmp
         assert status_is(machine, *OFF)
 
 
-@pytest.mark.slow
-def test_what_rules_apply_stays_and_is_undone_by_the_file(tmp_path):
-    with node() as (machine, bus):
-        done = CliRunner().invoke(
-            drive_tune, ["rules", "cascade", *TUNING, *bus, "--apply", "cascade", "--snapshot", "mine.toml"]
-        )
-        assert done.exit_code == 0, done.output
-        assert "written; drive-tune undo mine.toml restores the state before" in done.stdout
-        assert set() < differences(machine, "mine.toml") <= set(GAIN_OBJECTS)
-        again = CliRunner().invoke(drive_tune, ["rules", "cascade", *TUNING, *bus, "--snapshot", "mine.toml"])
-        assert again.exit_code == 2
-        assert "mine.toml exists already, and may be the state before an earlier run" in again.stderr
-        CliRunner().invoke(drive_tune, ["undo", "mine.toml", "--yes"])
-        assert differences(machine, "mine.toml") == set()
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_place_that_cannot_be_written_is_told_before_the_bus_is_opened(tmp_path, command):
     (tmp_path / "runs").write_text("a file", encoding="utf-8")

@@ -131,7 +131,7 @@ def test_sweep(tmp_path):
 def test_search(tmp_path):
     mine = shutil.copy(ROOT / "drive_env" / "motors" / "qbl4208.toml", tmp_path / "mine.toml")
     given = ("--motor", mine, "--load", "inertia", "--inertia-range", "0.5/3")
-    run("optimise", "--trials", 1, *given, "--out", tmp_path / "out")
+    run("auto", "--by", "tpe", "--trials", 1, *given, "--out", tmp_path / "out")
     settings = tomllib.loads((tmp_path / "out" / "settings.toml").read_text(encoding="utf-8"))
     assert fields("search settings") == list(settings)
     assert fields("trials") == header(tmp_path / "out" / "trials.csv")

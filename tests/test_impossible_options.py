@@ -24,18 +24,17 @@ APPS = {"drive-env": env_app, "drive-tune": tune_app, "drive-agent": agent_app}
 COMMANDS = [
     *(
         ("drive-tune", (command, "--travel", travel), "rad is impossible|must contain 0|must be LOW:HIGH")
-        for command in ("auto", "identify", "response", "rules", "optimise")
+        for command in ("auto", "identify", "response", "rules")
         for travel in ("-1e300:1e300", f"-{HUGE}:{HUGE}", "nan:nan", "-1:1e300")
     ),
-    ("drive-agent", ("tune", "--travel", "-1e300:1e300"), "a travel of .* rad is impossible"),
-    ("drive-agent", ("tune", "--trials", HUGE), "--trials .* and 10000 at most"),
+    ("drive-tune", ("auto", "--by", "agent", "--trials", HUGE), "--trials .* and 10000 at most"),
     *(
         ("drive-tune", (command, option, number), rf"{option} must be (1 or more|65536 at most), not {number}")
         for command, option in (("identify", "--machines"), ("response", "--machines"), ("rules", "--machines"),
-                                ("optimise", "--copies"))
+                                ("auto", "--machines"))
         for number in ("1000000000", HUGE, "0", "-1")
     ),
-    ("drive-tune", ("optimise", "--searches", "1000000000"), "--searches must be 1 or more, and 10000 at most"),
+    ("drive-tune", ("auto", "--by", "tpe", "--searches", "1000000000"), "--searches must be .* and 10000 at most"),
     ("drive-env", ("scan", "--timeout", "1e300"), "--timeout 1e.300 s must be above 0 s, and"),
     ("drive-env", ("get", "6041", "--timeout", "1e300", "--interface", "virtual"), "1e.300 s is impossible"),
     ("drive-env", ("log", "a.log", "--duration", "1e300"), "--duration 1e.300 s must be above 0 s, and"),

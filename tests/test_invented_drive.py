@@ -19,7 +19,6 @@ from rigs.life import Life
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
-from agents.commands.cli import app as agent_app
 from agents.tuner.tune_target import gains_for, surrogate
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
@@ -51,7 +50,7 @@ INVENTED = str(FOLDER)
 NAMES = ("speed_gain", "speed_integrator", "position_gain")
 NO_MODEL = (
     f"{INVENTED}: this drive has no linear model of its loops: its gains.toml has no P of the current loop, no I of "
-    "the current loop; drive-tune sweep and optimise need none, and find gains by trials"
+    "the current loop; drive-tune sweep and auto --by tpe need none, and find gains by trials"
 )
 SPEED_GAIN, SPEED_INTEGRATOR = "3200h:01", "3200h:02"
 
@@ -108,8 +107,8 @@ def test_a_search_finds_gains_within_its_ranges():
 
 
 def test_the_command_writes_them_by_their_names(tmp_path):
-    line = ["optimise", "--device", INVENTED, "--load", "inertia", "--sampler", "random", "--trials", "2",
-            "--copies", "2", "--out", str(tmp_path / "found")]  # fmt: skip
+    line = ["auto", "--by", "random", "--device", INVENTED, "--load", "inertia", "--trials", "2",
+            "--machines", "2", "--out", str(tmp_path / "found")]  # fmt: skip
     done = CliRunner().invoke(app, line)
     assert done.exit_code == 0, done.output
     head = (tmp_path / "found" / "trials.csv").read_text(encoding="utf-8").splitlines()[0]
@@ -212,10 +211,10 @@ def test_what_needs_a_linear_model_says_that_it_has_none(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("program", "command"), [(app, "auto"), (app, "rules"), (agent_app, "tune")])
-def test_commands_that_need_a_linear_model_end_with_that_line_and_leave_nothing(tmp_path, program, command):
-    out = [] if command == "rules" else ["--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(program, [command, "--device", INVENTED, "--load", "inertia", *out])
+@pytest.mark.parametrize("command", [("auto",), ("rules",), ("auto", "--by", "agent"), ("auto", "--by", "rule")])
+def test_commands_that_need_a_linear_model_end_with_that_line_and_leave_nothing(tmp_path, command):
+    out = [] if command == ("rules",) else ["--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*command, "--device", INVENTED, "--load", "inertia", *out])
     assert done.exit_code == 2, done.output
     assert done.stderr.strip().endswith(NO_MODEL)
     assert list(tmp_path.iterdir()) == []
@@ -242,7 +241,10 @@ def test_without_a_cascade_there_is_no_rule_and_every_method_says_so(tmp_path):
     out = str(tmp_path / "out")
     for line, says in (
         (["auto", "--device", str(folder), "--load", "inertia", "--out", out], "its gains.toml names no cascade"),
-        (["optimise", "--device", str(folder), "--load", "inertia", "--out", out], "names no cascade of its loops"),
+        (
+            ["auto", "--by", "tpe", "--device", str(folder), "--load", "inertia", "--out", out],
+            "names no cascade of its loops",
+        ),
         (["rank", "--suite", str(suite), "-t", "factory", "--out", out], "names no cascade of its loops"),
     ):
         done = CliRunner().invoke(app, line)

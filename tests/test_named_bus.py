@@ -89,14 +89,15 @@ SERVES = "drive-env serve"
 VALUES: dict[str, str] = {
     "objects": "6041", "name": "6081", "value": "1", "speed": "60 rpm", "motor": "qbl4208", "new": "5",
     "policy": "tracking_two_mass", "environment": "tracking", "device": "tmcm1636", "load": "inertia",
-    "drive-agent tune agent": "gain_tuning", "drive-env lss bit-rate new": "500000", "file": "state.toml",
+    "drive-env lss bit-rate new": "500000", "file": "state.toml",
     "drive-env backup file": "new.toml", "drive-env export file": "new.eds", "drive-env log file": "new.log",
     "drive-env replay file": "frames.log", "drive-tune undo file": "before.toml", "other": "state.toml",
+    "drive-tune auto agent": "gain_tuning", "drive-tune auto by": "design",
     "dynamics": "soft", "inertia_range": "0.8/4",
     "replay": "move.csv", "out": "new", "drive-env scope out": "new.csv", "drive-env jog out": "new.csv",
-    "eds": "own.eds", "config": "config.toml", "journal": "new.journal", "snapshot": "new.toml", "store": "new",
+    "eds": "own.eds", "config": "config.toml", "journal": "new.journal", "store": "new",
     "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env replay speed": "2", "max_current": "1 A",
-    "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc", "apply": "simc",
+    "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc",
     "sampler": "tpe", "objectives": "cost", "gains": "velocity_p", "axes": "apart", "travel": "-1:1",
     "cluster": "tcp://127.0.0.1:1", "against": "emulator", "sensor": "module:function", "listen": "127.0.0.1",
     "token": "12345678", "minari": "drives/tracking-v0", "fault": "encoder_stuck at=2",
@@ -177,8 +178,8 @@ def test_these_commands_may_act_on_a_bus():
     """That the programs are read rightly: a command that is lost from this list is looked at by nobody."""
     assert {str(one) for one in ON_A_BUS} >= {
         *(f"drive-env {one}" for one in ("scan", "get", "set", "jog", "scope", "export", "serve", "lss node-id")),
-        *(f"drive-tune {one}" for one in ("identify", "response", "rules", "optimise", "auto", "undo")),
-        *(f"drive-agent {one}" for one in ("tune", "evaluate")),
+        *(f"drive-tune {one}" for one in ("identify", "response", "rules", "auto", "undo")),
+        "drive-agent evaluate",
     }
     for one in ON_A_BUS:
         assert {"interface", "channel"} <= one.options.keys(), f"{one} has no name for the whole bus"
@@ -258,7 +259,7 @@ def test_a_bus_in_the_environment_alone_turns_no_motor(monkeypatch):
 def test_the_settings_of_a_search_on_a_bus_are_repeated_on_no_emulated_machine(monkeypatch):
     """A motor turns only if --bus is said again; without it the search is refused, not made elsewhere."""
     monkeypatch.setattr(EmulatedDrives, "__init__", emulated)
-    command = next(one for one in ON_A_BUS if str(one) == "drive-tune optimise")
+    command = next(one for one in ON_A_BUS if str(one) == "drive-tune auto")
     for where in ('channel = "can0"', 'interface = "socketcan"', "nodes = [1]"):
         Path("settings.toml").write_text(f'sampler = "tpe"\n[machine]\ndevice = "tmcm1636"\n{where}\n')
         found = run(command, line(command, "--config", "settings.toml"))

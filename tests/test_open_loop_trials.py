@@ -238,8 +238,8 @@ def test_sweep_runs_the_open_loop_experiment_says_what_is_not_measured_and_repea
 
 def test_optimise_says_which_terms_j_has_not(stepper, tmp_path):
     out = tmp_path / "found"
-    result = run("optimise", "--device", stepper, "--motor", NAME, "--load", "inertia", "--trials", 4, "--copies", 2,
-                 "--objective", "speed", "--objective", "current", "--out", out)  # fmt: skip
+    result = run("auto", "--by", "tpe", "--device", stepper, "--motor", NAME, "--load", "inertia", "--trials", 4,
+                 "--machines", 2, "--objective", "speed", "--objective", "current", "--out", out)  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "no load step and no ripple" in result.output
     assert "current [%]" in (out / "trials.csv").read_text(encoding="utf-8").splitlines()[0]
@@ -252,8 +252,8 @@ def test_optimise_says_which_terms_j_has_not(stepper, tmp_path):
     (("rules",), "no linear model of its loops"),
     (("rules", "--relay"), "no linear model of its loops"),
     (("sweep", "--load", "nothing"), "nothing"),
-    (("optimise", "--gain", "velocity_p"), "no gain is named 'velocity_p'; there are run_current, standby_current"),
-    (("optimise", "--objective", "noise"), "no objective is named 'noise'"),
+    (("auto", "--by", "tpe", "--gain", "velocity_p"), "no gain is named 'velocity_p'; there are run_current"),
+    (("auto", "--by", "tpe", "--objective", "noise"), "no objective is named 'noise'"),
 ])  # fmt: skip
 def test_commands_refuse_in_one_line_before_anything_moves(stepper, command, reason, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

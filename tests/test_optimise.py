@@ -503,7 +503,7 @@ def node(tmp_path, monkeypatch):
     hub = Hub()
     bus = ("--bus", "--interface", "slcan", "--channel", hub.channel, "--lockstep")
     with Server(world, hub):
-        yield machine, ("optimise", *bus, "--travel", "-5:5", "--yes", "--trials", 4, "--out", "obus")
+        yield machine, ("auto", "--by", "random", *bus, "--travel", "-5:5", "--yes", "--trials", 4, "--out", "obus")
     world.close()
 
 
@@ -511,7 +511,7 @@ def node(tmp_path, monkeypatch):
 def test_the_emergency_that_ended_a_trial_is_printed_and_in_the_table(node, tmp_path, monkeypatch):
     machine, arguments = node
     fails_in_its_second_trial(monkeypatch, machine)
-    done = CliRunner().invoke(app, [str(argument) for argument in (*arguments, "--sampler", "random")])
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert done.exit_code == 0, done.output
     assert done.stdout.count("was stopped: the drive reported") == 1
     assert "trial 1 was stopped: the drive reported shutdown switch (5441h)" in done.stdout
@@ -535,7 +535,10 @@ def is_interrupted(monkeypatch):
     ("more", "says"),
     [
         ((), "the trials made so far are lost: on a bus they are kept only with --journal FILE"),
-        (("--journal", "kept.log"), "the trials made are in kept.log: the same command continues from there"),
+        (
+            ("--journal", "kept.log"),
+            "the trials made are in kept.log: the same command, with a new --out, continues from there",
+        ),
     ],
 )
 def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkeypatch, more, says):
@@ -545,26 +548,26 @@ def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkey
     code, error = drive_tune(*arguments, *more)
     assert code == 130
     assert error.splitlines() == [
-        "drive-tune: the drives have their state from before, by a second reading; drive-tune undo obus-before.toml "
+        "drive-tune: the drives have their state from before, by a second reading; drive-tune undo obus/before.toml "
         "restores it",
         f"drive-tune: interrupted; {says}",
     ]
     assert [int(machine.read(key)[0]) for key in GAIN_OBJECTS] == before
 
 
-def test_the_way_back_of_an_earlier_search_is_not_replaced(node, monkeypatch, tmp_path):
+def test_the_way_back_of_an_earlier_search_is_not_replaced(node, tmp_path):
     """It is the only one, if that search was killed."""
     _, arguments = node
-    is_interrupted(monkeypatch)
-    (tmp_path / "obus-before.toml").write_text("the only copy", encoding="utf-8")
+    (tmp_path / "obus").mkdir()
+    (tmp_path / "obus" / "before.toml").write_text("the only copy", encoding="utf-8")
     _, error = drive_tune(*arguments)
-    assert "drive-tune undo obus-before-2.toml restores it" in error
-    assert (tmp_path / "obus-before.toml").read_text(encoding="utf-8") == "the only copy"
+    assert "the folder obus is not empty; choose another --out" in error
+    assert (tmp_path / "obus" / "before.toml").read_text(encoding="utf-8") == "the only copy"
 
 
 def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    search = ("optimise", "--load", "inertia", "--trials", 2, "--copies", 1, "--sampler", "random", "--out", "run")
+    search = ("auto", "--by", "random", "--load", "inertia", "--trials", 2, "--machines", 1, "--out", "run")
     assert drive_tune(*search, "--resume") == (
         2, "drive-tune: there is no search to resume: run.unfinished does not exist; correct --out, or leave --resume "
         "out to begin a new one",
@@ -584,10 +587,11 @@ def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypa
         raise KeyboardInterrupt
 
     monkeypatch.setattr("tuning.search.searches.run", pressed)
-    search = ("optimise", "--load", "inertia", "--out", "run")
+    search = ("auto", "--by", "tpe", "--load", "inertia", "--out", "run")
     assert drive_tune(*search) == (130, "drive-tune: interrupted; nothing was written")
     assert drive_tune(*search, "--journal", "kept.log") == (
-        130, "drive-tune: interrupted; the trials made are in kept.log: the same command continues from there",
+        130, "drive-tune: interrupted; the trials made are in kept.log: the same command, with a new --out, continues "
+        "from there",
     )  # fmt: skip
 
 
@@ -632,4 +636,4 @@ def test_the_first_gains_are_those_of_the_commissioning_preset(rigid):
 def test_settings_of_versions_before_0_2_are_read(tmp_path):
     file = tmp_path / "settings.toml"
     file.write_text('sampler = "tpe"\n[machine]\nload = "inertia"\nlanes = 3\n', encoding="utf-8")
-    assert load_options(file) == {"sampler": "tpe", "load": "inertia", "copies": 3}
+    assert load_options(file) == {"by": "tpe", "load": "inertia", "machines": 3}

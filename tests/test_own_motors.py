@@ -215,14 +215,13 @@ def test_a_motor_of_the_catalogue_that_is_changed_takes_the_rules_preset():
 @pytest.mark.slow
 def test_auto_and_the_agent_tune_a_motor_of_ones_own(file, tmp_path):
     """Both look for gains on machines with the motor itself, not one of the catalogue with its name."""
-    from agents.commands.cli import app as agent
     from tuning.commands.cli import app as tune
 
     own = ["--motor", str(file), "--load", "inertia"]
     done = CliRunner().invoke(tune, ["auto", *own, "--out", str(tmp_path / "auto")])
     assert done.exit_code in (0, 1), done.output  # accepted, or rejected by a check
     assert (tmp_path / "auto" / "certificate.json").exists()
-    done = CliRunner().invoke(agent, ["tune", *own, "--trials", "1", "--out", str(tmp_path / "agent")])
+    done = CliRunner().invoke(tune, ["auto", "--by", "agent", *own, "--trials", "1", "--out", str(tmp_path / "agent")])
     assert done.exit_code in (0, 1), done.output
     assert (tmp_path / "agent" / "certificate.json").exists()
 

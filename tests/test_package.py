@@ -63,7 +63,7 @@ def test_the_version_has_one_home_and_its_heading_in_the_changelog():
     (OF_AGENTS, ("drive-agent", "evaluate", "mine.onnx"), "agents"),
     (OF_AGENTS, ("drive-agent", "evaluate", "mine.zip", "--environment", "tracking", "--trust"), "agents"),
     (OF_CLUSTER, ("drive-tune", "sweep", "--cluster", "tcp://127.0.0.1:8786"), "cluster"),
-    (OF_CLUSTER, ("drive-tune", "optimise", "--cluster", "tcp://127.0.0.1:8786"), "cluster"),
+    (OF_CLUSTER, ("drive-tune", "auto", "--by", "tpe", "--cluster", "tcp://127.0.0.1:8786"), "cluster"),
     (OF_CLUSTER, ("drive-tune", "rank", "--cluster", "tcp://127.0.0.1:8786"), "cluster"),
     (OF_CLUSTER, ("drive-agent", "evaluate", "tracking_two_mass", "--cluster", "tcp://127.0.0.1:8786"), "cluster"),
 ])  # fmt: skip

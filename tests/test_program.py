@@ -52,6 +52,16 @@ def test_the_version_is_that_of_the_package(name):
     assert (result.exit_code, result.stdout) == (0, f"{name} {drive_env.__version__}\n")
 
 
+@pytest.mark.parametrize(("program", "old", "new"), [
+    ("drive-tune", "optimise", "drive-tune auto --by tpe"),
+    ("drive-agent", "tune", "drive-tune auto --by agent"),
+])  # fmt: skip
+@pytest.mark.parametrize("more", [[], ["--help"], ["--channel", "can0", "--yes", "x"]], ids=" ".join)
+def test_an_old_name_answers_with_the_new_one_and_does_nothing(program, old, new, more):
+    result = CliRunner().invoke(APPS[program], [old, *more])
+    assert (result.exit_code, result.output) == (2, f"{program}: `{program} {old}` is `{new}` now\n")
+
+
 @pytest.mark.parametrize("name", APPS)
 def test_quiet_and_verbose_exclude_each_other(name):
     command = {"drive-env": "list", "drive-tune": "rules", "drive-agent": "evaluate"}[name]

@@ -451,16 +451,19 @@ def test_the_command_lists_tuners_and_suites():
         (("rank", "--dynamics", "harsh"), "dynamics 'harsh': give soft, standard, stiff"),
         (("rank", "--dynamics", ""), "dynamics '': give soft, standard, stiff"),
         (("rank", "--seed", "-1"), "--seed must be 0 or more, not -1"),
-        (("optimise", "--sampler", "luck"), "no sampler is named 'luck'"),
-        (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES has one"),
-        (("optimise", "--copies", "0"), "--copies must be 1 or more"),
-        (("optimise", "--load", "pendulum"), "no load is named 'pendulum'"),
-        (("optimise", "--bus"), "--travel is missing"),
-        (("optimise", "--lockstep"), "--travel is missing"),
-        (("optimise", "--channel", "can0"), "--travel is missing"),
-        (("optimise", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? There is no terminal to ask"),
-        (("optimise", "--config", "nosuch.toml"), "cannot read nosuch.toml"),
-        (("optimise", "--cluster", "here"), "--cluster here must be the address of a Dask scheduler"),
+        (("auto", "--by", "luck"), "no method is named 'luck'"),
+        (("auto", "--by", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES has one"),
+        (("auto", "--by", "tpe", "--machines", "0"), "--machines must be 1 or more"),
+        (("auto", "--by", "tpe", "--load", "pendulum"), "no load is named 'pendulum'"),
+        (("auto", "--by", "tpe", "--bus"), "--travel is missing"),
+        (("auto", "--by", "tpe", "--lockstep"), "--travel is missing"),
+        (("auto", "--by", "tpe", "--channel", "can0"), "--travel is missing"),
+        (
+            ("auto", "--by", "tpe", "--bus", "--travel", "-1:1"),
+            "will turn. Is its way clear? There is no terminal to ask",
+        ),
+        (("auto", "--config", "nosuch.toml"), "cannot read nosuch.toml"),
+        (("auto", "--by", "tpe", "--cluster", "here"), "--cluster here must be the address of a Dask scheduler"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path):
@@ -474,18 +477,15 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path):
 @pytest.mark.slow
 def test_optimise_prints_and_writes_what_it_found(tmp_path):
     folder = tmp_path / "out"
-    result = run("optimise", "--load", "inertia", "--trials", 6, "--copies", 3, "--safe", "--out", folder)
+    search = ("auto", "--by", "tpe", "--load", "inertia", "--trials", 6, "--machines", 3, "--safe")
+    result = run(*search, "--out", folder)
     assert result.exit_code == 0, result.output
     assert "6 trials" in result.output and "safe start" in result.output
     rows = list(csv.DictReader((folder / "trials.csv").open(encoding="utf-8")))
     assert [int(row["trial"]) for row in rows] == list(range(6))
     assert (folder / "trials.png").read_bytes().startswith(b"\x89PNG")
     assert "safe = true" in (folder / "settings.toml").read_text()
-    told = json.loads(
-        run(
-            "optimise", "--load", "inertia", "--trials", 6, "--copies", 3, "--safe", "--json", "--out", tmp_path / "b"
-        ).stdout
-    )
+    told = json.loads(run(*search, "--json", "--out", tmp_path / "b").stdout)["search"]
     best = min((row for row in rows if row["stopped"] == "False"), key=lambda row: float(row["J"]))
     assert told["gains"][0][2:] == [int(best[name]) for name in ("velocity_p", "velocity_i", "position_p")]
 
@@ -493,14 +493,14 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
 @pytest.mark.slow
 def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their_place(tmp_path):
     first, again, other = tmp_path / "first", tmp_path / "again", tmp_path / "other"
-    options = ("--searches", 2, "--copies", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",
+    options = ("--searches", 2, "--machines", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",
                "velocity_p", "--objective", "speed", "--objective", "current", "--width", 1.2)  # fmt: skip
-    assert run("optimise", "--trials", 3, *options, "--out", first).exit_code == 0
+    assert run("auto", "--by", "tpe", "--trials", 3, *options, "--out", first).exit_code == 0
     settings = first / "settings.toml"
-    assert run("optimise", "--config", settings, "--out", again).exit_code == 0
+    assert run("auto", "--config", settings, "--out", again).exit_code == 0
     for name in ("trials.csv", "settings.toml", "trials.png"):
         assert (first / name).read_bytes() == (again / name).read_bytes()
-    assert run("optimise", "--config", settings, "--trials", 1, "--out", other).exit_code == 0
+    assert run("auto", "--config", settings, "--trials", 1, "--out", other).exit_code == 0
     changed = tomllib.loads((other / "settings.toml").read_text(encoding="utf-8"))
     assert changed == tomllib.loads(settings.read_text(encoding="utf-8")) | {"trials": 1}
 

@@ -328,7 +328,7 @@ def test_a_killed_sweep_with_a_motor_of_ones_own_is_refused_then_goes_on_to_the_
 
 # --- searches and comparisons -----------------------------------------------------------------------------------------
 def interrupt_the_search(monkeypatch):
-    """Have a search of `drive-tune optimise` end as Ctrl-C ends it, with a part that is done."""
+    """Have a search of `drive-tune auto --by tpe` end as Ctrl-C ends it, with a part that is done."""
 
     def stop(shards, pool, log, progress):
         log.append(0, {"x": np.zeros(1)})
@@ -337,7 +337,8 @@ def interrupt_the_search(monkeypatch):
     monkeypatch.setattr(searches, "run", stop)
 
 
-OPTIMISE = ("optimise", "--motor", "mine.toml", "--load", "arm/arm.xml", "--trials", 1, "--copies", 1, "--out", "out")
+OPTIMISE = ("auto", "--by", "tpe", "--motor", "mine.toml", "--load", "arm/arm.xml", "--trials", 1, "--machines", 1,
+            "--out", "out")  # fmt: skip
 
 
 def test_a_search_is_not_resumed_with_a_file_that_was_changed(own, monkeypatch):
@@ -351,16 +352,16 @@ def test_a_search_is_not_resumed_with_a_file_that_was_changed(own, monkeypatch):
 
 @pytest.mark.slow
 def test_settings_of_a_search_repeat_it_from_its_folder_alone(own, decoys, monkeypatch):
-    assert drive_tune(*OPTIMISE, "--sampler", "grid").exit_code == 0
+    assert drive_tune(*OPTIMISE, "--by", "grid").exit_code == 0
     found = (own / "out" / "trials.csv").read_bytes()
     (own / "out").rename(decoys / "moved")
     shutil.rmtree(own / "arm")
     monkeypatch.chdir(decoys)
-    result = drive_tune("optimise", "--config", "moved/settings.toml", "--out", "again")
+    result = drive_tune("auto", "--config", "moved/settings.toml", "--out", "again")
     assert result.exit_code == 0, result.output
     assert (decoys / "again" / "trials.csv").read_bytes() == found
     edit(decoys / "moved" / "inputs" / "motor" / "mine.toml")
-    result = drive_tune("optimise", "--config", "moved/settings.toml", "--out", "third")
+    result = drive_tune("auto", "--config", "moved/settings.toml", "--out", "third")
     assert result.exit_code == 2
     assert "inputs/motor/mine.toml was changed since the run was made with it" in result.output
 
@@ -370,8 +371,8 @@ def test_settings_of_a_search_repeat_it_from_its_folder_alone(own, decoys, monke
 def test_a_journal_is_not_gone_on_with_for_something_else(own, other):
     """Before: trials of both in one study, whatever they were of."""
     pytest.importorskip("optuna")
-    first = ["optimise", "--motor", "mine.toml", "--load", "inertia", "--trials", 1, "--copies", 1, "--sampler",
-             "random", "--journal", "journal"]  # fmt: skip
+    first = ["auto", "--by", "random", "--motor", "mine.toml", "--load", "inertia", "--trials", 1, "--machines", 1,
+             "--journal", "journal"]  # fmt: skip
     assert drive_tune(*first, "--out", "one").exit_code == 0
     before = (own / "journal").read_bytes()
     if other == "changed":

@@ -137,9 +137,11 @@ def test_dynamics_that_cannot_be_asked_for_are_refused(tmp_path):
     with stepper as target, pytest.raises(ValueError, match="no linear model"):
         optimise(target, FEW)
     out = tmp_path / "out"
-    refused = drive_tune("optimise", "--device", "tmcm6212", "--load", "inertia", "--dynamics", "soft", "--out", out)
+    refused = drive_tune(
+        "auto", "--by", "tpe", "--device", "tmcm6212", "--load", "inertia", "--dynamics", "soft", "--out", out
+    )
     assert refused.exit_code == 2 and "leave --dynamics out" in refused.output and not out.exists()
-    refused = drive_tune("optimise", "--dynamics", "45/8", "--out", out)
+    refused = drive_tune("auto", "--by", "tpe", "--dynamics", "45/8", "--out", out)
     assert refused.exit_code == 2 and "phase margin/gain margin/Ms" in refused.output and not out.exists()
 
 
@@ -154,18 +156,18 @@ def test_gains_of_a_search_bear_the_load_inertia_that_was_asked_for(tmp_path, mo
 
     monkeypatch.setattr(search, "ModelMargins", Margins)
     one, two = tmp_path / "one", tmp_path / "two"
-    arguments = ("--trials", 1, "--copies", 1, "--inertia-range", "0.2/5", "--out", one, "--json")
-    done = drive_tune("optimise", *arguments)
+    arguments = ("--trials", 1, "--machines", 1, "--inertia-range", "0.2/5", "--out", one, "--json")
+    done = drive_tune("auto", "--by", "tpe", *arguments)
     assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["settings"]["inertia_range"] == "0.2/5"
-    assert drive_tune("optimise", "--config", one / "settings.toml", "--out", two).exit_code == 0
+    assert json.loads(done.stdout)["search"]["settings"]["inertia_range"] == "0.2/5"
+    assert drive_tune("auto", "--config", one / "settings.toml", "--out", two).exit_code == 0
     assert asked == [("standard", (0.2, 5.0))] * 2
 
 
 @pytest.mark.slow
 def test_a_journal_of_another_range_of_load_inertia_is_refused(tmp_path):
     journal = tmp_path / "search.journal"
-    arguments = ("optimise", "--trials", 1, "--copies", 1, "--load", "inertia", "--journal", journal)
+    arguments = ("auto", "--by", "tpe", "--trials", 1, "--machines", 1, "--load", "inertia", "--journal", journal)
     assert drive_tune(*arguments, "--out", tmp_path / "one").exit_code == 0
     refused = drive_tune(*arguments, "--inertia-range", "0.5/3", "--out", tmp_path / "two")
     assert refused.exit_code == 2 and "give another --journal" in refused.output, refused.output
@@ -173,21 +175,21 @@ def test_a_journal_of_another_range_of_load_inertia_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_asks_for_standard_dynamics_and_says_whose_margins_it_prints(tmp_path):
-    arguments = ("optimise", "--trials", 2, "--copies", 2)
+    arguments = ("auto", "--by", "tpe", "--trials", 2, "--machines", 2)
     found = drive_tune(*arguments, "--out", tmp_path / "one")
     assert found.exit_code == 0, found.output
     assert "they break standard dynamics by the model" in found.output
     assert "axis 0: by the identified model, not measured: velocity loop " in found.output
-    told = json.loads(drive_tune(*arguments, "--dynamics", "50/10/1.8", "--json", "--out", tmp_path / "two").stdout)
+    told = json.loads(drive_tune(*arguments, "--dynamics", "50/10/1.8", "--json", "--out", tmp_path / "two").stdout)[
+        "search"
+    ]
     assert told["settings"]["dynamics"] == "50/10/1.8"
     margins = told["margins"][0]
     assert set(margins) == {"velocity", "position"}
     assert min(loop["phase_deg"] for loop in margins.values()) > 50.0
     assert max(loop["ms"] for loop in margins.values()) < 1.8
-    again = drive_tune(
-        "optimise", "--config", tmp_path / "two" / "settings.toml", "--out", tmp_path / "three", "--json"
-    )
-    assert json.loads(again.stdout)["gains"] == told["gains"]
+    again = drive_tune("auto", "--config", tmp_path / "two" / "settings.toml", "--out", tmp_path / "three", "--json")
+    assert json.loads(again.stdout)["search"]["gains"] == told["gains"]
     stepper = (
         "--device",
         "tmcm6212",

@@ -157,7 +157,7 @@ def test_another_seed_trial_or_machine_makes_another_run():
 
 
 # --- the command --------------------------------------------------------------------------------------------------
-SEARCH = ("optimise", "--load", "inertia", "--sampler", "tpe", "--trials", 40, "--copies", 2, "--seed", 4)
+SEARCH = ("auto", "--by", "tpe", "--load", "inertia", "--trials", 40, "--machines", 2, "--seed", 4)
 
 
 def begun(*arguments):

@@ -67,8 +67,7 @@ def given(monkeypatch):
         "drive_env.commands.fault",
         "drive_env.commands.scan",
         "agents.commands.evaluate",
-        "agents.commands.tune",
-        *(f"tuning.commands.{name}" for name in ("auto", "rank", "optimise", "response", "rules", "sweep")),
+        *(f"tuning.commands.{name}" for name in ("auto", "rank", "search", "response", "rules", "sweep", "dry_run")),
     ):
         monkeypatch.setattr(f"{module}.print_lines", note_lines)
     monkeypatch.setattr("drive_env.commands.tables.terminal_width", lambda: WIDTH)
@@ -93,15 +92,15 @@ EMULATED = [
     ("drive-tune", "rank", "--list"),
     ("drive-tune", "rules", "--load", "inertia"),
     ("drive-tune", "response", "--load", "gantry"),
-    ("drive-tune", "optimise", "--load", "gantry", "--trials", "3", "--copies", "3", "--objective", "speed",
-     "--objective", "robustness", "--objective", "current", "--out", "found"),
+    ("drive-tune", "auto", "--by", "tpe", "--load", "gantry", "--trials", "3", "--machines", "3",
+     "--objective", "speed", "--objective", "robustness", "--objective", "current", "--out", "found"),
 ]  # fmt: skip
 SLOW = [
     ("drive-tune", "identify", "--load", "gantry"),
     ("drive-tune", "auto", "--load", "gantry", "--out", "found"),
     ("drive-tune", "sweep", "--out", "found"),
     ("drive-tune", "rank", "-t", "baseline", "-t", "symmetrical_optimum", "--count", "2", "--out", "found"),
-    ("drive-agent", "tune", "--load", "belt", "--out", "found"),
+    ("drive-tune", "auto", "--by", "agent", "--load", "belt", "--out", "found"),
     ("drive-agent", "evaluate", "gain_tuning", "--episodes", "2", "--out", "found"),
 ]
 
@@ -148,14 +147,15 @@ def test_what_a_command_prints_of_a_bus_is_whole_at_80_columns(given, channel, t
 def test_helps_are_whole_at_80_columns(name, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(WIDTH))
     group = typer.main.get_command(APPS[name])
-    for command in (None, *group.commands):
+    shown_commands = {name: one for name, one in group.commands.items() if not one.hidden}
+    for command in (None, *shown_commands):
         result = CliRunner().invoke(APPS[name], ["--help"] if command is None else [command, "--help"], prog_name=name)
         described = group if command is None else group.commands[command]
         shown = [one for one in described.params if not getattr(one, "hidden", False)]
         texts = [described.help.replace("\b", " "), *(getattr(one, "help", None) or "" for one in shown)]
         texts += [option for one in shown for option in (*one.opts, *one.secondary_opts) if "-" in option]
         if command is None:
-            texts += [one.get_short_help_str(limit=1000) for one in group.commands.values()]
+            texts += [one.get_short_help_str(limit=1000) for one in shown_commands.values()]
         assert max(map(len, result.stdout.splitlines())) <= WIDTH, command
         assert "…" not in result.stdout, command
         found = words(result.stdout)

@@ -206,7 +206,7 @@ def test_figures_are_in_units_that_a_person_reads():
 
 # --- what is written --------------------------------------------------------------------------------------------------
 MACHINE = {"device": "tmcm1636", "motor": "qbl4208", "load": "belt", "supply": 24.0, "travel": (-1.0, 1.5),
-           "copies": 4, "channel": None, "lockstep": True}  # fmt: skip
+           "machines": 4, "channel": None, "lockstep": True}  # fmt: skip
 FOUND = SimpleNamespace(
     t_0=0.01,
     rows=[
@@ -240,19 +240,19 @@ def test_the_table_has_a_row_for_each_axis_of_each_trial(written):
 
 def test_the_settings_repeat_the_search(written):
     text = (written / "settings.toml").read_text(encoding="utf-8")
-    assert text.startswith("# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n")
+    assert text.startswith("# All settings of the search. To repeat it: drive-tune auto --config settings.toml\n")
     assert "\n# journal: kept.log\n" in text
     assert tomllib.loads(text) == {
         "sampler": "random", "trials": 3, "objectives": ["cost"], "gains": ["velocity_p", "position_p"],
         "width": 0.5, "safe": True, "seed": 2,
         "machine": {"device": "tmcm1636", "motor": "qbl4208", "load": "belt", "supply": 24.0, "travel": [-1.0, 1.5],
-                    "copies": 4, "lockstep": True},
+                    "machines": 4, "lockstep": True},
         "versions": {"drive-env": "1.2"},
     }  # fmt: skip
     assert load_options(written / "settings.toml") == {
-        "sampler": "random", "trials": 3, "objectives": ["cost"], "gains": ["velocity_p", "position_p"],
+        "by": "random", "trials": 3, "objectives": ["cost"], "gains": ["velocity_p", "position_p"],
         "width": 0.5, "safe": True, "seed": 2, "device": "tmcm1636", "motor": "qbl4208", "load": "belt",
-        "supply": 24.0, "travel": [-1.0, 1.5], "copies": 4, "lockstep": True,
+        "supply": 24.0, "travel": [-1.0, 1.5], "machines": 4, "lockstep": True,
     }  # fmt: skip
 
 
@@ -280,12 +280,12 @@ def test_the_pace_is_read_and_left_out_since_lockstep_says_it(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("seed = ", r"settings\.toml is not TOML: .*; give settings\.toml of drive-tune optimise"),
-        ("seed = 3\n", r"settings\.toml is not from a search; give settings\.toml of drive-tune optimise"),
+        ("seed = ", r"settings\.toml is not TOML: .*; give settings\.toml of drive-tune auto"),
+        ("seed = 3\n", r"settings\.toml is not from a search; give settings\.toml of drive-tune auto"),
         ("luck = 3\n[machine]\n", r"settings\.toml: key 'luck' is unknown; there are sampler, trials, objectives"),
         ("[machine]\ncolour = 3\n", r"settings\.toml: machine: key 'colour' is unknown; there are device, motor"),
-        (None, r"cannot read .*settings\.toml: No such file or directory; give settings\.toml of drive-tune optimise"),
-        (b"\xff", r"settings\.toml is not TOML: .*; give settings\.toml of drive-tune optimise"),
+        (None, r"cannot read .*settings\.toml: No such file or directory; give settings\.toml of drive-tune auto"),
+        (b"\xff", r"settings\.toml is not TOML: .*; give settings\.toml of drive-tune auto"),
     ],
 )
 def test_a_file_that_is_of_no_search_is_told_why(tmp_path, text, message):

@@ -124,7 +124,7 @@ def test_without_out_results_go_to_a_folder_named_after_the_time(run):
 def test_help_is_quick_and_names_the_options(tmp_path):
     done = drive_tune("--help", cwd=tmp_path)
     assert done.returncode == 0
-    for command in ("identify", "response", "rules", "optimise", "auto", "sweep", "rank", "verify", "undo"):
+    for command in ("identify", "response", "rules", "auto", "sweep", "rank", "verify", "undo"):
         assert f"│ {command} " in done.stdout
     options = drive_tune("sweep", "--help", cwd=tmp_path).stdout
     for option in ("--config", "--device", "--motor", "--load", "--seed", "--out", "--show-config", "--list",
@@ -168,7 +168,7 @@ def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_
     (["identify", "--eds", "vendor.eds"], "an EDS says neither which objects are gains nor in what units"),
     (["auto", "--eds", "vendor.eds", "--node", "1", "--travel", "free"], "give --device FOLDER"),
     (["response", "--eds", "vendor.eds"], "give --device FOLDER"),
-    (["optimise", "--eds", "vendor.eds"], "give --device FOLDER"),
+    (["auto", "--by", "tpe", "--eds", "vendor.eds"], "give --device FOLDER"),
     (["rules", "--eds", "vendor.eds"], "give --device FOLDER"),
     (["sweep", "--seed", "x"], "--seed"),
     (["sweep", "extra"], "unexpected extra argument"),

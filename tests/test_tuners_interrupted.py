@@ -106,11 +106,9 @@ def wait_for(condition, process=None):
 
 
 def start(command, device, address, folder):
-    program = "drive_agent" if command[0] == "agent" else "drive_tune"
-    words = [*command[1:]] if command[0] == "agent" else [*command]
     bus = ["--interface", address["interface"], "--channel", address["channel"], "--node", str(address["nodes"][0])]
     return subprocess.Popen(
-        [sys.executable, "-c", f"from drive_env.programs import {program} as run; run()", *words, "--device", device,
+        [sys.executable, "-c", "from drive_env.programs import drive_tune as run; run()", *command, "--device", device,
          *bus, *["--lockstep"] * (address.get("pace") == "lockstep"), "--travel", "-5:5", "--yes"],
         cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
@@ -131,8 +129,21 @@ def check_left(truth, device, address, folder, said, before):
 ROWS = [
     (device, fieldbus, command, how)
     for device, fieldbus, commands in (
-        ("tgz_d", "ethercat", (("auto",), ("identify",), ("response",), ("agent", "tune"))),
-        ("tmcm3313", "ethercat", (("auto",), ("optimise", "--trials", "20", "--sampler", "random"))),
+        ("tgz_d", "ethercat", (("auto",), ("identify",), ("response",), ("auto", "--by", "agent"))),
+        (
+            "tmcm3313",
+            "ethercat",
+            (
+                ("auto",),
+                (
+                    "auto",
+                    "--by",
+                    "random",
+                    "--trials",
+                    "20",
+                ),
+            ),
+        ),
         ("tmcm6212", "can", (("auto",),)),
     )
     for command in commands
@@ -142,7 +153,7 @@ ROWS = [
 
 def named(one):
     """Return what a test of a row is called."""
-    return one if isinstance(one, str) else " ".join(one[:2]) if one[0] == "agent" else one[0]
+    return one if isinstance(one, str) else " ".join(one[:3]) if "--by" in one else one[0]
 
 
 @pytest.mark.parametrize(("device", "fieldbus", "command", "how"), ROWS, ids=named)
@@ -177,7 +188,7 @@ def test_a_tuner_is_interrupted_at_random(tmp_path, device, fieldbus, command, h
 
 TWO = {
     "one axis": ("tmcm1636", ("auto",), ("auto",)),
-    "one axis, an agent second": ("tmcm1636", ("identify",), ("agent", "tune")),
+    "one axis, an agent second": ("tmcm1636", ("identify",), ("auto", "--by", "agent")),
     "two axes of a module": ("tmcm6212", ("auto", "--axis", "0"), ("auto", "--axis", "3")),
 }
 

@@ -32,7 +32,7 @@ SLOW = 2.0 * 2.0 * np.pi  # rad/s that a ramp's end and a cycle of 1 ms leave
 COMMANDS = {
     "auto": ("tuning.commands.cli", ("auto", "--bus")),
     "identify": ("tuning.commands.cli", ("identify", "--bus")),
-    "agent tune": ("agents.commands.cli", ("tune",)),
+    "agent": ("tuning.commands.cli", ("auto", "--by", "agent")),
 }
 
 

@@ -160,7 +160,7 @@ READERS = {
     "render": (load_demonstration, DemonstrationError),
     "sweep": (load_experiment, ExperimentError),
     "compare": (load_suite, ExperimentError),
-    "optimise": (trials_files.load_options, ValueError),
+    "search": (trials_files.load_options, ValueError),
     "environment": (lambda path: configured(TrackingConfig, path, {}), ValueError),
     "distributions": (Distributions.load, ValueError),
 }
@@ -181,7 +181,7 @@ COMMANDS = {
     "render": (env_app, ("render", "--config", "deep.toml", "--show-config")),
     "sweep": (tune_app, ("sweep", "--config", "deep.toml", "--show-config")),
     "compare": (tune_app, ("rank", "--suite", "deep.toml")),
-    "optimise": (tune_app, ("optimise", "--config", "deep.toml")),
+    "search": (tune_app, ("auto", "--config", "deep.toml")),
     "verify": (tune_app, ("verify", "deep.json")),
     "evaluate": (agent_app, ("evaluate", "tracking_two_mass", "--config", "deep.toml")),
     "against": (agent_app, ("evaluate", "tracking_two_mass", "--against", "deep.json", "--episodes", "1")),

@@ -18,7 +18,6 @@ from rigs.auto_stages import skip_stages
 from rigs.served_drives import GAIN_OBJECTS, PATIENCE, environment, files, node, parameters, status_is, wait_until
 from typer.testing import CliRunner
 
-from agents.commands.cli import app as drive_agent
 from agents.tuner import tuning_run
 from drive_env import cia402, motion
 from drive_env.fieldbus.description import Description
@@ -54,26 +53,25 @@ def pressed(*arguments):
 
 
 @pytest.mark.parametrize(
-    ("program", "stage", "words"),
+    ("by", "stage", "words"),
     [
-        ("auto", "Transaction", "nothing was changed"),
-        ("auto", "write", AS_BEFORE),
-        ("auto", "collect", AS_BEFORE),
-        ("auto", "Transaction.__exit__", "changed still: 2041h:01 "),
-        ("tune", "Transaction", "nothing was changed"),
-        ("tune", "collect", AS_BEFORE),
-        ("tune", "Transaction.__exit__", "changed still: 2041h:01 "),
+        ("design", "Transaction", "nothing was changed"),
+        ("design", "write", AS_BEFORE),
+        ("design", "collect", AS_BEFORE),
+        ("design", "Transaction.__exit__", "changed still: 2041h:01 "),
+        ("agent", "Transaction", "nothing was changed"),
+        ("agent", "collect", AS_BEFORE),
+        ("agent", "Transaction.__exit__", "changed still: 2041h:01 "),
     ],
 )
-def test_ctrl_c_at_any_stage_ends_with_what_the_drives_have(monkeypatch, tmp_path, program, stage, words):
+def test_ctrl_c_at_any_stage_ends_with_what_the_drives_have(monkeypatch, tmp_path, by, stage, words):
     skip_stages(monkeypatch.setattr, NEW)
     monkeypatch.setattr(tuning_run, "make_trials", lambda *given: auto_module.RecordedGains.only(NEW.copy()))
     owner, _, name = stage.rpartition(".")
     monkeypatch.setattr(getattr(auto_module, owner) if owner else auto_module, name, pressed)
-    app = drive_tune if program == "auto" else drive_agent
     with node() as (machine, bus):
         before = [int(machine.read(key)[0]) for key in GAIN_OBJECTS]
-        done = CliRunner().invoke(app, [program, *bus, "--travel", "-5:5", "--yes", "--out", "run"])
+        done = CliRunner().invoke(drive_tune, ["auto", "--by", by, *bus, "--travel", "-5:5", "--yes", "--out", "run"])
         assert done.exit_code == 130, done.output
         state, reason = done.stderr.strip().splitlines()
         assert words.format("run/before.toml") in state and reason.endswith(": interrupted")
@@ -183,7 +181,7 @@ def nmt(bus):
 # --- real processes, real signals ---------------------------------------------------------------------------------
 RUNS = {
     "auto": ("drive_tune", ("auto", "--travel", "-5:5", "--yes", "--out", "run")),
-    "tune": ("drive_agent", ("tune", "--travel", "-5:5", "--yes", "--out", "run")),
+    "agent": ("drive_tune", ("auto", "--by", "agent", "--travel", "-5:5", "--yes", "--out", "run")),
     "identify": ("drive_tune", ("identify", "--travel", "-5:5", "--yes")),
     "response": ("drive_tune", ("response", "position", "--travel", "-5:5", "--yes")),
 }

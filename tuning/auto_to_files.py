@@ -10,6 +10,7 @@ from drive_env.loops.dynamics import DEFAULT
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
+    from tuning.auto.one_button import Method
     from tuning.auto.result import Result
     from tuning.stepper.result import StepperResult
     from tuning.target import Target
@@ -27,6 +28,7 @@ def auto_to_files(
     seed: int = 0,
     keep: bool = True,
     dynamics: str | Dynamics = DEFAULT,
+    method: Method | None = None,
 ) -> Result:
     """Tune axes with closed loops; before.toml, certificate.json and report.html are in the folder afterwards.
 
@@ -35,19 +37,21 @@ def auto_to_files(
         folder: New or empty.
         progress: Called with the present step and the share done.
         seed: Of the emulated machine, for the certificate.
-        dynamics: What the loops must keep.
         keep: Whether drives on a bus store the gains.
+        dynamics: What the loops must keep.
+        method: How gains are found; None is auto's own design.
 
     Raises:
         BusError, OSError: As `auto` does.
     """
     from tuning.auto.certify import certificate
-    from tuning.auto.one_button import auto
+    from tuning.auto.one_button import DESIGN, auto
     from tuning.certificate.certificate_files import certificate_files
 
+    method = method or DESIGN
     return auto(
-        target, folder / BEFORE, dynamics=dynamics, keep=keep, progress=progress,
-        files=lambda result: certificate_files(certificate(target, result, seed), folder, target.inputs),
+        target, folder / BEFORE, method=method, dynamics=dynamics, keep=keep, progress=progress,
+        files=lambda result: certificate_files(certificate(target, result, seed, method.tuner), folder, target.inputs),
     )  # fmt: skip
 
 

@@ -9,13 +9,14 @@ from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_
 app = Program("drive-agent")
 
 PANELS = {
-    "Use an agent": ("tune", "evaluate", "margins", "export"),
+    "Use an agent": ("evaluate", "margins", "export"),
     "Make one": ("train", "search", "benchmark"),
 }
 for panel, names in PANELS.items():
     for name in names:
         module = importlib.import_module(f"agents.commands.{name}")
         app.command(name, rich_help_panel=panel)(getattr(module, name))
+app.moved({"tune": "drive-tune auto --by agent"})
 
 
 @app.callback()

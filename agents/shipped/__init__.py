@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-TUNER = "gain_tuning"  # what `drive-agent tune` takes unless told otherwise
+TUNER = "gain_tuning"  # what `drive-tune auto --by agent` takes unless told otherwise
 
 
 def shipped_names() -> tuple[str, ...]:

@@ -57,7 +57,7 @@ def columns_of(device: str) -> tuple[str, ...]:
 
 
 def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
-    """Return the agent's work: that of `drive-agent tune`, its files in the run's folder."""
+    """Return the agent's work: that of `drive-tune auto --by agent`, its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
         from agents.tuner import tuning_run

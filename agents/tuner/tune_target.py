@@ -251,7 +251,7 @@ def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ..
     if missing:
         raise ValueError(
             f"{device.name} has {', '.join(missing)} among its gains, which the agent changes; train an agent for it "
-            "(drive-agent train gain-tuning), or use drive-tune optimise"
+            "(drive-agent train gain-tuning), or use drive-tune auto --by tpe"
         )
     per_chip(device)  # without a cascade there is no rule to begin with
     return tuple(device.gains.names[k] for k in columns if k is not None)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from agents.tuner.tune_target import TrialShown, tune_target
+from agents.tuner.tune_target import TrialShown, best_good, tune_target
 from drive_env.loops.dynamics import DEFAULT
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
+    from tuning.auto.one_button import Find
     from tuning.auto.result import Result
     from tuning.auto.stages import Basis, RecordedGains
     from tuning.certificate.certificate import Certificate
@@ -61,19 +62,13 @@ def run(
             a file that cannot be written.
     """
     from tuning.auto.certify import certificate
-    from tuning.auto.one_button import auto
+    from tuning.auto.one_button import Method, auto
 
     trials: list[TrialShown] = []
 
     def tried(trial: TrialShown) -> None:
         trials.append(trial)
         show(trial)
-
-    def find(bench: AutoBench, basis: Basis, _: Any) -> RecordedGains:
-        for doubt in doubts:
-            bench.reserve(bench.going, doubt)
-        say("trials")
-        return make_trials(bench, basis, policy, tried)
 
     def told(what: str, share: float) -> None:
         if share < 1.0:
@@ -86,10 +81,21 @@ def run(
         return files(certificates[0])
 
     asked = policy.bundle.configuration.get("dynamics", DEFAULT)
-    result = auto(
-        target, file, find=find, dynamics=asked, keep=keep, progress=told, budget=math.inf, files=written
-    )  # fmt: skip
+    method = Method(f"agent {name}", finder(policy, doubts, tried, say), math.inf)
+    result = auto(target, file, method=method, dynamics=asked, keep=keep, progress=told, files=written)
     return TunerRun(result, certificates[0], tuple(trials))
+
+
+def finder(policy: Any, doubts: Sequence[str], show: Callable[[TrialShown], None], say: Callable[[str], None]) -> Find:
+    """Return the search of a run of auto, by a policy's trials; arguments as `run` has them."""
+
+    def find(bench: AutoBench, basis: Basis, _: Any) -> RecordedGains:
+        for doubt in doubts:
+            bench.reserve(bench.going, doubt)
+        say("trials")
+        return make_trials(bench, basis, policy, show)
+
+    return find
 
 
 def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> RecordedGains:
@@ -136,6 +142,8 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
                 journal.note(f"{lowered} of the agent's {len(tuned.trials) - 1} proposals broke {bench.dynamics.name} "
                              "dynamics by the identified plant, and lower gains were tried")  # fmt: skip
         proof[own], verified[own] = float(answer.measured[machine]), BY_TRIAL
+        for journal in bench.journals[own]:
+            journal.note(_answer(tuned.trials, answer, machine))
         if tuned.overruled[machine]:
             for journal in bench.journals[own]:
                 journal.note(
@@ -143,3 +151,15 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
                     "the best trial that was not and does not is kept"
                 )
     return replace(tried, proof=proof, verified=verified)
+
+
+def _answer(trials: Sequence[TrialShown], answer: TrialShown, machine: int) -> str:
+    """Return which trial the agent chooses for a machine, and why if another one measured better."""
+    which = f"trial {answer.number}" if answer.number else "the baseline rule's gains"
+    cost, best = float(answer.measured[machine]), best_good(trials, machine)
+    if best is None or best.measured[machine] >= cost:
+        return f"the agent chooses {which}, the best: J {cost:.3f}"
+    return (
+        f"the agent chooses {which}, J {cost:.3f}: by its estimate from all trials, the J of "
+        f"{best.measured[machine]:.3f} of trial {best.number} would not be repeated"
+    )

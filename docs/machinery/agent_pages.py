@@ -15,8 +15,9 @@ from drive_env.envs.suite import TASKS
 PAGE = """# Agents that ship
 
 An agent is one small file (`.npz`) with its weights, the normaliser of its observations, and a card of how it was
-trained and what it reaches. It acts with NumPy alone. `drive-agent tune` uses `gain_tuning`; the others are controllers
-that `drive-agent evaluate NAME` runs, on emulated drives or on a bus. `drive-agent evaluate NAME --card` prints a card.
+trained and what it reaches. It acts with NumPy alone. `drive-tune auto --by agent` uses `gain_tuning`; the others are
+controllers that `drive-agent evaluate NAME` runs, on emulated drives or on a bus. `drive-agent evaluate NAME --card`
+prints a card.
 
 This page is made from the cards.
 

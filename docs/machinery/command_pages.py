@@ -35,6 +35,8 @@ def commands(group: Any, above: tuple[str, ...] = ()) -> list[tuple[tuple[str, .
     """Return the commands of a program, with the words that name them."""
     found: list[tuple[tuple[str, ...], Any]] = []
     for name, command in group.commands.items():
+        if command.hidden:  # an old name
+            continue
         path = (*above, name)
         found += commands(command, path) if hasattr(command, "commands") else [(path, command)]
     return found

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import sys
 import warnings
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
 
 from drive_env import __version__
 from drive_env.commands.compile_bar import show_compiling
-from drive_env.programs import INTERRUPTED
+from drive_env.programs import INTERRUPTED, USER_ERROR
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
 AGAIN = 10.0  # s, after which a line that was printed is printed again
@@ -73,6 +75,22 @@ class Program(typer.Typer):
             context_settings=CONTEXT,
         )
         self._interrupted = f"{name}: {interrupted}"
+
+    def moved(self, names: Mapping[str, str]) -> None:
+        """Answer old names of commands with the new ones, for one version; nothing is executed.
+
+        Args:
+            names: The whole new command by the old name.
+        """
+        settings = {"ignore_unknown_options": True, "allow_extra_args": True}
+        for old, new in names.items():
+
+            def answer(said: str = f"`{self.info.name} {old}` is `{new}` now") -> None:
+                print(f"{self.info.name}: {said}", file=sys.stderr)
+                raise typer.Exit(USER_ERROR)
+
+            answer.__signature__ = inspect.Signature()  # type: ignore[attr-defined]  # what typer reads
+            self.command(old, hidden=True, add_help_option=False, context_settings=settings)(answer)
 
     def run(self) -> None:
         """Run the command; Ctrl-C ends it with 130."""

@@ -262,8 +262,8 @@ def check_linear_model(device: Device) -> None:
     """Raise ValueError unless a device's loops are those of the linear model: every gain of the cascade, once."""
     if lacks := _lacks(device):
         raise ValueError(
-            f"{device.name}: this drive has no linear model of its loops: {lacks}; drive-tune sweep and optimise need "
-            "none, and find gains by trials"
+            f"{device.name}: this drive has no linear model of its loops: {lacks}; drive-tune sweep and auto --by tpe "
+            "need none, and find gains by trials"
         )
 
 

@@ -48,6 +48,6 @@ def skip_stages(replace, gains):
     replace(one_button, "identify", lambda bench, experiments: IdentifiedAxes((None,) * n, (None,) * n))
     replace(one_button, "prepare", lambda bench, identified: basis(gains, before=bench.before))
     replace(one_button, "on_twins", lambda bench, basis, say: RecordedGains.only(gains.copy()))
-    replace(one_button, "correct", lambda bench, basis, tried, target, say: tried)
+    replace(one_button, "correct", lambda bench, basis, tried, target, say, improves: tried)
     replace(one_button, "look_back", lambda bench, basis, recorded: recorded)
     replace(one_button, "judge", lambda bench, basis, recorded: recorded)

@@ -54,7 +54,13 @@ def _most_velocity_p(bench: AutoBench, best: RecordedGains | None, recorded: Rec
 
 
 def correct(
-    bench: AutoBench, basis: Basis, tried: RecordedGains, target: Target, say: Callable[[str, float], None]
+    bench: AutoBench,
+    basis: Basis,
+    tried: RecordedGains,
+    target: Target,
+    say: Callable[[str, float], None],
+    *,
+    improves: bool = True,
 ) -> RecordedGains:
     """Verify gains by a move, a frequency response and a load step, and correct the design by what these show.
 
@@ -64,6 +70,7 @@ def correct(
         tried: The gains, and what their trials showed.
         target: The drives, whose time is not counted.
         say: Called with the present step and the share done.
+        improves: Whether gains that keep the dynamics give way to others that cost less on the digital twins.
 
     Returns:
         The best of what was verified; an axis whose gains cannot stay is out of the run.
@@ -91,7 +98,7 @@ def correct(
         if number == CORRECTIONS:
             break
         say("correcting the design", 0.76 + 0.08 * number)
-        gains, why = _corrected(bench, basis, recorded, most)
+        gains, why = _corrected(bench, basis, recorded, most, worth=WORTH if improves else 0.0)
         tried_before.append(recorded.gains)
         for k in map(int, np.flatnonzero(bench.going)):
             if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
@@ -124,7 +131,9 @@ def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
     return np.asarray(np.repeat(cost.reshape(-1, per_machine).max(axis=1), per_machine))
 
 
-def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Floats) -> tuple[Integers, list[str]]:
+def _corrected(
+    bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Floats, worth: float
+) -> tuple[Integers, list[str]]:
     """Return corrected gains, (num_axes, count), and why; the present ones of axes that need no correction."""
     known, why = bench.target.device.gains, [""] * bench.target.num_axes
     gains = recorded.gains.copy()
@@ -138,6 +147,8 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
     # Of machines that failed their move no loop was looked at yet; one looked at and not seen asks for more margin.
     looked_at = bench.going & bench.whole_machines(recorded.failed == "")
     blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
+    if not worth and not blind.any() and not any(_short(bench, recorded, int(k)) for k in np.flatnonzero(bench.going)):
+        return gains, why
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)
     if blind.any():
         asked = find_dynamics("soft", bench.dynamics.inertia_range)
@@ -146,7 +157,7 @@ def _corrected(bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Fl
         cost, present = (np.where(blind, one, all_) for one, all_ in zip(more, (cost, present), strict=True))
     for k in map(int, np.flatnonzero(bench.going)):
         why[k] = _short(bench, recorded, k) or (UNSEEN if blind[k] else "")
-        if not why[k] and cost[k] < WORTH * present[k]:
+        if not why[k] and cost[k] < worth * present[k]:
             why[k] = f"its twins, as measured, have a robust cost of {cost[k]:.2f} for {present[k]:.2f}"
         shoots_over = recorded.overshoot[k] > bench.dynamics.overshoot
         unlike = blind[k] and not np.array_equal(designed[k], recorded.gains[k])

@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from tuning.auto.trying import try_gains
 from tuning.identify.quick_identification import identify_briefly
 from tuning.lateness import told_lateness
 from tuning.outcome import Outcome
+from tuning.rules.rules_by_name import check_rule, propose
 from tuning.snapshot import Transaction, can_store
 from tuning.target import timed
 
@@ -53,16 +54,34 @@ Find = Callable[[AutoBench, Basis, Progress], RecordedGains]  # for the axes tha
 BUDGET = 18.0  # s of drive time
 
 
+class Method(NamedTuple):
+    """How a run finds gains.
+
+    tuner: Its name in the certificate.
+    find: Finds gains, and tries them on the proving ground that it gives the bench; if it raises, everything is rolled
+        back. None is `on_twins`.
+    budget: Longest drive time for each axis of a machine [s]; steps beyond it are left out, with a note.
+    improves: Whether gains that keep the dynamics as measured give way to others that cost less on the digital twins.
+    """
+
+    tuner: str = "auto"
+    find: Find | None = None
+    budget: float = BUDGET
+    improves: bool = True
+
+
+DESIGN = Method()
+
+
 def auto(
     target: Target,
     file: str | Path,
     *,
-    find: Find | None = None,
+    method: Method = DESIGN,
     dynamics: str | Dynamics = DEFAULT,
     keep: bool = True,
     progress: Progress = lambda what, share: None,
     experiments: Identify = identify_briefly,
-    budget: float = BUDGET,
     files: Files = nullcontext,
 ) -> Result:
     """Tune the axes of a target; an axis that fails is rolled back, and the reason is in the result.
@@ -70,13 +89,11 @@ def auto(
     Args:
         target: The drives; they may have any gains, also none, and are off afterwards.
         file: File for the state before.
-        find: Finds gains, and tries them on the proving ground that it gives the bench; if it raises, everything is
-            rolled back. `on_twins` by default.
+        method: How gains are found; designed on digital twins by default.
         dynamics: What the loops must keep.
         keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
         progress: Called with the present step, and the share done.
         experiments: The identification experiments.
-        budget: Longest drive time for each axis of a machine [s]; steps beyond it are left out, with a note.
         files: Writes the result files before the drives store the gains; if it raises, everything is rolled back. Its
             files must be removed if the block in it fails.
 
@@ -87,7 +104,7 @@ def auto(
     """
     check_linear_model(target.device)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
-        bench = AutoBench(watched, clock, budget, find_dynamics(dynamics))
+        bench = AutoBench(watched, clock, method.budget, find_dynamics(dynamics))
         progress("checking the drives", 0.0)
         begin(bench)
         progress("identifying", 0.05)
@@ -97,8 +114,10 @@ def auto(
             bench.note(bench.going, "gains were designed for a load inertia of "
                        f"{loads[0]:g} to {loads[1]:g} times that of the tuning")  # fmt: skip
         basis = prepare(bench, identified)
-        tried = (find or on_twins)(bench, basis, progress) if bench.going.any() else RecordedGains.only(bench.before)
-        recorded = correct(bench, basis, tried, target, progress)
+        tried = (
+            (method.find or on_twins)(bench, basis, progress) if bench.going.any() else RecordedGains.only(bench.before)
+        )
+        recorded = correct(bench, basis, tried, target, progress, improves=method.improves)
         progress("comparing with the gains before", 0.94)
         recorded = judge(bench, basis, look_back(bench, basis, recorded))
         tell_of_lateness(bench)
@@ -123,6 +142,28 @@ def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> RecordedGains:
     gains, cost, _ = design_axes(bench, basis, bench.going, lambda share: say(designing, 0.3 + 0.35 * share))
     say("trying gains on the drives", 0.68)
     return try_gains(bench, basis, gains, cost)
+
+
+def by_rule(name: str) -> Method:
+    """Return the method that takes a rule's proposal for each identified axis.
+
+    Raises:
+        ValueError: For a rule that does not exist.
+    """
+    check_rule(name)
+
+    def find(bench: AutoBench, basis: Basis, say: Progress) -> RecordedGains:
+        target, gains = bench.target, basis.reference.copy()
+        for k in map(int, np.flatnonzero(bench.going)):
+            plant, _ = basis.identified.known(k)
+            proposal = propose(name, target.device, target.motor, plant)
+            gains[k] = proposal.gains
+            for note in proposal.notes:
+                bench.journals[k].note(f"{name}: {note}")
+        say("trying gains on the drives", 0.68)
+        return try_gains(bench, basis, gains, np.full(target.num_axes, np.nan))
+
+    return Method(f"rule {name}", find, improves=False)
 
 
 def tell_of_lateness(bench: AutoBench) -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drive_env.commands.tables import Column, print_lines, print_table
+from tuning.commands.dry_run import tell_plan
+from tuning.commands.methods import DESIGN, SEARCHES, By, MethodOptions, OpenedMethod, open_method
 from tuning.commands.options import (
     REFUSED,
     DynamicsOption,
@@ -23,57 +28,139 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from drive_env.loops.dynamics import Dynamics
     from tuning.auto.result import AxisResult, Result
     from tuning.stepper.result import StepperResult
     from tuning.target import Target
 
 
-@takes(TargetOptions)
+@takes
 def auto(
     drive: TargetOptions,
+    method: MethodOptions,
+    by: By = DESIGN,
     dynamics: DynamicsOption = None,
     inertia_range: InertiaRangeOption = None,
     store: Annotated[
         bool,
         typer.Option("--store/--no-store", help="Drives on a bus store the gains, so that they survive a power cycle."),
     ] = True,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Print what would be read, moved and written; drives on a bus are only read."),
+    ] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-auto")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Tune a drive: identify, design gains, try, verify and store them; an axis that fails a check is rolled back.
+    """Tune a drive: identify, find gains, try, verify and store them; an axis that fails a check is rolled back.
+
+    `--by` says how gains are found; all else is the same: the state before is saved, what was found is tried, corrected
+    by what is measured, and certified.
 
     Of an open-loop stepper it sets the phase currents, the StallGuard threshold and CoolStep, and writes
     stepper-certificate.json in place of certificate.json and report.html.
 
-    The motor turns, for 9 to 20 s an axis, longer where a stepper's loop is closed. The verdict is accepted, accepted
-    with reservations, which are listed, or rejected. Writes before.toml, with which `drive-tune undo` restores the
-    state before, certificate.json and report.html. Exit code 1 if an axis was rejected; the reason is printed.
+    The motor turns, for 9 to 20 s an axis, longer where a stepper's loop is closed or an agent makes its trials. The
+    verdict is accepted, accepted with reservations, which are listed, or rejected. Writes before.toml, with which
+    `drive-tune undo` restores the state before, certificate.json and report.html. Exit code 1 if an axis was rejected;
+    the reason is printed.
     """
     with errors_as_exit_codes():
-        from tuning.auto_to_files import BEFORE, auto_to_files, commission_to_files
+        from tuning.auto_to_files import BEFORE
         from tuning.runs import provenance
         from tuning.way_back import way_back
 
+        method.check(by)
+        if by in SEARCHES:
+            _search(by, drive, method, dynamics, inertia_range, out=out, store=store, dry_run=dry_run, json=json)
+            return
         asked = asked_dynamics(dynamics, drive.device, inertia_range)  # before anything is done
+        tell: Callable[[str], None] = (lambda line: None) if json else print
+        how = open_method(by, method, drive.device, dynamics, None if drive.bus else drive.load, tell)
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
+        if dry_run:
+            drive.check_linear_model()  # what the commissioning of a stepper writes is not listed
+            with drive.open_to_read() as target:
+                how.method(target)  # an agent says what it was not trained for
+                tell_plan(target, how, folder, keep=store, json=json)
+            return
         file = folder / BEFORE if drive.bus else None
-        result: Result | StepperResult
         with way_back(file, "drive-tune"), drive.open() as target:
-            if target.device.gains.is_open_loop:
-                with progress_bar("commissioning") as show:
-                    result = commission_to_files(target, folder, lambda what, share: show(share), keep=store)
-                _report_stepper(target, result, folder, json)
-            else:
-                with progress_bar("tuning") as show:
-                    result = auto_to_files(
-                        target, folder, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=asked
-                    )
-                _report(target, result, folder, json)
+            result = _run(target, how, folder, asked, seed=drive.seed, store=store, json=json)
         if not result.accepted.all():
             raise typer.Exit(REFUSED)
+
+
+def _run(
+    target: Target, how: OpenedMethod, folder: Path, dynamics: Dynamics, *, seed: int, store: bool, json: bool
+) -> Result | StepperResult:
+    """Tune drives and print the result."""
+    from tuning.auto_to_files import auto_to_files, commission_to_files
+
+    if target.device.gains.is_open_loop:
+        with progress_bar("commissioning") as show:
+            commissioned = commission_to_files(target, folder, lambda what, share: show(share), keep=store)
+        _report_stepper(target, commissioned, folder, json)
+        return commissioned
+    with progress_bar("tuning") as show:
+        result = auto_to_files(
+            target, folder, lambda what, share: show(share), seed=seed, keep=store, dynamics=dynamics,
+            method=how.method(target),
+        )  # fmt: skip
+    _report(target, result, folder, json)
+    return result
+
+
+def _search(
+    by: str,
+    drive: TargetOptions,
+    method: MethodOptions,
+    dynamics: str | None,
+    inertia_range: str | None,
+    *,
+    out: Path | None,
+    store: bool,
+    dry_run: bool,
+    json: bool,
+) -> None:
+    """Tune drives by a search, and print the result; where no certificate is possible, it is the search alone."""
+    from tuning.auto_to_files import BEFORE, auto_to_files
+    from tuning.commands.search import open_search
+    from tuning.runs import provenance, unfinished
+    from tuning.way_back import way_back
+
+    search = open_search(by, drive, method, dynamics=dynamics, inertia_range=inertia_range, out=out)
+    folder = search.folder
+    if dry_run:
+        drive.check_linear_model()
+        with drive.open_to_read() as target:
+            how = OpenedMethod(search.plan, math.inf, lambda target: search.method(folder))
+            tell_plan(target, how, folder, keep=store, json=json)
+        return
+    if not search.is_certified:
+        search.alone(json)
+        return
+    asked = asked_dynamics(dynamics, drive.device, inertia_range)
+    before = folder / BEFORE if drive.bus else None
+    place = nullcontext(folder) if drive.bus else provenance.new_folder(folder)
+    with unfinished.telling_what_is_kept(folder), search.telling_what_is_lost(), way_back(before, "drive-tune"):
+        if not drive.bus:
+            search.on_machine()
+        with replace(drive, machines=None).open() as target:
+            with place as here, progress_bar(search.plan) as show:
+                result = auto_to_files(
+                    target, here, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=asked,
+                    method=search.method(here),
+                )  # fmt: skip
+            if not json:
+                search.print(before)
+            _report(target, result._replace(file=folder / BEFORE), folder, json, {"search": search.as_dict(before)})
+    unfinished.discard(folder)
+    if not result.accepted.all():
+        raise typer.Exit(REFUSED)
 
 
 def _report_stepper(target: Target, result: StepperResult, folder: Path, json: bool) -> None:
@@ -123,7 +210,7 @@ def _not_kept(target: Target) -> str:
     return "; the drive has no 1010h: it has the settings until it is switched off (`drive-env backup` keeps them)"
 
 
-def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
+def _report(target: Target, result: Result, folder: Path, json: bool, search: Mapping[str, Any] | None = None) -> None:
     if json:
         names = target.device.gains.names
         rows = [
@@ -134,6 +221,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
                 "reservations": axis.reservations,
                 "reason": axis.reason,
                 "verified": axis.verified,
+                "J": axis.proof if math.isfinite(axis.proof) else None,
                 "before": dict(zip(names, axis.before, strict=True)),
                 "after": dict(zip(names, axis.after, strict=True)),
                 "notes": axis.notes,
@@ -143,7 +231,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         summary = {"drive seconds": result.drive_seconds.tolist(), "stored": result.kept}
         written = {"certificate": "certificate.json", "report": "report.html"}
         files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in written.items()}
-        print_json({"axes": rows} | summary | files)
+        print_json({"axes": rows} | summary | files | dict(search or {}))
         return
     known = target.device.gains
     loops = list(dict.fromkeys(row.loop for row in known.rows))
@@ -171,9 +259,11 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         lines += [f"axis {k}: {note}" for note in axis.notes]
     kept = "; the gains are stored in the drive" if result.kept else _not_kept(target)
     stopped = int(result.aborts.sum())
-    trials = f"{stopped} trial{'s' * (stopped != 1)} stopped"
-    lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {trials}{kept}")
-    lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
+    lines.append(
+        f"{result.drive_seconds.max():.1f} s of drive time, {stopped} trial{'s' * (stopped != 1)} stopped{kept}"
+    )
+    trials = "" if search is None else ", trials.csv, trials.png, settings.toml"
+    lines.append(f"written to {folder}: before.toml, certificate.json, report.html{trials}")
     if target.bus:
         lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 from tuning.commands.auto import auto
 from tuning.commands.identify import identify
-from tuning.commands.optimise import optimise
 from tuning.commands.rank import rank
 from tuning.commands.response import response
 from tuning.commands.rules import rules
@@ -16,13 +15,14 @@ from tuning.commands.verify import verify
 app = Program("drive-tune", "interrupted; nothing was written")
 
 PANELS = {
-    "A drive, emulated or on a bus": (identify, response, rules, optimise, auto),
+    "A drive, emulated or on a bus": (identify, response, rules, auto),
     "Many emulated machines": (sweep, rank),
     "What a change leaves": (verify, undo),
 }
 for panel, commands in PANELS.items():
     for command in commands:
         app.command(rich_help_panel=panel)(command)
+app.moved({"optimise": "drive-tune auto --by tpe"})
 
 
 @app.callback()

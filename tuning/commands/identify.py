@@ -36,7 +36,7 @@ K_T_NOTE = (
 )
 
 
-@takes(TargetOptions)
+@takes
 def identify(
     drive: TargetOptions,
     out: Annotated[Path | None, typer.Option("--out", help="File for the results (JSON).")] = None,

@@ -26,7 +26,7 @@ from drive_env.commands.options import Nodes as Nodes
 from drive_env.commands.options import WouldDo as WouldDo
 from drive_env.commands.options import Yes as Yes
 from drive_env.commands.options import ask as ask
-from drive_env.commands.options import ending_by, file_names_a_bus, names_a_bus, options_of, with_options
+from drive_env.commands.options import ending_by, file_names_a_bus, grouped, names_a_bus, options_of, with_options
 from drive_env.commands.options import look_first as look_first
 from drive_env.commands.options import print_json as print_json
 from drive_env.commands.progress import progress_on
@@ -110,7 +110,10 @@ ChosenAxis = Annotated[
         show_default="all",
     ),
 ]
-Machines = Annotated[int, typer.Option("--machines", help="Number of emulated machines.")]
+Machines = Annotated[
+    int | None,
+    typer.Option("--machines", help="Number of emulated machines.", show_default="1; 8 for a search by trials"),
+]
 Randomise = Annotated[bool, typer.Option("--randomise", help="Draw random parameters for every machine.")]
 Workers = Annotated[
     int | None,
@@ -211,47 +214,54 @@ class DriveOptions:
             ask_to_turn(self.nodes, self.yes, self.interface, self.axis)
         return open_target(self)
 
+    def open_to_read(self) -> Target:
+        """Return the drives for a dry run, without asking; raises as `open_target` does, and for a silent node."""
+        self.check()
+        if self.bus:
+            look_first(self.interface, self.channel, self.nodes, self.bitrate, self.device)
+        return open_target(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TargetOptions(DriveOptions):
     """The same, and how many emulated machines."""
 
-    machines: Machines = 1
+    machines: Machines = None
     randomise: Randomise = False
+
+    @property
+    def count(self) -> int:
+        """How many emulated machines there are, 1 unless told otherwise."""
+        return 1 if self.machines is None else self.machines
 
     def check(self) -> None:
         """Raise ValueError for a number that cannot be."""
         super().check()
-        check_machines("--machines", self.machines)
+        check_machines("--machines", self.count)
 
     def machine(self) -> dict[str, Any]:
         """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
-        return super().machine() | {"num_machines": self.machines, "randomise": self.randomise}
+        return super().machine() | {"num_machines": self.count, "randomise": self.randomise}
 
 
-def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command these options beside its own; it gets them together, as its argument `drive`.
+def takes(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command have the fields of its dataclasses as options, its own and those of its argument `drive`.
 
     An option of a bus means drives on the bus.
     """
+    run = grouped(command)
+    shared = {p.name for p in options_of(inspect.signature(command, eval_str=True).parameters["drive"].annotation)}
+    options = inspect.signature(run).parameters.values()
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        shared = options_of(options)
-        own = inspect.signature(command, eval_str=True).parameters
-        mine = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, p in own.items() if name != "drive"]
+    @wraps(command)
+    def run_on(context: typer.Context, **given: Any) -> None:
+        given["bus"] |= names_a_bus(context)
+        if file_names_a_bus(context) and not given["bus"]:
+            fail("--config names drives on a bus; add --bus to use them, and their motors turn")
+        run(**given)
 
-        @wraps(command)
-        def run(context: typer.Context, **given: Any) -> None:
-            given["bus"] |= names_a_bus(context)
-            if file_names_a_bus(context) and not given["bus"]:
-                fail("--config names drives on a bus; add --bus to use them, and their motors turn")
-            chosen = options(**{p.name: given.pop(p.name) for p in shared})
-            command(drive=chosen, **given)
-
-        context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        return with_options(run, [context, *mine, *shared])
-
-    return decorate
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    return with_options(run_on, [context, *sorted(options, key=lambda p: p.name in shared)])
 
 
 def parse_travel(text: str) -> tuple[float, float]:

@@ -36,7 +36,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@takes(TargetOptions)
+@takes
 def response(
     drive: TargetOptions,
     loop: Annotated[str, typer.Argument(help="velocity or position.")] = "velocity",

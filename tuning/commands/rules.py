@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from contextlib import nullcontext
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,11 +14,11 @@ from tuning.commands.options import (
     InertiaRangeOption,
     Json,
     TargetOptions,
-    ask,
     asked_dynamics,
     before_as_json,
     errors_as_exit_codes,
     fail,
+    file_of,
     print_json,
     progress_bar,
     takes,
@@ -32,15 +29,13 @@ from tuning.commands.options import (
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
     from drive_env.loops.dynamics import Dynamics
-    from drive_env.loops.linear_model import Plant
     from tuning.compare.side_by_side import AxisRules
-    from tuning.snapshot import Transaction
     from tuning.target import Target
 
 MEASURED = "relay, measured"
 
 
-@takes(TargetOptions)
+@takes
 def rules(
     drive: TargetOptions,
     rule: Annotated[list[str] | None, typer.Argument(help="Rules by name; all by default.")] = None,
@@ -49,48 +44,28 @@ def rules(
     ] = (False),
     dynamics: DynamicsOption = None,
     inertia_range: InertiaRangeOption = None,
-    apply: Annotated[str | None, typer.Option("--apply", help="Write this rule's gains to the drive.")] = None,
-    store: Annotated[
-        bool, typer.Option("--store", help="Store them in the drive, so that they survive a power cycle.")
-    ] = False,
-    snapshot: Annotated[
-        Path | None,
-        typer.Option(
-            help="File for the state before, with --apply or on a bus.",
-            show_default="runs/<timestamp>-rules/before.toml",
-        ),
-    ] = None,
     json: Json = False,
 ) -> None:
     """Identify an axis and show the gains that each rule proposes, with the margins they would have.
 
     Margins of the velocity and the position loop are computed by the identified model. Gains keep the --dynamics if
     this axis keeps them, with the overshoot of a csp step, and its variants (load inertia x 0.5 and x 2, stiffness x
-    0.8, velocity P x 0.67 and x 1.5) keep weaker margins. Notes name limits of the integer gains. On a bus the
-    parameters before are saved to --snapshot first and restored at the end, except what --apply writes.
+    0.8, velocity P x 0.67 and x 1.5) keep weaker margins. Notes name limits of the integer gains. Afterwards the drive
+    has its own parameters; on a bus they are also saved to a file for `drive-tune undo`, in runs/. A rule's gains are
+    written by `drive-tune auto --by rule`.
     """
     with errors_as_exit_codes():
         from tuning.compare.side_by_side import AxisRules, identified_plants, proposals, swung_proposals
-        from tuning.rules.rules_by_name import RULES
-        from tuning.runs.provenance import run_folder
-        from tuning.snapshot import check_place
+        from tuning.rules.rules_by_name import RULES, check_rule
 
         chosen = rule or list(RULES)
-        for name in [*chosen, *([apply] if apply else [])]:
-            if name not in RULES:
-                raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
-        if store and not apply:
-            raise ValueError("--store stores what --apply writes; add --apply RULE, or leave it out")
-        if snapshot is not None and not (apply or drive.bus):
-            raise ValueError("--snapshot is the file for the state before --apply; add --apply RULE, or leave it out")
+        for name in chosen:
+            check_rule(name)
         drive.check()
         drive.check_linear_model()
         asked = asked_dynamics(dynamics, drive.device, inertia_range)
-        file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
-        if drive.bus:
-            check_place(file)  # written before the motor turns; of emulated drives, before their gains change
-        before = file if drive.bus else None
-        with unchanged(drive, before) as (target, transaction):
+        before = file_of(drive, "rules")
+        with unchanged(drive, before) as (target, _):
             with progress_bar("identifying") as show:
                 plants = identified_plants(target, show)
             known = [plant for plant in plants if not isinstance(plant, str)]
@@ -109,12 +84,9 @@ def rules(
             else:
                 for k, axis in zip(target.axis_numbers, axes, strict=True):
                     _print(target, axis, asked, k if drive.axis or len(plants) > 1 else None)
-            if not known or (apply and len(known) < len(plants)):
-                fail("nothing was written: a rule needs the inertia of every axis" if known else
-                     "no axis has an identified inertia, which every rule needs", REFUSED)  # fmt: skip
-            if apply:
-                _apply(target, known, apply, file, transaction, store=store, yes=drive.yes)
-        if not (apply or json):
+            if not known:
+                fail("no axis has an identified inertia, which every rule needs", REFUSED)
+        if not json:
             tell_before(before)
 
 
@@ -189,32 +161,3 @@ def _gain_titles(known: GainSet) -> list[str]:
         titles.append(f"{'' if place == told else f'{gain.key[0]:04X}h'}\n{gain.part}")
         told = place
     return titles
-
-
-def _apply(
-    target: Target,
-    plants: Sequence[Plant],
-    name: str,
-    file: Path,
-    under_way: Transaction | None,
-    *,
-    store: bool,
-    yes: bool,
-) -> None:
-    """Write a rule's gains if the user agrees, inside the transaction that is under way, or one of its own."""
-    import numpy as np
-
-    from drive_env.drives.raw_gains import write_gains
-    from tuning.rules.rules_by_name import propose
-    from tuning.snapshot import Transaction
-
-    proposals = [propose(name, target.device, target.motor, plant) for plant in plants]
-    ask(f"Write the gains of {name} to {'the axis' if target.num_axes == 1 else f'{target.num_axes} axes'}?", yes)
-    with Transaction(target, file) if under_way is None else nullcontext(under_way) as transaction:
-        write_gains(target.drives, np.array([proposal.gains for proposal in proposals], np.int64))
-        kept = store and transaction.store()
-        transaction.commit()
-    way_back = "emulated drives exist in this program only"
-    if target.bus:
-        way_back = f"drive-tune undo {file} restores the state before"
-    print(f"written{', and stored in the drive' if kept else ''}; {way_back}")

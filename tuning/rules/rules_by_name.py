@@ -56,6 +56,11 @@ def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
         ValueError: For an unknown rule, naming those there are, or a drive without a linear model of its loops.
     """
     check_linear_model(device)
+    check_rule(name)
+    return RULES[name](device, motor, plant)
+
+
+def check_rule(name: str) -> None:
+    """Raise ValueError for a rule that does not exist, naming those there are."""
     if name not in RULES:
         raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
-    return RULES[name](device, motor, plant)

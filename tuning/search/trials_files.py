@@ -47,9 +47,9 @@ PID_MEANINGS = MEANINGS | {
     "current": "vibration of the encoder, as J counts a ripple of so much [%]",
 }
 
-HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
+HEADER = "# All settings of the search. To repeat it: drive-tune auto --config settings.toml\n"
 _SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed", "dynamics", "inertia_range")
-_MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "copies", "searches", "interface", "channel",
+_MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "machines", "searches", "interface", "channel",
             "nodes", "bitrate", "lockstep", "pace")  # fmt: skip
 
 
@@ -129,7 +129,7 @@ def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]
 
 
 def load_options(path: str | Path) -> dict[str, Any]:
-    """Return the options of `drive-tune optimise` by which a search repeats, from its settings.toml.
+    """Return the options of `drive-tune auto` by which a search repeats, from its settings.toml.
 
     Whether the drives are on a bus is not among them: a motor turns only if --bus is said again.
 
@@ -139,20 +139,22 @@ def load_options(path: str | Path) -> dict[str, Any]:
     try:
         table = read_toml(path)
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}; give settings.toml of drive-tune optimise") from None
+        raise ValueError(f"cannot read {path}: {error.strerror}; give settings.toml of drive-tune auto") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ValueError(f"{path} is not TOML: {error}; give settings.toml of drive-tune optimise") from None
+        raise ValueError(f"{path} is not TOML: {error}; give settings.toml of drive-tune auto") from None
     if "machine" not in table:
-        raise ValueError(f"{path} is not from a search; give settings.toml of drive-tune optimise")
+        raise ValueError(f"{path} is not from a search; give settings.toml of drive-tune auto")
     check_keys(str(path), table, [*_SEARCH, "machine", "inputs", "versions"], optional=["inputs", "versions", *_SEARCH])
     machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
-    if "lanes" in machine:  # as versions before 0.2 named them
-        machine["copies"] = machine.pop("lanes")
+    for before in ("lanes", "copies"):  # as versions before 0.2 named them
+        if before in machine:
+            machine["machines"] = machine.pop(before)
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
     machine.pop("pace", None)  # what lockstep says
     kept = found_again(machine, table.get("inputs"), Path(path).parent)
     machine = {name: value.given if isinstance(value, Input) else value for name, value in kept.items()}
-    return {name: table[name] for name in _SEARCH if name in table} | machine
+    settings = {name: table[name] for name in _SEARCH if name in table}
+    return {"by" if name == "sampler" else name: value for name, value in settings.items()} | machine
 
 
 def axis_numbers(machine: Mapping[str, Any], count: int) -> list[int]:

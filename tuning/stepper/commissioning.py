@@ -54,7 +54,7 @@ def check_stepper(target: Target) -> None:
     if lacks := lacks_load_detection(target.device):
         raise ValueError(
             f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "
-            "optimise find its phase currents by trials"
+            "auto --by tpe find its phase currents by trials"
         )
     load(Settings().sampler)
 

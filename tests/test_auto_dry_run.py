@@ -1,4 +1,4 @@
-"""`drive-agent tune --dry-run`: everything is looked at, nothing is written, and what a run writes was told before."""
+"""`drive-tune auto --dry-run`: everything is looked at, nothing is written, and what a run writes was told before."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ import pytest
 from rigs.ethercat_segment import EmulatedSegment
 from typer.testing import CliRunner
 
-from agents.commands.cli import app
 from agents.policies.policy import load_policy
 from agents.shipped import shipped
-from agents.tuner.rehearsal import NO, rehearse
 from agents.tuner.tuning_run import run
 from drive_env import EmulatedDrives, motion
 from drive_env.bus.hub import Hub
@@ -24,6 +22,8 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.ethercat.ethercat_server import EtherCatServer
 from drive_env.ethercat.ways import UdpSocket
 from drive_env.master.can.sdo import SdoClient
+from tuning.commands.cli import app
+from tuning.rehearsal import NO, rehearse
 from tuning.target import on_bus
 
 TURN = 65536
@@ -62,16 +62,18 @@ def dictionary_of(world):
 
 
 def dry_run(channel, *more):
-    arguments = ["tune", "--interface", "slcan", "--channel", channel, "--lockstep", "--travel", "-2:2", "--dry-run"]
-    result = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(app, [*arguments, *more])
+    bus = ["--interface", "slcan", "--channel", channel, "--lockstep"]
+    arguments = ["auto", *bus, "--travel", "-2:2", "--dry-run", *more]
+    result = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(app, arguments)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result
 
 
-def test_the_drive_is_read_and_nothing_else():
+@pytest.mark.parametrize("by", ["design", "agent", "rule", "tpe"])
+def test_the_drive_is_read_and_nothing_else(by):
     with served() as (world, _, channel, frames):
         before, state = dictionary_of(world), world.nodes[1].state
-        found = dry_run(channel)
+        found = dry_run(channel, "--by", by)
         assert (found.exit_code, found.stderr) == (0, "")
         assert dictionary_of(world) == before and world.nodes[1].state is state and world.time == 0.0
         assert len(frames) > 100
@@ -79,7 +81,9 @@ def test_the_drive_is_read_and_nothing_else():
     for line in ("ok    identity: node 1 is a tmcm1636: TMCM-1636", "ok    state: switch on disabled",
                  "ok    interface: SDO answers in", "would carry 6064h", "ok    heartbeat: the drive can monitor",
                  "pole pairs 4", "24 V entered", "6064h from -131072 to 131072, now 0",
-                 "a quick stop for a position beyond", "now torque P 4021", "Nothing was written."):  # fmt: skip
+                 "a quick stop for a position beyond", "now torque P 4021",
+                 "It would move axis 0 between -12.6 and 12.6 rad from where it is",
+                 "Nothing was written."):  # fmt: skip
         assert line in found.stdout, line
 
 
@@ -149,7 +153,7 @@ def test_what_a_run_would_not_begin_for(prepare, line):
         assert dictionary_of(world) == before
         assert all(frame.data[0] & 0xE0 in UPLOADS for frame in frames)
     assert found.exit_code == 1 and line in found.stdout
-    assert found.stderr.startswith("drive-agent: a run would not start")
+    assert found.stderr.startswith("drive-tune: a run would not start")
 
 
 @pytest.mark.parametrize("patient_masters", [None], ids=["as patient as a user's"])
@@ -168,8 +172,10 @@ def test_a_node_that_is_stopped_stays_so(patient_masters):
 
 def test_an_emulated_drive_is_rehearsed_as_well(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = CliRunner().invoke(app, ["tune", "--dry-run", "--trials", "3"])
-    assert found.exit_code == 0 and "1 + 3 trials of 3 moves" in found.stdout
+    found = CliRunner().invoke(app, ["auto", "--by", "agent", "--dry-run", "--trials", "3"])
+    assert (
+        found.exit_code == 0 and "1 + 3 trials of gains that the agent proposes (3 moves of 250 ms each" in found.stdout
+    )
     assert NO + " " not in [line.strip()[:3] for line in found.stdout.splitlines()]
     assert not any(tmp_path.iterdir())
 
@@ -183,7 +189,7 @@ def test_a_drive_of_two_axes_on_ethercat_is_rehearsed(pace, of_demand):
             bus = ["--interface", "ethercat-udp", "--channel", str(way.port), "--device", "tgz_d"]
             more = ["--lockstep"] if pace == "lockstep" else []
             found = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(
-                app, ["tune", *bus, *more, "--travel", "-2:2", "--dry-run"]
+                app, ["auto", *bus, *more, "--travel", "-2:2", "--dry-run"]
             )
         segment.world.lockstep = True
     assert found.exception is None or isinstance(found.exception, SystemExit), found.exception
