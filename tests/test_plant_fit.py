@@ -48,7 +48,7 @@ def test_a_rigid_plant_is_drawn_every_time():
 
 # --- what is found ----------------------------------------------------------------------------------------------------
 SERVO = find_device("tgz_d")
-SERVO_GAINS = np.array([3324, 955, 562, 412, 118])
+SERVO_GAINS = np.array([6925, 3431, 4018, 31_814, 31_467, 0])
 AM3041 = find_motor("am3041_e")
 
 

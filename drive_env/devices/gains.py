@@ -308,6 +308,10 @@ class GainScale(NamedTuple):
         """Return the values of integers."""
         return self._along(self.per**-self.power, raw)
 
+    def one_value(self, raw: int) -> float:
+        """Return the value of one integer, as `value` does."""
+        return self.per**-self.power * raw**self.power if raw else 0.0
+
     def _along(self, per: float, x: ArrayLike) -> Floats:
         given = np.asarray(x, float)
         return np.where(given == 0.0, 0.0, per * np.where(given == 0.0, 1.0, given) ** self.power)

@@ -247,7 +247,7 @@ class Controllers(NamedTuple):
 def controllers(device: Device, gains: RawGains) -> Controllers:
     """Return raw gains in SI; ValueError for a device whose loops are others than those of this model."""
     scales = loop_scales(device)
-    return Controllers(*(float(scales[k].value(int(gains[k]))) for k in cascade_columns(device)))
+    return Controllers(*(scales[k].one_value(int(gains[k])) for k in cascade_columns(device)))
 
 
 def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:
