@@ -208,7 +208,7 @@ def test_a_master_takes_the_image_that_has_what_is_played_and_puts_the_factorys_
         assert (slave.output_size, slave.input_size) == (40, 40)
 
 
-TURN, TURN_INSIDE = 65_536, 2**28
+TURN, TURN_INSIDE = 2**20, 2**32
 NATIVE = {0x23C7: np.zeros((2, 2), int)}  # what is played before enabling selects the native image
 
 
@@ -231,24 +231,24 @@ def test_a_target_beyond_the_limits_is_refused_by_whatever_object_and_in_whateve
     for mode in ("csp", "ip"):
         motion.enable(drives, mode=mode)
         for name, turn in ((0x607A, TURN), ((0x60C1, 1), TURN), (0x23C7, TURN_INSIDE)):
-            with pytest.raises(SafetyError, match="beyond the limits -131072 to 131072; nothing was sent"):
+            with pytest.raises(SafetyError, match="beyond the limits -2097152 to 2097152; nothing was sent"):
                 drives.write(name, 3 * turn)
-        with pytest.raises(SafetyError, match=r"would lead to 13\d+, .*; nothing was sent"):
+        with pytest.raises(SafetyError, match=r"would lead to 21\d+, .*; nothing was sent"):
             drives.record([0x33C0, 0x6077], 0.1, {0x23C7: np.stack([ramp * TURN_INSIDE] * 2, axis=1).astype(int)})
         motion.disable(drives)
     assert np.abs(inside.machine.rotor_angle).max() < 0.1
 
 
 def test_a_target_of_64_bits_is_held_against_the_limits_by_all_of_them(within_two_turns):
-    """65,536 turns from zero 6064h shows 0, too: the target beside the axis is allowed, the one at zero is far away."""
+    """4,096 turns from zero 6064h shows 0, too: the target beside the axis is allowed, the one at zero is far away."""
     drives, inside = within_two_turns
-    set_lanes(inside.inside.records, "home_shift", np.full(2, -2.0 * np.pi * 65_536))
+    set_lanes(inside.inside.records, "home_shift", np.full(2, -2.0 * np.pi * 4096))
     drives.advance(0.01)
-    assert drives.read(0x6064) == pytest.approx(0, abs=50)
-    assert drives.read(0x33C0) == pytest.approx(2**44, abs=50 * 4096)
+    assert drives.read(0x6064) == pytest.approx(0, abs=800)
+    assert drives.read(0x33C0) == pytest.approx(2**44, abs=800 * 4096)
     motion.enable(drives, mode="csp")
     drives.write(0x23C7, 2**44 + TURN_INSIDE // 100)
-    with pytest.raises(SafetyError, match="would lead to -4294966641, beyond the limits"):
+    with pytest.raises(SafetyError, match="would lead to -4294956810, beyond the limits"):
         drives.write(0x23C7, TURN_INSIDE // 100)
 
 

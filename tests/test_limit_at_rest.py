@@ -42,7 +42,7 @@ def test_an_encoder_that_is_stuck_is_told_though_the_drive_reports_no_fault(devi
     """On a TMCM-1636 it is 7.0 A of 7.0 A for ever, with a statusword of 0237h."""
     with EmulatedDrives(device, load="inertia", num_threads=1) as drives:
         drives.machine.fault("encoder_stuck")
-        set_off(drives)
+        set_off(drives, round(0.3 * drives.read(Role.POSITION_SCALE)[0]))
         when = told(drives, LimitAtRest(drives), 2.0)
         status, current, _, limit = map(drives.read, READ)
         assert cia402.matches(status, cia402.OPERATION_ENABLED).all()

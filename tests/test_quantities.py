@@ -41,7 +41,7 @@ def entry(unit, low=-(2**31), high=2**31 - 1):
         ("mA", "current", 0.001), ("V", "voltage", 1.0), ("0.1V", "voltage", 0.1), ("s", "time", 1.0),
         ("ms", "time", 0.001), ("10ms", "time", 0.01), ("100us", "time", 0.0001), ("us", "time", 1e-6),
         ("512 clocks", "time", 32e-6),  # of 16 MHz
-        ("inc 64", "angle", 2**-28),
+        ("1/2^32 rev", "angle", 2**-32),
     ],
 )  # fmt: skip
 def test_every_unit_is_so_much_of_its_dimensions_own(unit, dimension, value):

@@ -214,7 +214,7 @@ def test_torques_speeds_and_positions_have_the_scales_of_their_objects():
         drives.write((0x6094, 2), [1000, 2])
         drives.write((0x608F, 1), [4096, 8192])
         drives.write((0x608F, 2), [1, 3])
-        turn = 2**28 * np.array([1 / 4096, 3 / 8192])
+        turn = 2**32 * np.array([1 / 4096, 3 / 8192])
         assert drives.read(Role.POSITION_SCALE).tolist() == turn.tolist()
         # A revolution a second is 60 rpm, 60 divisor / numerator velocity units.
         np.testing.assert_allclose(per_increment(drives, 0x606C) * turn, [60_000.0, 120 / 7])
@@ -231,7 +231,7 @@ def test_quantities_are_by_the_scales_of_each_axis():
             ("Target velocity", "500 rpm", [500_000, 143]),
             ("Profile acceleration", "10 rev/s^2", [600_000, 171]),
             ("Target torque", "2 A", [16384, 8192]),
-            ("Target position", "-0.25 rev", [-16384, -8192]),
+            ("Target position", "-0.25 rev", [-(2**18), -(2**17)]),
         ):
             drives.write(name, text)
             assert drives.read(name).tolist() == raw, name
@@ -745,10 +745,10 @@ def test_a_native_set_point_has_all_of_its_bits():
         image = ProcessImage(drives)
         select(image, 0x1721)
         data = bytearray(44)
-        data[0:8] = (3 * 2**28 + 1).to_bytes(8, "little")
+        data[0:8] = (3 * 2**32 + 1).to_bytes(8, "little")
         assert image.write_outputs(bytes(data))
-        assert image.dictionary.port(0x23C7, 0).read() == 3 * 2**28 + 1
-        assert image.dictionary.port(0x607A, 0).read() == 3 * 65_536
+        assert image.dictionary.port(0x23C7, 0).read() == 3 * 2**32 + 1
+        assert image.dictionary.port(0x607A, 0).read() == 3 * 2**20
 
 
 # --- the TGZ-S --------------------------------------------------------------------------------------------------------
@@ -764,7 +764,7 @@ def test_the_second_axis_of_a_tgz_s_is_there_and_does_nothing():
         assert wire.value(0x6841, 0) & FAULT[0] == FAULT[1]
         assert wire.value(0x4003, 2) & FAULT[0] == FAULT[1]
         motion.enable(drives, mode="pp")
-        motion.move_to(drives, 65_536, relative=True, timeout=3.0)
+        motion.move_to(drives, 2**20, relative=True, timeout=3.0)
         assert abs(wire.value(0x6864, 0)) == 0
         assert wire.value(0x1001, 0) == 0
 
@@ -800,7 +800,7 @@ def way_of(kind, distance, speed, up, down, times):
 
 def test_6062h_goes_the_way_of_each_motion_profile_type():
     """-3 to 1, each by the closed form of its acceleration, with other rates up and down; both ways."""
-    kinds, turn = np.repeat(list(ACCELERATIONS), 2), 65_536
+    kinds, turn = np.repeat(list(ACCELERATIONS), 2), 2**20
     sign = np.tile([1, -1], len(ACCELERATIONS))
     with EmulatedDrives("tgz_d", "inertia", num_machines=len(kinds), num_threads=1) as drives:
         drives.write(0x6065, 0)
@@ -822,5 +822,5 @@ def test_6062h_goes_the_way_of_each_motion_profile_type():
             np.abs(seen[:, k] - way_of(kind, 6.0 * turn, 10.0 * turn, 100.0 * turn, 50.0 * turn, times - late)[0]).max()
             for late in (-1e-3, 0.0, 1e-3)
         )
-        assert far < 40.0, (kind, sign[k], far)  # inc of 65,536: of a period in which ramps meet
+        assert far < 640.0, (kind, sign[k], far)  # inc of 1,048,576: of a period in which ramps meet
         assert seen[-1, k] == 6 * turn

@@ -20,7 +20,7 @@ from drive_env.firmware.record import get_lanes
 from mechanics.loads import find_load
 
 DEVICE = find_device("tgz_d")
-TURN = 65536
+TURN = 2**20
 RPM = 1000  # velocity units, as a drive is commissioned
 SEEN = (0x6041, 0x6061, 0x6062, 0x6064, 0x606B, 0x606C, 0x6077, 0x60F4)
 TRUE = ("theta_m", "omega_m", "i_q", "i_d", "i_q_ref", "stage_on", "u_q")

@@ -19,7 +19,6 @@ class Role(Enum):
     FEED_TURNS = "revolutions of the driving shaft that have them"
     GEAR_MOTOR = "revolutions of the motor"
     GEAR_SHAFT = "revolutions of the driving shaft that it makes of them"
-    TURN_INSIDE = "increments of a revolution inside the drive"
     POSITION_INSIDE = "actual position inside the drive"
     TARGET_INSIDE = "target position inside the drive"
     POSITION_NUMERATOR = "increments inside of a position unit: numerator"

@@ -114,7 +114,7 @@ UNITS: dict[str, Unit] = {
             lambda c: c.peak_current / 32767.0,
             follows_scale=True,
         ),
-        Unit("inc 64", "increments of the position inside, 2^28 a revolution", lambda c: TWO_PI / 2.0**28),
+        Unit("1/2^32 rev", "increments of the position inside, 2^32 a revolution", lambda c: TWO_PI / 2.0**32),
         Unit("1/1000", "thousandths", lambda c: 1e-3),
         Unit("1/65536 rev", "1/65536 revolution", lambda c: TWO_PI / 65536.0),
         Unit("current P", "Q8.8: duty LSB per current LSB", lambda c: 1.0 / (256.0 * 32768.0 * c.current_lsb)),

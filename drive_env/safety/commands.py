@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.position_scale import TURN_INSIDE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.axes import Axes
@@ -126,10 +127,9 @@ class Commands:
         """Return targets by another object than 607Ah in increments of 6064h, as it counts now."""
         if key == INTERPOLATED_POSITION:
             return raw
-        role = self._drives.description.role
-        turn, actual = role(Role.TURN_INSIDE), role(Role.POSITION_INSIDE)
-        assert turn is not None and actual is not None, "a drive with a target inside has both"
-        scale = self._axes.rotor.scale / read_own(self._drives, turn, 1)
+        actual = self._drives.description.role(Role.POSITION_INSIDE)
+        assert actual is not None, "a drive with a target inside has it"
+        scale = self._axes.rotor.scale / TURN_INSIDE
         # 6064h is the lower end of the position inside, whose turns of 32 bits it does not tell.
         above = read_own(self._drives, actual, 0) * scale - read_own(self._drives, POSITION, 0)
         return np.rint(raw * scale - 2.0**32 * np.rint(above / 2.0**32)).astype(np.int64)
