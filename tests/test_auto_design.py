@@ -18,7 +18,7 @@ from drive_env.motors import find_motor
 from tuning.auto import design as module
 from tuning.auto.design import LEAST_TORQUE, Judge, _around, _of_each, design
 from tuning.auto.loop_model import LoopModel, one_axis
-from tuning.auto.twin import UNCERTAIN, WORLDS, Known, Twins, least_gains
+from tuning.auto.twin import UNCERTAIN, WORLDS, Known, Twins, gain_bounds
 from tuning.target import emulated
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -84,7 +84,7 @@ def test_no_random_search_finds_much_better_gains(designed):
     _, fine, _, found = designed
     rng, best = np.random.default_rng(7), found.gains[0, 0]
     factors = np.exp(rng.uniform(np.log(0.3), np.log(3.0), (300, DEVICE.gains.count)))
-    rows = np.maximum(np.rint(best * factors), least_gains(DEVICE)).astype(np.int64)
+    rows = np.maximum(np.rint(best * factors), gain_bounds(DEVICE)[0]).astype(np.int64)
     most = found.gains[0, :, TORQUE_P].max()
     rows[:, TORQUE_P] = np.clip(rows[:, TORQUE_P], LEAST_TORQUE * most, most)
     searched = fine.score(rows[None])[0]

@@ -24,7 +24,7 @@ from agents.tuner.tune_target import gains_for, surrogate
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.devices.gains import check_linear_model, gain_factors, rule_gains
+from drive_env.devices.gains import check_linear_model, loop_scales, rule_gains
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.units import UNITS, Context
 from drive_env.envs.gain_scheduling import GainScheduling
@@ -81,11 +81,10 @@ def test_a_sweep_goes_over_its_objects():
 def test_the_sweep_that_ships_covers_the_same_gains_in_its_units():
     found, known = load_experiment(device=INVENTED), load_experiment()
     assert [swept.object for swept in found.sweep] == ["speed_gain", "speed_integrator"]
-    theirs = gain_factors(find_device(known.device))
-    for swept, other, factor, own in zip(
-        found.sweep, known.sweep, theirs[2:4], gain_factors(find_device(INVENTED)), strict=False
-    ):
-        assert (swept.low * own, swept.high * own) == pytest.approx((other.low * factor, other.high * factor), rel=0.05)
+    own, theirs = loop_scales(find_device(INVENTED)), loop_scales(find_device(known.device))[2:4]
+    for swept, other, one, scale in zip(found.sweep, known.sweep, own, theirs, strict=False):
+        ends = one.value([swept.low, swept.high])
+        assert ends == pytest.approx(scale.value([other.low, other.high]), rel=0.05)
         assert (swept.count, swept.spacing) == (other.count, other.spacing)
     small = replace(found, sweep=tuple(replace(swept, count=2) for swept in found.sweep))
     assert sweep.run(small).objects == (SPEED_GAIN, SPEED_INTEGRATOR)

@@ -431,11 +431,11 @@ def bench_of_a_gain(highest):
 def test_what_an_integer_misses_by_more_than_a_twentieth_is_said(wanted, raw, note):
     bench = Workbench(DEVICE, plant())
     part = ("velocity", "P")
-    reached = bench.p("velocity", wanted / bench.per_si[part])
-    assert reached == pytest.approx(raw / bench.per_si[part]) == pytest.approx(bench.si(part, raw))
+    reached = bench.p("velocity", float(bench.scales[part].value(wanted)))
+    assert reached == pytest.approx(float(bench.scales[part].value(raw))) == pytest.approx(bench.si(part, raw))
     assert [text.split("P ", 1)[1] for text in bench._notes] == ([] if note is None else [note])
     assert bench.so_far() == (1, 1, raw, 1, 1) and bench.so_far({("torque", "P"): 7, ("velocity", "P"): 3})[2] == 3
-    assert bench.raw(part, 9) == pytest.approx(9 / bench.per_si[part]) and bench.so_far()[2] == 9
+    assert bench.raw(part, 9) == pytest.approx(float(bench.scales[part].value(9))) and bench.so_far()[2] == 9
 
 
 @pytest.mark.parametrize(("wanted_hz", "slowed"), [(19.9, False), (20.1, True)])
@@ -474,7 +474,7 @@ def test_what_a_rule_asks_for_is_over_what_an_ampere_accelerates_by(rule, share,
     proposal = propose(rule, DEVICE, MOTOR, axis)
     small = small_of(axis, gains_in_si(DEVICE, axis.supply, proposal.gains))
     bench = Workbench(DEVICE, axis)
-    assert proposal.wanted["velocity_p"] / bench.per_si["velocity", "P"] == pytest.approx(
+    assert float(bench.scales["velocity", "P"].value(proposal.wanted["velocity_p"])) == pytest.approx(
         share / (slope * small), rel=1e-3
     )
 

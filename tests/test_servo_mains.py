@@ -495,8 +495,8 @@ def test_a_motor_that_oscillates_has_no_wrong_commutation(load):
     """With gains that no loop stands, at all of its current: speed is against the current for a part of each period."""
     with new_drives(load=load) as drives:
         drives.write(cia402.FOLLOWING_WINDOW, 0)
-        drives.write(0x23D2, 300)  # velocity P
-        drives.write(0x23D4, 12_000)  # position P
+        drives.write("V-K", 2150)
+        drives.write("P-K", 3_200_000)
         motion.enable(drives, mode="csp")
         targets = np.where(np.arange(600) // 30 % 2 == 0, 0, TURN // 16)
         trace = drives.record([cia402.VELOCITY_ACTUAL], 0.6, play={cia402.TARGET_POSITION: targets})
@@ -505,15 +505,15 @@ def test_a_motor_that_oscillates_has_no_wrong_commutation(load):
         assert all(one.code != 0x7122 for one in drives.emergencies())
 
 
-@pytest.mark.parametrize("velocity_i", [0, 300])
-def test_nor_has_one_that_oscillates_in_few_periods_of_supervision(velocity_i):
+@pytest.mark.parametrize("integration", [0, 43_700])  # us
+def test_nor_has_one_that_oscillates_in_few_periods_of_supervision(integration):
     """At some 250 Hz each look of 1 kHz finds another sign of current and speed: none of them lasts."""
-    gains = np.rint(np.geomspace(3000, 24_000, 16)).astype(int)
+    gains = np.rint(np.geomspace(21_500, 172_000, 16)).astype(int)
     with EmulatedDrives("tgz_d", "inertia", num_machines=len(gains), num_threads=1, seed=0) as drives:
         drives.write(cia402.FOLLOWING_WINDOW, 0)
-        drives.write(0x23D2, gains)
-        drives.write(0x23D3, velocity_i)
-        drives.write(0x23D4, 1000)
+        drives.write("V-K", gains)
+        drives.write("V-Ti", integration)
+        drives.write("P-K", 267_000)
         motion.enable(drives, mode="csp")
         targets = np.where(np.arange(600) // 60 % 2 == 0, 0, TURN // 8)
         trace = drives.record([cia402.VELOCITY_ACTUAL], 0.6, play={cia402.TARGET_POSITION: targets})

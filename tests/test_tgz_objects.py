@@ -129,11 +129,13 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x23C5: (Scene(twist, rows={0x6071: 3000}), 32767, 1000),
     0x23C6: (Scene(twist, rows={0x6071: 3000}), 0, 32_000),
     0x23C7: (Scene(hold, rows=FREE), 0, 2**22),
-    0x23D0: (Scene(twist, rows={0x6071: 3000}), 256, 512),
-    0x23D1: (Scene(twist, rows={0x6071: 3000}), 256, 0),
-    0x23D2: (Scene(turn), 256, 512),
-    0x23D3: (Scene(turn), 0, 256),
-    0x23D4: (Scene(follow, rows=FREE), 256, 512),
+    0x2500: (Scene(twist, rows={0x6071: 3000}), 500, 1000),
+    0x2501: (Scene(twist, rows={0x6071: 3000}), 12_800, 0),
+    0x2502: (Scene(turn), 100, 50),
+    0x2700: (Scene(turn), 1800, 3600),
+    0x2701: (Scene(turn), 0, 50_000),
+    0x2900: (Scene(follow, rows=FREE), 70_000, 140_000),
+    0x2901: (Scene(follow, rows=FREE), 0, 1000),
     0x23E0: (Scene(twist, rows={0x6071: 3000}), 5, 4),
     0x23E1: (Scene(turn), 65536, 32768),
     0x23E2: (Scene(turn), 0, 1),
@@ -179,6 +181,7 @@ ELSEWHERE = {
     (0x25C1, 0): "the same",
     (0x25C2, 0): "test_tgz.py: the mapped parameters",
     (0x25C3, 0): "the same",
+    **dict.fromkeys([(0x2503, 0), (0x2504, 0), (0x2704, 0), (0x2705, 0), (0x2706, 0)], "the maker calls them unused"),
     (0x4001, 0): "test_tgz.py: outputs, which both axes share",
     (0x60FE, 1): "the same",
     (0x60FE, 2): "the same",
@@ -221,7 +224,7 @@ def test_an_object_has_an_effect_on_its_axis_and_on_no_other(name):
     acts_on_one_axis(name, 0)
 
 
-@pytest.mark.parametrize("name", [0x23C3, 0x23D2, 0x6094, 0x60FF], ids=hex)
+@pytest.mark.parametrize("name", [0x23C3, 0x2700, 0x6094, 0x60FF], ids=hex)
 def test_so_it_is_on_the_second_axis(name):
     acts_on_one_axis((name, 1) if name == 0x6094 else name, 1)
 

@@ -58,7 +58,8 @@ def test_auto_over_a_bus_certifies_both_axes_and_undoes_itself(tmp_path):
 def test_a_sweep_moves_both_axes_of_each_machine_with_a_points_gains():
     """Two motors on a gantry: the best point's recording is that of a machine by itself, in the TGZ's own units."""
     swept = tuple(
-        SweptObject(f"23{number:02X}h:00", *ends, 2, "log") for number, ends in ((0xD2, (400, 800)), (0xD3, (30, 60)))
+        SweptObject(f"{index:04X}h:00", *ends, 2, "log")
+        for index, ends in ((0x2700, (2900, 5700)), (0x2701, (220_000, 440_000)))
     )
     given = replace(load_experiment(), device="tgz_d", load="gantry", motor="am3041_e", sweep=swept)
     found = sweep.run(given)

@@ -62,9 +62,7 @@ class KeptMargins(NamedTuple):
             if keep[axes].all():
                 continue
             columns = cascade_columns(model.device)[2:]
-            rows = np.repeat(gains[axes][None].astype(float), len(NEAREST), axis=0)
-            rows[..., columns] *= NEAREST[:, None]
-            every = np.maximum(np.rint(rows), 1).astype(np.int64)
+            every = model.device.gains.scaled(gains[axes], NEAREST[:, None], columns)
             good = model.slack(self.dynamics, every) >= 0.0
             result[axes] = every[good.argmax()] if good.any() else self.calm[axes]
         return result

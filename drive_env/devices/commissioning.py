@@ -94,12 +94,12 @@ def preset(device: Device, motor: Motor, table: Mapping[str, Any]) -> dict[str, 
 
 def _servo(device: Device, motor: Motor) -> dict[str, float]:
     """Return the quantities of a servo drive, rounded as people choose numbers."""
-    from drive_env.devices.gains import gains_from_bandwidths
+    from drive_env.devices.gains import bandwidth_gains
 
     brushed = motor.kind == "dc"
     ramp = TORQUE * motor.rated_torque / (ROTORS * motor.inertia)  # rad/s^2
     current = min(PEAK * motor.rated_current, device.nominal_current)  # as far as the stage carries it for ever
-    gains = gains_from_bandwidths(device, motor, ROTORS * motor.inertia, **BANDWIDTHS)
+    gains = bandwidth_gains(device, motor, ROTORS * motor.inertia, **BANDWIDTHS)
     return {
         "motor_type": 1 if brushed else 3,
         "encoder_init_mode": 0 if brushed else 1,  # use offset
@@ -109,7 +109,9 @@ def _servo(device: Device, motor: Motor) -> dict[str, float]:
         "hall_polarity": motor.hall_polarity,
         "hall_direction": motor.hall_direction,
         "current_ma": max(round(current * 10.0) * 100, 1),
-        **gains._asdict(),
+        **dict(zip(device.gains.names, gains.tolist(), strict=True)),
+        "line_inductance_per_volt": 2e3 * motor.L_q / device.supply_of(motor),  # mH between two terminals, per V
+        "electrical_time_ms": 1e3 * motor.L_q / motor.R_s,
         "speed_rpm": _rounded(max(SPEED * motor.rated_speed * RPM, 1.0), 3),
         "ramp_rpm_per_s": _rounded(ramp * RPM),
         "ramp_rev_per_s2": _rounded(ramp / (2.0 * math.pi)),

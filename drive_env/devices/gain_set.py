@@ -23,6 +23,7 @@ class Gain(NamedTuple):
 
     lowest: The least integer that makes sense: of a loop's gain 1, since 0 opens it.
     steps: How many different values the drive makes of all its integers; 0 for as many as there are.
+    is_time: Whether the integers of an I count the integration time, so that more of them act less.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Gain(NamedTuple):
     part: str
     lowest: int = 1
     steps: int = 0
+    is_time: bool = False
 
 
 # Kinds of loops that a stepper's drive may close: the encoder commutates; or a PID moves the field besides the ramp, or
@@ -146,6 +148,11 @@ class GainSet:
         return [self.names.index(name) for name in loop.gains.values()]
 
     @property
+    def powers(self) -> Floats:
+        """1 where a gain acts in proportion to its integer, -1 where by its inverse, shape (count,)."""
+        return np.array([-1.0 if row.is_time else 1.0 for row in self.rows])
+
+    @property
     def lowest(self) -> Integers:
         """The least integers, shape (count,)."""
         return np.array([row.lowest for row in self.rows], np.int64)
@@ -192,7 +199,8 @@ class GainSet:
         """Return gains of shape (n, count) with those of loops over a whole number, shape (n,) or one; 1 at least."""
         softer = raw.copy()
         for column in self.columns_of(*loops):
-            softer[:, column] = np.maximum(raw[:, column] // divisor, 1)
+            row, now = self.rows[column], raw[:, column]
+            softer[:, column] = np.minimum(now * divisor, row.highest) if row.is_time else np.maximum(now // divisor, 1)
         return softer
 
     def changed(self, raw: Integers, by: ArrayLike, columns: Sequence[int] | Integers, highest: Integers) -> Integers:
@@ -200,15 +208,16 @@ class GainSet:
 
         Args:
             raw: What is changed.
-            by: How much, of shape (..., len(columns)): the logarithm of a factor; of settings of a load detection, of
-                which 0 and below are values as others are, in units of `PER_UNIT`.
+            by: How much, of shape (..., len(columns)): the logarithm of a factor by which a gain acts more; of settings
+                of a load detection, of which 0 and below are values as others are, in units of `PER_UNIT`.
             columns: Which gains.
             highest: Of all gains.
         """
         unit, result = self._per_unit(columns), raw.copy()
         by = np.asarray(by, float)
         some = raw[..., columns]
-        wanted = np.where(unit > 0.0, np.rint(some + by * unit), np.rint(some * np.exp(np.where(unit > 0.0, 0.0, by))))
+        factor = np.exp(np.where(unit > 0.0, 0.0, by * self.powers[columns]))
+        wanted = np.where(unit > 0.0, np.rint(some + by * unit), np.rint(some * factor))
         lowest = np.where(unit > 0.0, self.lowest[columns], 1)
         result[..., columns] = np.clip(wanted, lowest, np.asarray(highest)[columns])
         return result
@@ -218,7 +227,7 @@ class GainSet:
         unit = self._per_unit(columns)
         now, before = raw[..., columns], since[..., columns]
         if not unit.any():
-            return np.asarray(np.log(now) - np.log(before))
+            return np.asarray(self.powers[columns] * (np.log(now) - np.log(before)))
         ratio = np.log(np.where(unit > 0.0, 1, now)) - np.log(np.where(unit > 0.0, 1, before))
         return np.asarray(np.where(unit > 0.0, (now - before) / np.where(unit > 0.0, unit, 1.0), ratio))
 
@@ -226,11 +235,22 @@ class GainSet:
         return np.array([PER_UNIT.get(self.rows[k].loop, 0.0) for k in columns])
 
     def scaled(self, raw: Integers, factor: ArrayLike, columns: Sequence[int]) -> Integers:
-        """Return gains of shape (..., count) with some of them times a factor, within their ranges; 1 at least."""
-        result = raw.copy()
-        wanted = np.rint(raw[..., columns] * np.asarray(factor, float))
+        """Return gains of shape (..., count), some of which act by a factor more, within their ranges; 1 at least.
+
+        Args:
+            raw: What is changed.
+            factor: One, or an array that fits (..., len(columns)).
+            columns: Which gains.
+        """
+        shape = np.broadcast_shapes((*raw.shape[:-1], len(columns)), np.shape(factor))
+        result = np.broadcast_to(raw, (*shape[:-1], self.count)).copy()
+        wanted = np.rint(raw[..., columns] * np.asarray(factor, float) ** self.powers[columns])
         result[..., columns] = np.clip(wanted, 1, self.highest[columns])
         return result
+
+    def strength(self, raw: Integers, columns: Sequence[int]) -> Floats:
+        """Return by how much some gains act, up to a constant of each, (..., len(columns))."""
+        return np.asarray(raw[..., columns].astype(float) ** self.powers[columns])
 
     def opens(self, raw: Sequence[int] | Integers, *loops: str) -> bool:
         """Return whether gains of shape (count,) leave one of the loops open: its P is 0."""
@@ -262,6 +282,7 @@ def load_gain_set(path: Path) -> GainSet:
                 row["part"],
                 row.get("lowest", 1),
                 row.get("steps", 0),
+                row.get("is_time", False),
             )
         )
     loops = tuple(_closed_loop(table, [row.name for row in rows]) for table in data.get("closed_loop", ()))

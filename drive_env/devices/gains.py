@@ -293,14 +293,37 @@ def cascade_columns(device: Device) -> list[int]:
     return [own.index(part) for part in _CHIP]
 
 
-def gain_factors(device: Device) -> list[float]:
-    """Return the value of an integer of each gain in the drive record: duty/A, A s/rad, 1/s; of an I a share of P e."""
-    context = _context(device)
-    return [float(find_unit(device.bindings[row.key].unit).factor(context)) for row in device.gains.rows]
+class GainScale(NamedTuple):
+    """Integers of a gain, and what they are in another unit: raw = per * value^power. 0 stays 0, and is off."""
+
+    per: float
+    power: float  # 1, or -1 where the integers count a time
+
+    def raw(self, value: ArrayLike) -> Floats:
+        """Return integers, not rounded, of values."""
+        return self._along(self.per, value)
+
+    def value(self, raw: ArrayLike) -> Floats:
+        """Return the values of integers."""
+        return self._along(self.per**-self.power, raw)
+
+    def _along(self, per: float, x: ArrayLike) -> Floats:
+        given = np.asarray(x, float)
+        return np.where(given == 0.0, 0.0, per * np.where(given == 0.0, 1.0, given) ** self.power)
 
 
-def per_chip(device: Device) -> dict[Part, float]:
-    """Return how many integers of a device are one of the chip, by loop and part; exactly 1 where it counts alike.
+def loop_scales(device: Device) -> list[GainScale]:
+    """Return the scale of each gain to what the loops take: duty/A, A s/rad, 1/s; of an I a share of P e per sample."""
+    context, found = _context(device), []
+    rates = {"current": device.current_rate, "velocity": device.velocity_rate}
+    for row in device.gains.rows:
+        factor = float(find_unit(device.bindings[row.key].unit).factor(context))
+        found.append(GainScale(1.0 / (rates[row.loop] * factor), -1.0) if row.is_time else GainScale(1.0 / factor, 1.0))
+    return found
+
+
+def per_chip(device: Device) -> dict[Part, GainScale]:
+    """Return the scale of a device's integers to the chip's, by loop and part; exactly 1 where it counts alike.
 
     Raises:
         ValueError: If the device names no cascade, or has a gain which that does not have, or has once.
@@ -312,21 +335,21 @@ def per_chip(device: Device) -> dict[Part, float]:
             f'cascade = "{PI}" if its loops are that one, or set gains by hand and use drive-tune sweep'
         )
     context = _context(device)
-    ratios: dict[Part, float] = {}
-    for row, own in zip(known.rows, gain_factors(device), strict=True):
+    scales: dict[Part, GainScale] = {}
+    for row, own in zip(known.rows, loop_scales(device), strict=True):
         part = row.loop, row.part
         if part not in _CHIP:
             raise ValueError(
                 f"{device.name}: gains.toml: {row.name} is {row.part} of the {row.loop} loop, which the cascade "
                 f'"{PI}" does not have; it has {", ".join(f"{p} of {loop}" for loop, p in _CHIP)}'
             )
-        if part in ratios:
+        if part in scales:
             raise ValueError(
                 f"{device.name}: gains.toml: {row.name} is a second {row.part} of the {row.loop} loop; the cascade "
                 f'"{PI}" has one'
             )
-        ratios[part] = float(UNITS[_CHIP[part]].factor(context)) / own
-    return ratios
+        scales[part] = GainScale(float(own.raw(UNITS[_CHIP[part]].factor(context))), own.power)
+    return scales
 
 
 def as_chip(device: Device, gains: RawGains) -> list[float]:
@@ -335,12 +358,12 @@ def as_chip(device: Device, gains: RawGains) -> list[float]:
     Raises:
         ValueError: If the device names no cascade.
     """
-    own = {part: float(value) / ratio for value, (part, ratio) in zip(gains, per_chip(device).items(), strict=True)}
+    own = {part: float(scale.value(raw)) for raw, (part, scale) in zip(gains, per_chip(device).items(), strict=True)}
     return [own.get(part, math.nan) for part in _CHIP]
 
 
-def integers_per_si(device: Device, supply: float) -> dict[Part, float]:
-    """Return how many integers of a device's gains are one in SI, by loop and part: of an I, of 1/T_i [1/s].
+def si_scales(device: Device, supply: float) -> dict[Part, GainScale]:
+    """Return the scale of a device's integers to SI, by loop and part: of an I to 1/T_i [1/s].
 
     P of current [V/A], of velocity [A s/rad], of position [1/s]; the supply [V] is that of the drive.
 
@@ -354,13 +377,13 @@ def integers_per_si(device: Device, supply: float) -> dict[Part, float]:
         ("velocity", "I"): 65536.0 / device.velocity_rate,
         ("position", "P"): _POSITION_P_SCALE,
     }
-    return {part: chip[part] * ratio for part, ratio in per_chip(device).items()}
+    return {part: GainScale(float(own.raw(chip[part])), own.power) for part, own in per_chip(device).items()}
 
 
 def _of_device(device: Device, raw: Floats) -> Floats:
     """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units."""
-    ratios, order = per_chip(device), list(_CHIP)
-    return np.asarray(raw[..., [order.index(part) for part in ratios]] * np.array(list(ratios.values())))
+    order = list(_CHIP)
+    return np.stack([own.raw(raw[..., order.index(part)]) for part, own in per_chip(device).items()], axis=-1)
 
 
 def _context(device: Device) -> Context:

@@ -429,13 +429,14 @@ class GainScheduling(VectorEnvironment):
         columns = known.columns(self.config.chosen)
         self._gain_objects = [known.keys[column] for column in columns]
         self._columns, self._scheduled, self._highest = columns, self.base_gains[:, columns], known.highest[columns]
+        self._powers = known.powers[columns]
         if self.config.dynamics is not None:
             self._margins = OnlineMargins(drives, find_dynamics(self.config.dynamics), self.config.mode)
 
     # --- a step ---------------------------------------------------------------------------------------------------
     def _gains_of(self, action: Floats) -> Integers:
         """Return raw gains, shape (num_axes, gains)."""
-        raw = np.rint(self._scheduled * np.exp(self.config.span * action))
+        raw = np.rint(self._scheduled * np.exp(self.config.span * action * self._powers))
         return np.asarray(np.clip(raw, 1, self._highest), np.int64)
 
     def _set_points(self, cycles: Integers) -> Integers:

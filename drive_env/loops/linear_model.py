@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drive_env.devices.gains import RawGains, cascade_columns, gain_factors
+from drive_env.devices.gains import RawGains, cascade_columns, loop_scales
 from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates, held, response, window
 from drive_env.loops.sampled import mean_velocity as mean_velocity_of
 from mechanics.arrays import Complex, Floats
@@ -246,8 +246,8 @@ class Controllers(NamedTuple):
 
 def controllers(device: Device, gains: RawGains) -> Controllers:
     """Return raw gains in SI; ValueError for a device whose loops are others than those of this model."""
-    factors = gain_factors(device)
-    return Controllers(*(int(gains[k]) * factors[k] for k in cascade_columns(device)))
+    scales = loop_scales(device)
+    return Controllers(*(float(scales[k].value(int(gains[k]))) for k in cascade_columns(device)))
 
 
 def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drive_env.devices.gains import cascade_columns, gain_factors
+from drive_env.devices.gains import cascade_columns, loop_scales
 from mechanics.arrays import Complex, Floats, Integers
 
 if TYPE_CHECKING:
@@ -115,8 +115,8 @@ class CascadeGains(NamedTuple):
     @classmethod
     def of(cls, device: Device, raw: Integers) -> CascadeGains:
         """Return raw gains, (machines, axes, count), in SI; ValueError for a device without a linear model."""
-        factors = np.array(gain_factors(device))
-        return cls(*(raw[..., k] * factors[k] for k in cascade_columns(device)))
+        scales = loop_scales(device)
+        return cls(*(scales[k].value(raw[..., k]) for k in cascade_columns(device)))
 
 
 class LoopWindow(NamedTuple):

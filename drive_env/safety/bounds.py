@@ -10,7 +10,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.devices.gains import PI, gain_factors
+from drive_env.devices.gains import PI, loop_scales
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context, find_unit, split_unit
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
@@ -203,8 +203,8 @@ def _loops(drives: WatchedDrives, rotor: RotorAngle) -> tuple[Floats, Floats]:
     keys = motion_gains(device)
     if device is None or not keys:
         return none, none
-    factors: dict[Key, float] = dict(zip((row.key for row in device.gains.rows), gain_factors(device), strict=True))
-    gain = {part: np.asarray(factors[key] * read_own(drives, key, 0), float) for part, key in keys.items()}
+    scales = dict(zip(device.gains.keys, loop_scales(device), strict=True))
+    gain = {part: scales[key].value(read_own(drives, key, 0)) for part, key in keys.items()}
     # The integral, in A, is P I f times the angle by which the axis is behind.
     per_rad = gain.get(("velocity", "P"), none) * gain.get(("velocity", "I"), none) * device.velocity_rate
     return (

@@ -93,7 +93,7 @@ def softness(known: GainSet, gains: Integers) -> Floats:
     load takes, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
     """
     cascade = known.columns_of("velocity", "position")
-    return np.asarray(1.0 / np.prod(gains[:, cascade].astype(float), axis=1))
+    return np.asarray(1.0 / known.strength(gains, cascade).prod(axis=1))
 
 
 def measured_cost(costs: Floats) -> Floats:

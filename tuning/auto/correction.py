@@ -174,14 +174,13 @@ def _lowered(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, mo
     """Return lowered outer gains of an axis: the liveliest whose measured loops keep the dynamics."""
     device, measured = bench.target.device, measured_axis(bench, basis, recorded, k)
     _, _, velocity_p, velocity_i, position_p = cascade_columns(device)
-    rows = np.tile(recorded.gains[k].astype(float), (len(LOWERED), 1))
-    rows[:, [velocity_p, velocity_i, position_p]] *= LOWERED
-    every = np.maximum(np.rint(rows), 1).astype(np.int64)
-    every = every[every[:, velocity_p] <= most]
+    outer = [velocity_p, velocity_i, position_p]
+    rows = device.gains.scaled(recorded.gains[k], LOWERED, outer)
+    every = rows[rows[:, velocity_p] <= most]
     if not len(every):
-        every = np.maximum(np.rint(rows[-1:]), 1).astype(np.int64)
+        every = rows[-1:]
     slack = np.zeros(len(every)) if measured is None else measured.slack(bench.dynamics, every)
-    lively = (every[:, velocity_p] * every[:, velocity_i]) ** 0.4 * every[:, position_p] ** 0.8
+    lively = (device.gains.strength(every, outer) ** (0.4, 0.4, 0.8)).prod(axis=1)
     return np.asarray(every[int(np.where(slack > 0.0, lively, slack - 1e9).argmax())])
 
 

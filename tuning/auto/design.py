@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drive_env.devices.gains import Part, cascade_columns, integers_per_si, small_time_constants
+from drive_env.devices.gains import Part, cascade_columns, si_scales, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.trials.score import robust_cost
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.loop_margins import measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models, model_of
 from tuning.auto.proving import RESTLESS
-from tuning.auto.twin import WORLDS, Known, Twins, known_of, least_gains
+from tuning.auto.twin import WORLDS, Known, Twins, gain_bounds, known_of
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -233,7 +233,7 @@ def design(
 
 def _grid(device: Device, plant: Plant) -> Integers:
     """Return the gains of the grid for an axis, raw, (sets, count); bandwidths change slowest."""
-    per_si = integers_per_si(device, plant.supply)
+    scales = si_scales(device, plant.supply)
     lag = CURRENT_LAG / device.current_rate
     small = float(small_time_constants(device, plant.velocity_filter)) + plant.delay - 1.0 / device.velocity_rate
     rows = []
@@ -246,12 +246,12 @@ def _grid(device: Device, plant: Plant) -> Integers:
             ("velocity", "I"): w / integration,
             ("position", "P"): position * w,
         }
-        rows.append([values[row.loop, row.part] * per_si[row.loop, row.part] for row in device.gains.rows])
+        rows.append([float(scale.raw(values[part])) for part, scale in scales.items()])
     return _whole(device, np.array(rows))
 
 
-def _whole(device: Device, rows: Floats) -> Integers:
-    return np.clip(np.rint(rows), least_gains(device), device.gains.highest).astype(np.int64)
+def _whole(device: Device, rows: Floats | Integers) -> Integers:
+    return np.clip(np.rint(rows), *gain_bounds(device)).astype(np.int64)
 
 
 def _promise(device: Device, gains: Integers) -> Floats:
@@ -259,7 +259,7 @@ def _promise(device: Device, gains: Integers) -> Floats:
 
     Their product is what a load step leaves, and what dry friction leaves of a move.
     """
-    return np.asarray(-np.log(gains[..., list(cascade_columns(device)[2:])]).sum(axis=-1))
+    return np.asarray(-np.log(device.gains.strength(gains, cascade_columns(device)[2:])).sum(axis=-1))
 
 
 def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:
@@ -279,7 +279,6 @@ def _around(device: Device, gains: Integers, step: float, most_torque_p: int) ->
     """Return gains around some, (sets, count): all outer gains and torque P up and down by a factor."""
     torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
     factors = np.array(list(product((1.0 / step, 1.0, step), repeat=4)))
-    rows = np.tile(gains.astype(float), (len(factors), 1))
-    rows[:, [torque_p, velocity_p, velocity_i, position_p]] *= factors
-    rows[:, torque_p] = np.clip(rows[:, torque_p], LEAST_TORQUE * most_torque_p, most_torque_p)
+    rows = device.gains.scaled(gains, factors, [torque_p, velocity_p, velocity_i, position_p])
+    rows[:, torque_p] = np.clip(rows[:, torque_p], np.rint(LEAST_TORQUE * most_torque_p), most_torque_p)
     return _whole(device, rows)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.devices.gains import integers_per_si
+from drive_env.devices.gains import si_scales
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, highest_ramp, plan_move
@@ -253,11 +253,12 @@ class Twins:
             robust.close()
 
 
-def least_gains(device: Device) -> Integers:
-    """Return the least integers that a search may go down to, shape (count,)."""
-    least = np.ones(device.gains.count, np.int64)
+def gain_bounds(device: Device) -> tuple[Integers, Integers]:
+    """Return the least and the greatest integers that a search may try, shape (count,) each."""
+    least, most = np.ones(device.gains.count, np.int64), device.gains.highest
     integral = device.gains.column("velocity", "I")
     if integral is not None:
-        per_second = integers_per_si(device, 1.0)["velocity", "I"]  # which no supply changes
-        least[integral] = max(round(per_second / LONGEST_INTEGRATION), 1)
-    return least
+        scale = si_scales(device, 1.0)["velocity", "I"]  # which no supply changes
+        longest = max(round(float(scale.raw(1.0 / LONGEST_INTEGRATION))), 1)
+        (most if device.gains.rows[integral].is_time else least)[integral] = longest
+    return least, most

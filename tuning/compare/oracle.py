@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drive_env.devices.gains import has_linear_model, integers_per_si
+from drive_env.devices.gains import has_linear_model, si_scales
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.whole_file import write_table
 from mechanics.arrays import Floats, Integers, Mask
@@ -126,14 +126,16 @@ class _Box(NamedTuple):
         if has_linear_model(device):
             L, R = (float(yardstick.parameters[name][0]) for name in ("motor.L_q", "motor.R_s"))
             for axis in range(axes):
-                per_si = integers_per_si(device, float(yardstick.supply[axis]))
+                scales = si_scales(device, float(yardstick.supply[axis]))
                 p, i = device.gains.column("current", "P"), device.gains.column("current", "I")
                 most[axis, p] = rule[axis, p] = np.log(
-                    CURRENT_CROSSOVER * device.current_rate / CURRENT_LAG * L * per_si["current", "P"]
+                    scales["current", "P"].raw(CURRENT_CROSSOVER * device.current_rate / CURRENT_LAG * L)
                 )
                 least[axis, p] = most[axis, p] + np.log(LEAST_TORQUE)
                 # Zeros at the winding's pole.
-                least[axis, i] = most[axis, i] = rule[axis, i] = np.log(max(R / L * per_si["current", "I"], 1.0))
+                least[axis, i] = most[axis, i] = rule[axis, i] = np.log(
+                    max(float(scales["current", "I"].raw(R / L)), 1.0)
+                )
         outer = np.array([row.loop != "current" for row in device.gains.rows])
         return cls(rule, least, most, outer)
 
@@ -175,11 +177,13 @@ def _first(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Floats:
     rounds = max(DRAWS // (POPULATION * yardstick.axes), 4)
     shape = (rounds * POPULATION, *box.rule.shape)
     together = rng.uniform(*TOGETHER, (shape[0], 1, 1)) * box.outer
+    powers = yardstick.device.gains.powers
     # All axes of a machine at the same place in their own scales.
-    x = np.clip(box.rule + together + rng.uniform(*EACH, (shape[0], 1, shape[2])), box.least, box.most)
+    reach = powers * (together + rng.uniform(*EACH, (shape[0], 1, shape[2])))
+    x = np.clip(box.rule + reach, box.least, box.most)
     gains = box.whole(x)
     slack = np.concatenate([yardstick.loop_slack(part.reshape(-1, shape[2])) for part in np.split(gains, rounds)])
-    promise = -(x * box.outer).sum(axis=(1, 2))
+    promise = -(x * powers * box.outer).sum(axis=(1, 2))
     band = np.digitize(together.max(axis=(1, 2)) + together.min(axis=(1, 2)), np.linspace(*TOGETHER, BANDS + 1)[1:-1])
     order = np.lexsort((np.where(slack > 0.0, promise, 1e9 - slack), band))
     place = np.concatenate([np.arange(np.count_nonzero(band == k)) for k in range(BANDS)])  # within its band

@@ -91,10 +91,10 @@ def loop_gains(working: Working) -> tuple[Floats, float]:
     lost = target.supply * stage["dead_time"].high * target.device.current_rate
     volts_per_ampere = np.maximum(LOOP_GAIN * motor.R_s, lost / (OVERCOMES * working.current))
     volts_per_ampere = np.minimum(volts_per_ampere, 2.0 * np.pi * LOOP_HZ * motor.L_q)
-    P = np.rint(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply * per["current", "P"])
-    cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate * per["current", "I"]
-    least = max(LEAST_INTEGRAL * per["current", "I"], 1.0)
-    return np.clip(P, 1, top_p), float(np.rint(np.clip(np.rint(INTEGRAL_SHARE * cancels), least, top_i)))
+    P = np.rint(per["current", "P"].raw(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply))
+    cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate
+    integral = per["current", "I"].raw(max(INTEGRAL_SHARE * cancels, LEAST_INTEGRAL))
+    return np.clip(P, 1, top_p), float(np.clip(np.rint(integral), 1, top_i))
 
 
 def _columns(target: Target) -> tuple[int, int]:
@@ -237,8 +237,8 @@ def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, po
     P_raw, I_raw = loop_gains(working)
     per = per_chip(device)
     regulator = _Regulator(
-        P=P_raw[k] / per["current", "P"] / (256.0 * device.current_full_scale),
-        share=I_raw / per["current", "I"] / 65536.0,
+        P=float(per["current", "P"].value(P_raw[k])) / (256.0 * device.current_full_scale),
+        share=float(per["current", "I"].value(I_raw)) / 65536.0,
         supply=supply,
         dt=1.0 / device.current_rate,
         ticks=round(CYCLE * device.current_rate),

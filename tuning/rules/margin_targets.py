@@ -60,7 +60,7 @@ def propose(device: Device, plant: Plant, phase_deg: float, gain_db: float) -> P
         return phase >= phase_deg and found.gain_db >= gain_db
 
     f = np.geomspace(2.0, 0.49 * device.current_rate, POINTS)
-    torque_i = bench.integer(CURRENT_I, bench.per_si[CURRENT_I] * plant.R / plant.L)
+    torque_i = bench.integer(CURRENT_I, plant.R / plant.L)
     unit = current_open_loop(device, plant, bench.so_far({CURRENT_I: torque_i}), f)
     torque_p = _greatest(bench, CURRENT_P, lambda p: margins(f, p * unit), enough, phase_deg, gain_db)
     bench.raw(CURRENT_P, torque_p)
@@ -90,7 +90,7 @@ def propose(device: Device, plant: Plant, phase_deg: float, gain_db: float) -> P
 
 def _integral(bench: Workbench, velocity_p: int, slope: float) -> int:
     crossover = bench.si(VELOCITY_P, velocity_p) * slope
-    return bench.integer(VELOCITY_I, bench.per_si[VELOCITY_I] * crossover / INTEGRATION)
+    return bench.integer(VELOCITY_I, crossover / INTEGRATION)
 
 
 def _greatest(

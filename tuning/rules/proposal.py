@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from drive_env.devices.gains import Part, check_linear_model, integers_per_si
+from drive_env.devices.gains import Part, check_linear_model, si_scales
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -52,7 +52,7 @@ class Workbench:
     def __init__(self, device: Device, plant: Plant) -> None:
         check_linear_model(device)
         self._rows = {(row.loop, row.part): row for row in device.gains.rows}
-        self.per_si = integers_per_si(device, plant.supply)
+        self.scales = si_scales(device, plant.supply)
         self._wanted: dict[str, float] = {}
         self._raw: dict[Part, int] = {}
         self._notes: list[str] = []
@@ -70,19 +70,19 @@ class Workbench:
         """Take an integer that a rule searched itself; return it in SI, of an I 1/s."""
         self._wanted[self._rows[part].name] = float(value)
         self._raw[part] = value
-        return value / self.per_si[part]
+        return self.si(part, value)
 
     def si(self, part: Part, value: float) -> float:
         """Return a raw gain in SI units, of an I 1/s."""
-        return value / self.per_si[part]
+        return float(self.scales[part].value(value))
 
     def row(self, part: Part) -> Gain:
         """Return a gain of the device's set."""
         return self._rows[part]
 
-    def integer(self, part: Part, wanted: float) -> int:
-        """Return the integer that is nearest to the wanted value of a gain, 1 at least."""
-        return min(max(round(wanted), 1), self._rows[part].highest)
+    def integer(self, part: Part, value: float) -> int:
+        """Return the integer of a gain that is nearest to a value [SI], of an I [1/s]; 1 at least."""
+        return min(max(round(float(self.scales[part].raw(value))), 1), self._rows[part].highest)
 
     def note(self, text: str) -> None:
         """Add a note to the proposal."""
@@ -98,9 +98,9 @@ class Workbench:
         return Proposal(tuple(self._raw[part] for part in self._rows), dict(self._wanted), tuple(self._notes))
 
     def _take(self, part: Part, value: float) -> float:
-        gain, wanted = self._rows[part], value * self.per_si[part]
+        gain, wanted = self._rows[part], float(self.scales[part].raw(value))
         self._wanted[gain.name] = wanted
-        raw = 0 if wanted == 0.0 else self.integer(part, wanted)
+        raw = 0 if wanted == 0.0 else self.integer(part, value)
         self._raw[part] = raw
         title, highest = gain.title, gain.highest
         if wanted > highest + 0.5:
@@ -113,4 +113,4 @@ class Workbench:
         elif raw and abs(raw / wanted - 1.0) > COARSE:
             self.note(f"{title} would have to be {wanted:.2f}; no integer comes nearer than {raw}, "
                       f"{100.0 * abs(raw / wanted - 1.0):.0f} % off")  # fmt: skip
-        return raw / self.per_si[part]
+        return float(self.scales[part].value(raw))

@@ -16,7 +16,7 @@ import numpy as np
 from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.devices.gain_set import LOAD_ANGLE, PID_ON_RAMP, ClosedLoop
-from drive_env.devices.gains import gain_factors
+from drive_env.devices.gains import loop_scales
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
@@ -310,7 +310,7 @@ def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
     except ValueError as error:
         raise ExperimentError(str(error)) from None
     own, dictionary = find_device(experiment.device), find_device(experiment.device).new_dictionary()
-    factors, theirs, found = gain_factors(own), gain_factors(device), []
+    scales, theirs, found = loop_scales(own), loop_scales(device), []
     for number, swept in enumerate(experiment.sweep, 1):
         entry = _swept_entry(own, dictionary, number, swept)
         k = own.gains.keys.index((entry.index, entry.sub))
@@ -321,11 +321,12 @@ def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
                 f"{name} has no {gain.part} of the {gain.loop} loop, which the default experiment sweeps; give "
                 f"--config a file that sweeps some of {', '.join(device.gains.names)}"
             )
-        other, ratio = device.gains.rows[column], factors[k] / theirs[column]
-        if other.key == gain.key and ratio == 1.0:
+        other = device.gains.rows[column]
+        if other.key == gain.key and theirs[column] == scales[k]:
             found.append(swept)
             continue
-        low, high = (min(max(round(end * ratio), 1), other.highest) for end in (swept.low, swept.high))
+        ends = theirs[column].raw(scales[k].value([swept.low, swept.high]))
+        low, high = sorted(min(max(round(end), 1), other.highest) for end in ends.tolist())
         found.append(replace(swept, object=other.name, low=low, high=high))
     return tuple(found)
 

@@ -10,7 +10,7 @@ from mechanics.compiled import inlined
 
 @inlined
 def derive_sensors(drive):
-    """Compute the constants of encoder and current sensor."""
+    """Compute the constants of encoder, current sensor and flux regulator."""
     for lane in range(LANES):
         # 2080h:02 may be 0, which is no encoder that could be counted with.
         steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
@@ -20,6 +20,7 @@ def derive_sensors(drive):
         drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]
         drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
         drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]
+        drive.current_p_d[lane] = drive.current_p[lane] * drive.current_d_share[lane]
 
 
 @inlined

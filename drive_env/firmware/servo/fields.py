@@ -12,6 +12,7 @@ PARAMETERS = (
     # --- parameters and commands that the dictionary writes -------------------------------------------------------
     Field("current_p", "f8", "1/A", "2041h:01: duty per A of current error"),
     Field("current_i", "f8", "1", "2041h:02: share of P * error that the integrator takes per sample"),
+    Field("current_d_share", "f8", "1", "gain of the flux regulator over that of the torque regulator", 1.0),
     Field("velocity_p", "f8", "A*s/rad", "2042h:01"),
     Field("velocity_i", "f8", "1", "2042h:02: share of P * error that the integrator takes per sample"),
     Field("i_max", "f8", "A", "2003h: limit of the current set-point"),
@@ -92,6 +93,7 @@ STATE = (
     Field("i_q_ref", "f8", "A", "set-point of the torque current, in the user's direction"),
     Field("current_share", "f8", "1", "share of 2003h that the torque limit leaves", 1.0),
     Field("torque_demand_share", "f8", "1", "6074h: i_q_ref as a share of 2003h"),
+    Field("current_p_d", "f8", "1/A", "duty per A of flux current error"),
     Field("i_d_meas", "f8", "A", "measured flux current"),
     Field("i_q_meas", "f8", "A", "measured torque current, motor's direction"),
     Field("current_error_d", "f8", "A", "2041h:05"),

@@ -49,7 +49,7 @@ def current_loop(drive):
         on = drive.stage_on[lane]
         # Between two legs lies the whole supply, not the voltage circle.
         limit = 1.0 if drive.angle_source[lane] == 5.0 else drive.duty_limit[lane]
-        p_d = drive.current_p[lane] * error_d
+        p_d = drive.current_p_d[lane] * error_d
         p_q = drive.current_p[lane] * error_q
         sum_d = clip(drive.current_sum_d[lane] + p_d * drive.current_i[lane], limit) * on
         sum_q = clip(drive.current_sum_q[lane] + p_q * drive.current_i[lane], limit) * on

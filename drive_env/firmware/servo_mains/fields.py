@@ -33,6 +33,9 @@ PARAMETERS = (
     *mains_link.PARAMETERS,
     # --- parameters and commands that the dictionary writes -------------------------------------------------------
     Field("peak_current", "f8", "A", "M-Ipeak of the motor"),
+    Field("current_integration", "f8", "s", "C-Ti: integration time of the current regulators; 0: no integrator"),
+    Field("velocity_integration", "f8", "s", "V-Ti: integration time of the velocity regulator; 0: no integrator"),
+    Field("feed_forward", "f8", "1", "P-SFF: share of the velocity demand that the position loop adds to its output"),
     Field("image_limit", "f8", "1/32767", "share of M-Ipeak that is taken away: 0 none, 32767 all"),
     Field("velocity_ratio", "f8", "rpm", "6094h: of a velocity unit", 1.0),
     Field("d_mode", "i4", "", "2303h, 2403h"),

@@ -1,5 +1,7 @@
-"""Position P and velocity PI of a servo amplifier, with the feed-forward and the limit of the current.
+"""Position P and velocity PI of a servo amplifier, with feed-forward of speed and current, and the current's limit.
 
+The regulators are told by a gain and an integration time (C-K and C-Ti, V-K and V-Ti); the position loop adds a share
+of the speed that its set-points have (P-SFF).
 Torque objects are shares of the motor's peak current (M-Ipeak): 32767 is all of it. The manual has 6071h as the
 set-point of cst and pt, and in csp and ip as "the feedforward torque value", which "is added to the desired value of
 the current regulator". Of the current limit it prints no equation, only its ends: 0 is no limitation, "where maximal
@@ -34,8 +36,17 @@ def share_current(drive):
         drive.torque_demand_share[lane] = drive.i_q_ref[lane] / peak if peak > 0.0 else 0.0
 
 
+@inlined
+def find_integral_shares(drive, tick, window):
+    """Write what the integrators take of P e per sample, from the integration times; ticks and windows in s."""
+    for lane in range(LANES):
+        current, velocity = drive.current_integration[lane], drive.velocity_integration[lane]
+        drive.current_i[lane] = tick / current if current > 0.0 else 0.0
+        drive.velocity_i[lane] = window / velocity if velocity > 0.0 else 0.0
+
+
 @stage
-def feed_forward(drive, lane):
+def feed_forward_current(drive, lane):
     """Write the current that ip and csp add; an axis that stops, waits or is blocked is driven by its loops alone."""
     follows = (
         acts_as(drive.mode_display[lane]) == CSP
@@ -54,7 +65,9 @@ def motion_loops(drive):
     for lane in range(LANES):
         level = drive.loop_level[lane]
         position_error = drive.position_demand[lane] - drive.theta_meas[lane]
-        omega_ref = drive.position_p[lane] * position_error if level == 2 else drive.velocity_demand[lane]
+        demand = drive.velocity_demand[lane]
+        ahead = drive.feed_forward[lane] * demand
+        omega_ref = drive.position_p[lane] * position_error + ahead if level == 2 else demand
         error = omega_ref - drive.omega_meas[lane]
         i_max = drive.i_max[lane] * drive.current_share[lane]
         proportional = drive.velocity_p[lane] * error

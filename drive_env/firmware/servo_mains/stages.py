@@ -22,7 +22,12 @@ from drive_env.firmware.servo.stages import (
 )
 from drive_env.firmware.servo_mains import causes, d_mode, fields
 from drive_env.firmware.servo_mains.inputs import find_switches, read_module_inputs
-from drive_env.firmware.servo_mains.loops import feed_forward, motion_loops, share_current
+from drive_env.firmware.servo_mains.loops import (
+    feed_forward_current,
+    find_integral_shares,
+    motion_loops,
+    share_current,
+)
 from drive_env.firmware.servo_mains.mains_link import (
     derive_link,
     find_rectifier_voltage,
@@ -74,6 +79,7 @@ def read_mains(drive, rates):
 def prepare_link(drive, rates):
     """Compute what the ticks need as quotients, and look after the link."""
     derive_sensors(drive)
+    find_integral_shares(drive, rates.tick, rates.window)
     share_current(drive)
     watch_link(drive, rates.period)
     derive_link(drive, rates.tick)
@@ -106,7 +112,7 @@ STAGES = FirmwareStages(
     begin_period=(warm, prepare_link, read_module_inputs),
     measure=(find_switches, servo_causes.watch_phases, causes.watch_motion),
     switch=(servo_causes.forget_peaks, d_mode.look_at_gate, alignment.commutate, tell_sensor),
-    tell=(feed_forward, tell_errors),
+    tell=(feed_forward_current, tell_errors),
     end_period=(find_what_is_needed,),
     window=(read_motion, regulate_motion, read_mains, prepare_winding),
     tick=(run_tick,),
