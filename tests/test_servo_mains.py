@@ -13,7 +13,7 @@ from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.firmware.servo_mains.causes import CAUSES
 
 D_MODE = 0x2303
-PEAK = 0x23C3  # M-Ipeak, mA
+PEAK = 0x2107  # M-Ipeak, mA
 LIMIT = 0x23C6  # as the process images carry it
 ENABLED, QUICK_STOP, FAULT, DISABLED = (0x6F, 0x27), (0x6F, 0x07), (0x4F, 0x08), (0x4F, 0x40)
 REMOTE = 0x0200

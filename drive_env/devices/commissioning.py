@@ -109,6 +109,9 @@ def _servo(device: Device, motor: Motor) -> dict[str, float]:
         "hall_polarity": motor.hall_polarity,
         "hall_direction": motor.hall_direction,
         "current_ma": max(round(current * 10.0) * 100, 1),
+        "rated_rms_ma": max(round(1e3 * motor.rated_current / math.sqrt(2.0)), 1),
+        "rated_rpm": max(motor.rated_speed * RPM, 1.0),
+        "thermal_time_s": motor.thermal_time,
         **dict(zip(device.gains.names, gains.tolist(), strict=True)),
         "line_inductance_per_volt": 2e3 * motor.L_q / device.supply_of(motor),  # mH between two terminals, per V
         "electrical_time_ms": 1e3 * motor.L_q / motor.R_s,

@@ -116,6 +116,8 @@ UNITS: dict[str, Unit] = {
         ),
         Unit("1/2^32 rev", "increments of the position inside, 2^32 a revolution", lambda c: TWO_PI / 2.0**32),
         Unit("1/1000", "thousandths", lambda c: 1e-3),
+        Unit("V", "volts", lambda c: 1.0),
+        Unit("100us", "tenths of a millisecond", lambda c: 1e-4),
         Unit("us", "microseconds", lambda c: 1e-6),
         Unit("percent", "hundredths", lambda c: 1e-2),
         Unit("mV/A", "millivolts per ampere, where 32 V are the whole link", lambda c: 1e-3 / 32.0),

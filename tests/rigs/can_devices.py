@@ -183,8 +183,13 @@ MANUALS = (
     ),
     Manual(
         "tgz_d",
-        # Its registers lie 100h apart as 3325h and 3425h do; 333Eh is once in the module.
-        areas=((0x2300, 0x23FF, 0x100), (0x3300, 0x333D, 0x100), (0x333F, 0x33FF, 0x100), PROFILE_AREA),
+        # Its registers lie 100h apart as 3325h and 3425h do, but for what the module has once.
+        areas=(
+            *((0x2100 + 0x200 * k, 0x210F + 0x200 * k, 0x100) for k in (0, 2, 3, 4)),
+            *((0x2300, 0x230C, 0x100), (0x230F, 0x23FF, 0x100), (0x2B00, 0x2B02, 0x100), (0x2B04, 0x2B0F, 0x100)),
+            *((0x3301, 0x3328, 0x100), (0x332B, 0x333D, 0x100), (0x333F, 0x333F, 0x100), (0x3341, 0x33FF, 0x100)),
+            PROFILE_AREA,
+        ),
         pdo_set=0,
         error_behaviour={0: "PRE_OPERATIONAL", 1: "OPERATIONAL", 2: "STOPPED"},  # CiA 301
         inhibit_unit=1e-4,  # CiA 301

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drive_env.firmware.common import causes, fsa, start_up
-from drive_env.firmware.common.brake import CLOSED
+from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT
 from drive_env.firmware.common.modes import CSP, acts_as
 from drive_env.firmware.common.protection import (
     BLOCKS_NEGATIVE,
@@ -66,8 +66,9 @@ def watch_motion(drive, lane, dt):
     way = 1.0 if asked > 0.0 else -1.0
     so_far = way * drive.reverse_time[lane]
     drive.reverse_time[lane] = way * ((so_far if so_far > 0.0 else 0.0) + dt) if runs_away else 0.0
+    mode = drive.brake_mode[lane]
     held = (
-        drive.brake_mode[lane] == CLOSED
+        (mode == CLOSED or (mode == WITH_OUTPUT and drive.brake_opened[lane] == 0))
         and drive.stage_on[lane] > 0.0
         and abs(drive.velocity_demand[lane]) > drive.standstill[lane]
         and abs(slow) <= drive.standstill[lane]
@@ -102,8 +103,9 @@ def current_measurement(drive, lane, told):
 
 @stage
 def motor_thermostat(drive, lane, told):
-    """Return whether the winding's thermostat has opened."""
-    return drive.T_winding[lane] > drive.thermostat_temperature[lane]
+    """Return whether the resistance of the motor's sensor is beyond its limits; a feedback without one has none."""
+    found = drive.sensor_resistance[lane]
+    return found > 0.0 and (found < drive.sensor_lowest[lane] or found > drive.sensor_highest[lane])
 
 
 @stage
@@ -167,8 +169,8 @@ def brake_resistance(drive, lane, told):
 
 @stage
 def i2t(drive, lane, told):
-    """Return whether the stage's I2t budget is used up."""
-    return drive.overload[lane] > 1.0
+    """Return whether the stage's I2t budget is used up, or the motor has more than M-Inull in the mean."""
+    return drive.overload[lane] > 1.0 or drive.mean_motor_current[lane] > drive.nominal_motor_current[lane]
 
 
 @stage

@@ -77,7 +77,8 @@ def motion_loops(drive):
         # While torque is commanded the integrator follows it, or a change to a velocity mode would jump.
         total = clip(i_direct - proportional, i_max) if level == 0 else total
         i_ref = i_direct if level == 0 else i_loop
-        on = drive.drive_function[lane]
+        # A current that waits for the brake holds the axis meanwhile.
+        on = 1.0 if drive.drive_function[lane] > 0.0 or drive.holding[lane] == 1 else 0.0
         drive.position_error[lane] = position_error
         drive.omega_ref[lane] = omega_ref
         drive.velocity_error[lane] = error
