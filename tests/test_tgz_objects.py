@@ -126,7 +126,7 @@ HOMING = FREE | {0x6098: 21, (0x6099, 1): 300 * RPM, (0x6099, 2): 60 * RPM, 0x60
 ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x2303: (Scene(switch_on), 3, 6),
     0x2107: (Scene(twist, rows={0x6071: 3000}), 4000, 8000),
-    0x23C5: (Scene(twist, rows={0x6071: 3000}), 32767, 1000),
+    0x2506: (Scene(twist, rows={0x6071: 3000}), 4000, 100),
     0x23C6: (Scene(twist, rows={0x6071: 3000}), 0, 32_000),
     0x23C7: (Scene(hold, rows=FREE), 0, 2**22),
     0x2500: (Scene(twist, rows={0x6071: 3000}), 500, 1000),
@@ -175,25 +175,19 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x6086: (Scene(go), 0, 1),
     0x60FF: (Scene(turn), 100 * RPM, 200 * RPM),
 }  # fmt: skip
+# Of the maker's registers.
+REGISTERS = (
+    0x2106, 0x2108, *range(0x210A, 0x210F), *range(0x230A, 0x230F), 0x2B00, 0x2B02, 0x2505, 0x2507, 0x2508,
+    0x2702, 0x2703, 0x2902, 0x2903, 0x3900, 0x3901, 0x3907, 0x3908, 0x390A, 0x390B, 0x390C,
+)  # fmt: skip
 # Objects whose effect other tests find.
 ELSEWHERE = {
-    **{
-        (index, 0): "test_tgz_registers.py"
-        for index in (
-            0x2106,
-            0x2108,
-            *range(0x210A, 0x210F),
-            0x230A,
-            0x230B,
-            0x230C,
-            0x230D,
-            0x230E,
-            0x2B00,
-            0x2B02,
-        )
-    },
+    **{(index, 0): "test_tgz_registers.py" for index in REGISTERS},
     **{(index, 0): "texts, kept and shown" for index in (*range(0x2100, 0x2106), *range(0x2300, 0x2303))},
-    **{(index, 0): "what it is of is not emulated: kept and shown" for index in (0x200C, 0x200F, 0x2011, 0x2B03)},
+    **{
+        (index, 0): "what it is of is not emulated: kept and shown"
+        for index in (0x200C, 0x200F, 0x2011, 0x2509, 0x2B03)
+    },
     (0x2B04, 0): "its maker uses it for nothing",
     (0x25C0, 0): "test_tgz.py: images with which a drive begins",
     (0x25C1, 0): "the same",

@@ -13,6 +13,7 @@ from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 from drive_env.devices import find_device
+from drive_env.drives.currents import read_current_limit, write_current_limit
 from drive_env.firmware.record import get_lanes, set_lanes
 
 DEVICE = find_device("tgz_d")
@@ -271,6 +272,135 @@ def test_d_delayenable_hwen_is_from_the_inputs_edge_to_enabling(drives):
     assert not enabled(drives) and field(drives, "stage_on")[0] == 0.0
     drives.advance(0.06)
     assert enabled(drives) and field(drives, "stage_on")[0] == 1.0
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("name", "other", "way"), [("C-LimP", "C-LimN", 1.0), ("C-LimN", "C-LimP", -1.0)])
+def test_c_limn_and_c_limp_limit_one_sign_each_to_parts_of_m_inull(drives, name, other, way):
+    """R's example: 3000 thousandths of 2000 mA are 6000 mA; here 500 of 2000, 1000 mA."""
+    drives.write("M-Inull", 2000)
+    drives.write(name, 500)
+    drives.write(other, 2000)
+    drives.machine.brake = "closed"
+    motion.enable(drives, mode="cst")
+    for sign, most in ((way, 1.0), (-way, 3.0)):
+        drives.write(cia402.TARGET_TORQUE, f"{sign * 3.0} A")
+        drives.advance(0.02)
+        assert field(drives, "i_q")[0] == pytest.approx(sign * most, abs=0.02)
+    motion.disable(drives)
+    drives.write("V-K", 60_000)
+    for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION):
+        drives.write(ramp, "1000000 rpm/s")
+    motion.enable(drives, mode="pv")  # the velocity controller's output, too
+    for sign, most in ((way, 1.0), (-way, 4.0)):
+        drives.write(cia402.TARGET_VELOCITY, f"{sign * 3000} rpm")
+        drives.advance(0.04)
+        assert field(drives, "i_q")[0] == pytest.approx(sign * most, abs=0.05)
+
+
+def test_the_current_limit_in_amperes_is_both_of_them(drives):
+    drives.write("M-Inull", 2000)
+    write_current_limit(drives, 3.0)
+    assert (drives.read("C-LimN")[0], drives.read("C-LimP")[0]) == (1500, 1500)
+    assert read_current_limit(drives)[0] == pytest.approx(3.0)
+    drives.write("C-LimN", 1000)
+    assert read_current_limit(drives)[0] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("name", "way"), [("C-VoltLimMax", 1.0), ("C-VoltLimMin", -1.0)])
+def test_c_voltlim_limits_one_sign_of_the_voltage(drives, name, way):
+    """The speed at which the back-EMF takes all of it: half the voltage, half the speed; the other way is free."""
+    drives.write(name, 10)
+    motion.enable(drives, mode="cst")
+    seen = []
+    for sign in (way, -way):
+        drives.write(cia402.TARGET_TORQUE, f"{sign * 1.0} A")
+        drives.advance(0.6)
+        seen.append(abs(drives.machine.rotor_speed[0]))
+        assert errors(drives) <= {OVER_SPEED}
+        if errors(drives):
+            break
+    # 1/sqrt(3) of the link, 10 % of it, over the flux linkage of the pole pairs, less R i.
+    flux = field(drives, "psi_m")[0] * field(drives, "n_p")[0]
+    least = 0.1 / math.sqrt(3.0) * field(drives, "u_dc")[0] / flux
+    assert 0.7 * least < seen[0] < 1.01 * least
+    assert seen[1] > 2.0 * least or OVER_SPEED in errors(drives)
+
+
+@pytest.mark.parametrize(("name", "way"), [("V-LimP", 1.0), ("V-LimN", -1.0)])
+def test_v_lim_limits_what_the_position_controller_asks_for(drives, name, way):
+    drives.write(name, 120)
+    drives.write(cia402.FOLLOWING_WINDOW, 0)
+    drives.write(cia402.PROFILE_VELOCITY, "3000 rpm")
+    motion.enable(drives, mode="pp")
+    for sign, free in ((way, False), (-way, True)):
+        motion.start_move(drives, int(sign * 5 * 2**20))
+        drives.advance(0.2)
+        speed = sign * drives.machine.rotor_speed[0] / RPM
+        assert speed > 300.0 if free else speed == pytest.approx(120.0, abs=3.0)
+
+
+@pytest.mark.parametrize(("angle", "turns"), [(2**31, 0), (0, 1)])
+def test_p_max_error_is_error_15_at_once(drives, angle, turns):
+    drives.write("P-MaxAngleError", angle)
+    drives.write("P-MaxRevolError", turns)
+    drives.write(cia402.FOLLOWING_WINDOW, 0)
+    drives.write("P-K", 1000)  # 1/s: far behind
+    motion.enable(drives, mode="csp")
+    limit = turns + angle / TURN
+    path = np.rint(np.linspace(0.0, 1.5 * limit, 300) * 2**20).astype(int)
+    trace = drives.record(["aDriveError", 0x33C9], 0.3, {cia402.TARGET_POSITION: path})
+    came = int(np.argmax(trace["aDriveError"][:, 0] >> 15 & 1))
+    assert came > 0
+    assert trace[0x33C9][came - 2, 0] / TURN == pytest.approx(limit, rel=0.02)
+
+
+# --- the profile generator --------------------------------------------------------------------------------------------
+def test_acc_dec_and_posspeed_are_those_of_moves(drives):
+    """A trapezoid by closed form: 4 revolutions with 20 rev/s^2 up, 40 down, 5 rev/s."""
+    drives.write("PG BitsPerRevol", 20)
+    for name, value in (("PG Acc", 20), ("PG Dec", 40), ("PG PosSpeed", 5)):
+        drives.write(name, value * 2**20)
+    motion.enable(drives, mode="pp")
+    motion.start_move(drives, 4 * 2**20)
+    trace = drives.record(["PG ASpeed", "PG APosRevol", "PG APosAngle", "PG Rdy"], 1.5)
+    speed = trace["PG ASpeed"][:, 0] / 2**20
+    way = trace["PG APosRevol"][:, 0] + trace["PG APosAngle"][:, 0] / TURN
+    assert speed.max() == pytest.approx(5.0, rel=1e-3)
+    assert np.argmax(speed > 4.999) == pytest.approx(250, abs=2)  # ms, 5 / 20
+    duration = 5 / 20 + 5 / 40 + (4 - 25 / 40 - 25 / 80) / 5
+    assert np.argmax(way >= 4.0 - 1e-9) == pytest.approx(1e3 * duration, abs=3)
+    assert trace["PG Rdy"][-1, 0] == 1 and trace["PG Rdy"][300, 0] == 0
+    assert drives.machine.rotor_angle[0] / (2.0 * math.pi) == pytest.approx(4.0, abs=0.01)
+
+
+def test_speed_is_that_of_the_velocity_profile_and_a_unit_changes_its_meaning(drives):
+    motion.enable(drives, mode="pv")
+    drives.write("PG BitsPerRevol", 16)
+    drives.write("PG Speed", -5 * 2**16)
+    drives.advance(0.6)
+    assert drives.machine.rotor_speed[0] / (2.0 * math.pi) == pytest.approx(-5.0, rel=0.02)
+    drives.write("PG BitsPerRevol", 15)  # the register keeps its number
+    assert drives.read("PG Speed")[0] == -5 * 2**16
+    drives.advance(0.6)
+    assert drives.machine.rotor_speed[0] / (2.0 * math.pi) == pytest.approx(-10.0, rel=0.02)
+
+
+def test_the_standards_objects_and_the_generators_are_two_views_of_one_value(drives):
+    drives.write(cia402.PROFILE_VELOCITY, "600 rpm")
+    assert drives.read("PG PosSpeed")[0] == 10 * 2**16
+    drives.write("PG Acc", 100 * 2**16)
+    assert drives.read(cia402.PROFILE_ACCELERATION)[0] == 6_000_000  # 1/1000 rpm/s, as commissioned
+    for kind, profile in ((0, -1), (1, -2), (2, -3), (3, 0), (4, 1)):
+        drives.write("PG Type", kind)
+        assert drives.read(0x6086)[0] == profile
+        drives.write(0x6086, 0)
+        drives.write(0x6086, profile)
+        assert drives.read("PG Type")[0] == kind
+    before = drives.read(cia402.PROFILE_VELOCITY)[0]
+    drives.machine.power_cycle()
+    assert drives.read(cia402.PROFILE_VELOCITY)[0] != before, "what was commissioned is back, and no default of PG"
+    assert drives.read("PG PosSpeed")[0] > 0
 
 
 # --- readings ---------------------------------------------------------------------------------------------------------

@@ -110,6 +110,14 @@ def _servo(device: Device, motor: Motor) -> dict[str, float]:
         "hall_direction": motor.hall_direction,
         "current_ma": max(round(current * 10.0) * 100, 1),
         "rated_rms_ma": max(round(1e3 * motor.rated_current / math.sqrt(2.0)), 1),
+        # Rounded up, so that the peak current limits alone.
+        "peak_over_rated_permille": math.ceil(
+            1e6
+            * math.sqrt(2.0)
+            * max(round(current * 10.0), 1)
+            / 10.0
+            / max(round(1e3 * motor.rated_current / math.sqrt(2.0)), 1)
+        ),
         "rated_rpm": max(motor.rated_speed * RPM, 1.0),
         "thermal_time_s": motor.thermal_time,
         **dict(zip(device.gains.names, gains.tolist(), strict=True)),

@@ -2,7 +2,7 @@
 
 A device's table `parts` has them: `of`, the object, or one for each axis of the node; `axis`, whose; `shift` and
 `bits`, which part of it: bits from `shift` on, taken as a signed number with `signed`; or a `share` of its number, the
-first over the second.
+first over the second; or another number for each of its own, by `table`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ class Part(NamedTuple):
         shift: Lowest of its bits.
         bits: How many of them.
         signed: Whether their highest one is a sign.
+        table: Pairs of a number of the whole and what is shown for it, instead of bits.
         share: Numerator and divisor of what is shown of the whole number instead; (0, 1) shows bits.
     """
 
@@ -31,6 +32,7 @@ class Part(NamedTuple):
     bits: int = 32
     signed: bool = False
     share: tuple[int, int] = (0, 1)
+    table: tuple[tuple[int, int], ...] = ()
 
     def source(self, axis: int) -> Key:
         """Return the object that an axis of the node shows a part of."""
@@ -38,6 +40,8 @@ class Part(NamedTuple):
 
     def shown(self, raw: Any) -> Any:
         """Return the part of integers of the object."""
+        if self.table:
+            return sum((raw == whole) * shown for whole, shown in self.table)
         numerator, divisor = self.share
         if numerator:
             return raw * numerator // divisor
@@ -46,6 +50,8 @@ class Part(NamedTuple):
 
     def put(self, raw: Any, part: Any) -> Any:
         """Return integers of the object with another part."""
+        if self.table:
+            return sum((part == shown) * whole for whole, shown in self.table)
         mask = ((1 << self.bits) - 1) << self.shift
         return (raw & ~mask) | ((part << self.shift) & mask)
 

@@ -186,7 +186,13 @@ MANUALS = (
         # Its registers lie 100h apart as 3325h and 3425h do, but for what the module has once.
         areas=(
             *((0x2100 + 0x200 * k, 0x210F + 0x200 * k, 0x100) for k in (0, 2, 3, 4)),
-            *((0x2300, 0x230C, 0x100), (0x230F, 0x23FF, 0x100), (0x2B00, 0x2B02, 0x100), (0x2B04, 0x2B0F, 0x100)),
+            *(
+                (0x2300, 0x230C, 0x100),
+                (0x230F, 0x23FF, 0x100),
+                (0x3900, 0x390F, 0x100),
+                (0x2B00, 0x2B02, 0x100),
+                (0x2B04, 0x2B0F, 0x100),
+            ),
             *((0x3301, 0x3328, 0x100), (0x332B, 0x333D, 0x100), (0x333F, 0x333F, 0x100), (0x3341, 0x33FF, 0x100)),
             PROFILE_AREA,
         ),
@@ -203,7 +209,9 @@ MANUALS = (
         groups={1: ("communication", "profile", "motor 0", "motor 1", "module")},
         shared=frozenset((0x60FE, 0x68FE, 0x60FD, 0x68FD)),
         refuses=frozenset((0x1C12, 0x1C13, 0x1C32, 0x1C33)),  # CoE
-        commands=frozenset((0x4001, 0x23C6, 0x23C7, 0x24C6, 0x24C7)),
+        commands=frozenset(
+            (0x4001, *(index + step for index in (0x23C6, 0x23C7, 0x3908, 0x390A) for step in (0, 0x100)))
+        ),
         stores_mapped=True,  # every parameter is mappable by the table of objects
     ),
     Manual(

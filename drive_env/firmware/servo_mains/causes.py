@@ -49,7 +49,7 @@ def watch_motion(drive, lane, dt):
     # The mean of the period: of a current that oscillates faster, single values are whatever moment they are of.
     asked = drive.asked_mean[lane]
     drive.asked_mean[lane] = 0.0
-    most = REVERSE_SHARE * drive.i_max[lane] * drive.current_share[lane]
+    most = REVERSE_SHARE * (drive.i_high[lane] if asked > 0.0 else -drive.i_low[lane])
     omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
     # It gains speed against the current. One that oscillates has it against the current, too, and loses it then.
     gained = omega - drive.omega_before[lane]
@@ -135,7 +135,11 @@ def over_speed(drive, lane, told):
 
 @stage
 def contouring(drive, lane, told):
-    """Return whether the axis has been farther from its demand than 6065h for longer than 6066h."""
+    """Return whether the axis is farther from its demand than P-Max..., or than 6065h for longer than 6066h."""
+    most = drive.error_turns[lane] + drive.error_angle[lane]
+    by_position = drive.drive_function[lane] > 0.0 and drive.loop_level[lane] == 2.0
+    if by_position and 0.0 < most < abs(drive.position_demand[lane] - drive.theta_meas[lane]):
+        return True
     # Whole milliseconds; half a period keeps the sum's rounding out.
     return drive.following_time[lane] > drive.following_error_time[lane] + 5e-4
 

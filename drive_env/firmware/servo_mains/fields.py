@@ -3,7 +3,7 @@
 Names that a device binds, or a test reads:
 
 - peak_current: M-Ipeak [A]: what 32767 of every torque object is, which are currents in the record
-- i_max: limit of the current of its own [A], beside M-Ipeak
+- i_low, i_high: what C-LimN, C-LimP, M-Ipeak and the image leave of the current [A]; i_max is the greater of them
 - target_torque: 6071h [A]: set-point of cst and pt, feed-forward in csp and ip, with torque_offset (loops.py)
 - image_limit: current limit of the process images, raw: 0 none, 32767 no current at all
 - velocity_ratio: 6094h: rpm of a velocity unit; only units read it
@@ -47,8 +47,15 @@ PARAMETERS = (
     Field("current_integration", "f8", "s", "C-Ti: integration time of the current regulators; 0: no integrator"),
     Field("velocity_integration", "f8", "s", "V-Ti: integration time of the velocity regulator; 0: no integrator"),
     Field("feed_forward", "f8", "1", "P-SFF: share of the velocity demand that the position loop adds to its output"),
+    Field("limit_negative", "f8", "1", "C-LimN: limit of negative currents, as amplitudes in units of M-Inull"),
+    Field("limit_positive", "f8", "1", "C-LimP: the same of positive ones"),
+    Field("speed_low", "f8", "rad/s", "V-LimN: limit of negative speeds that the position loop asks for", 1e9),
+    Field("speed_high", "f8", "rad/s", "V-LimP: the same of positive ones", 1e9),
+    Field("error_angle", "f8", "rad", "P-MaxAngleError"),
+    Field("error_turns", "f8", "rad", "P-MaxRevolError"),
     Field("image_limit", "f8", "1/32767", "share of M-Ipeak that is taken away: 0 none, 32767 all"),
     Field("velocity_ratio", "f8", "rpm", "6094h: of a velocity unit", 1.0),
+    Field("profile_bits", "f8", "", "BitsPerRevol: only units read it", 16.0),
     Field("d_mode", "i4", "", "2303h, 2403h"),
     Field("following_error_time", "f8", "s", "6066h: for which the error may be outside of 6065h"),
     Field("negative_switch_mask", "i4", "", "inputs that are the negative limit switch; 0: there is none"),
@@ -72,6 +79,8 @@ PARAMETERS = (
 STATE = (
     *servo.STATE,
     *mains_link.STATE,
+    Field("i_low", "f8", "A", "least current that may be asked for"),
+    Field("i_high", "f8", "A", "greatest current that may be asked for"),
     Field("torque_feed_forward", "f8", "A", "what csp and ip add to the set-point of the current"),
     Field("disconnected", "i4", "", "1: the D-Mode does not fit, the master is ignored"),
     Field("following_time", "f8", "s", "for which the following error has been outside of its window"),
