@@ -188,6 +188,7 @@ ELSEWHERE = {
         (index, 0): "what it is of is not emulated: kept and shown"
         for index in (0x200C, 0x200F, 0x2011, 0x2509, 0x2B03)
     },
+    (0x200D, 0): "test_tgz.py: node-ID; test_ethercat_tgz.py: alias",
     (0x2B04, 0): "its maker uses it for nothing",
     (0x25C0, 0): "test_tgz.py: images with which a drive begins",
     (0x25C1, 0): "the same",

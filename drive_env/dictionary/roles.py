@@ -27,6 +27,8 @@ class Role(Enum):
     VELOCITY_DIVISOR = "rpm of a velocity unit: divisor"
     PEAK_CURRENT = "peak current of the motor, whose parts torques are"
     PROFILE_BITS = "increments of a revolution of the profile generator, as a power of two"
+    SYNC_TIME = "measured time between two pulses of SYNC0"
+    PACKET_TIME = "measured time between two packets of process data"
     MODE_GATE = "mode of the drive that a mode of operation needs"
     OUTPUT_IMAGE = "process image into the drive that it begins with"
     INPUT_IMAGE = "process image out of the drive that it begins with"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,12 @@ def peak_current(drives: BasicDrives) -> Floats:
     return np.asarray(drives.read(Role.PEAK_CURRENT), float) * MILLIAMPERE
 
 
+def highest_current(drives: Drives) -> Floats | float:
+    """Return the current that no limit lets pass [A], one or (num_axes,): the motor's peak current, if it is known."""
+    per_count = ampere_per_count(drives)
+    return math.inf if isinstance(per_count, float) else per_count * _WHOLE
+
+
 def to_counts(drives: Drives, current: Any) -> Integers:
     """Return currents [A], axes last, as counts of 6071h."""
     return np.asarray(np.rint(counts_per_ampere(drives) * np.asarray(current, float)), np.int64)
@@ -67,9 +74,9 @@ def current_limit_roles(drives: Drives) -> tuple[Role, ...]:
 
 
 def read_current_limit(drives: Drives) -> Floats:
-    """Return the current limit of every axis [A], shape (num_axes,); of two signs the lower one."""
+    """Return the current limit of every axis [A], shape (num_axes,): the least of both signs and the peak current."""
     raw = np.min([drives.read(role) for role in current_limit_roles(drives)], axis=0)
-    return np.asarray(raw * ampere_per_limit(drives), float)
+    return np.asarray(np.minimum(raw * ampere_per_limit(drives), highest_current(drives)), float)
 
 
 def write_current_limit(drives: Drives, current: ArrayLike, where: Mask | None = None) -> None:

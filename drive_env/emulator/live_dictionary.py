@@ -491,6 +491,8 @@ class LiveDictionary:
 
     def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
+        if key in self.device.kept_bits:
+            raw = raw & self.device.kept_bits[key]
         before = self._values.get(key)
         if key in self.device.shared_values:
             node = np.arange(self.num_axes) // self.device.num_axes

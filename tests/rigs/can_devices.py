@@ -96,6 +96,7 @@ class Manual(NamedTuple):
         hot: Temperature [degC] of a stage that the drive ends in fault.
         hot_told: The emergencies of it: code, error register, additional bytes ("axis": the motor's number).
         further_axis: Bit of 1001h of axes other than the first.
+        refused: 1001h while process data are not taken.
         lost: Emergencies of a lost heartbeat: code, and additional bytes; one of each axis where they name it.
         stopped: The same of a node that is stopped (NMT) while an axis is enabled.
         before_mode: What must be written for a mode: index, step to the next axis, raw value by mode, bytes.
@@ -128,6 +129,7 @@ class Manual(NamedTuple):
     refuses: frozenset[int] = frozenset()
     commands: frozenset[int] = frozenset()
     stores_mapped: bool = False
+    refused: int = 0x21
 
 
 STOPS = {0: "STOPPED", 1: "OPERATIONAL", 2: "STOPPED"}  # manual of the TMCM-1636, table 41
@@ -213,6 +215,7 @@ MANUALS = (
             (0x4001, *(index + step for index in (0x23C6, 0x23C7, 0x3908, 0x390A) for step in (0, 0x100)))
         ),
         stores_mapped=True,  # every parameter is mappable by the table of objects
+        refused=0x01,  # error register: bit 5 is not used
     ),
     Manual(
         "tmcm3313",
