@@ -161,7 +161,7 @@ def test_the_register_has_the_bits_of_all_errors_and_reset_communication_forgets
     wire.start()
     wire.play(f"""
         rx {RPDO_ID:03X}  00 00 02
-        tx 085  20 63 21 00 FF 00 00 00
+        tx 085  20 63 {facts.manual.refused:02X} 00 FF 00 00 00
         rx {RPDO_ID:03X}  00
         tx 085  10 82 11 00 FF 00 00 00   # the PDO's error is another one now
         rx 000  82 05

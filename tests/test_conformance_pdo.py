@@ -157,7 +157,7 @@ def test_a_mode_that_an_axis_has_not_is_told_and_nothing_of_the_frame_taken(wire
     wire.start()
     wire.play(f"""
         rx {FREE_ID:03X}  06 00 02        # vl
-        tx 085  20 63 21 00 FF 00 00 00
+        tx 085  20 63 {facts.manual.refused:02X} 00 FF 00 00 00
         wait 1 ms
         rx {FREE_ID:03X}  00 00 00
         wait 1 ms

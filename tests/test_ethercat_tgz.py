@@ -15,7 +15,7 @@ from rigs.tgz_images import SIZES, select, structure
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
 from drive_env.drives.limits import Limits
-from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.ethercat.application import AlState, AlStatusCode, ClockSetting
 from drive_env.ethercat.esi import esi_text
 from drive_env.ethercat.sii_content import sii_content
 from drive_env.firmware.record import set_lanes
@@ -150,7 +150,7 @@ def test_eeprom_and_esi_have_the_factorys_image_first_and_the_others_to_choose()
     parts = categories(sii_content(device))
     assert [row[:2] for row in pdos(parts[51])] == [(0x1701, 2), (0x1702, 0xFF), (0x1703, 0xFF), (0x1721, 0xFF)]
     assert [row[:2] for row in pdos(parts[50])] == [(0x1B01, 3), (0x1B21, 0xFF)]
-    assert [struct.unpack_from("<HH", parts[41], 8 * k) for k in (2, 3)] == [(0x1200, 40), (0x1300, 40)]
+    assert [struct.unpack_from("<HH", parts[41], 8 * k) for k in (2, 3)] == [(0x1000, 40), (0x1400, 40)]
     root = ET.fromstring(esi_text(device)).find("Descriptions/Devices/Device")
     for tag, manager, category in (("RxPdo", "2", 51), ("TxPdo", "3", 50)):
         rows = root.findall(tag)
@@ -163,6 +163,54 @@ def test_eeprom_and_esi_have_the_factorys_image_first_and_the_others_to_choose()
         assert bits == [[(index, size) for index, _, size in one[2]] for one in pdos(parts[category])]
     assert root.find("Mailbox/CoE").get("PdoConfig") == "0"
     assert not parts[30][5] & 0x08, "no configuration of PDOs"
+
+
+# --- the slave, as its maker's page has it ----------------------------------------------------------------------------
+def test_there_is_no_bootstrap(rig):
+    rig.request(1)
+    assert rig.request(3) == (0x11, 0x0013)
+
+
+def test_an_identification_request_is_answered_by_c_id_which_is_the_alias_too(rig):
+    """From the next power-on on: AL status bit 5, and the number in place of a code; word 4 of the EEPROM, 0012h."""
+    assert rig.value(0x0012) == 1
+    assert rig.download(0x200D, 0, struct.pack("<I", 0)) == 0x06090032, "never 0"
+    assert rig.download(0x200D, 0, struct.pack("<I", 77)) == 0
+    assert rig.download(0x1010, 1, b"save") == 0
+    rig.world.power_on()
+    rig.address()
+    assert rig.value(0x0012) == 77
+    assert struct.unpack_from("<H", rig.node.read_sii(), 8) == (77,)
+    rig.bring_to(AlState.PRE_OP)
+    assert rig.request(0x22) == (0x22, 77)
+    assert rig.request(2) == (2, 0)
+    assert rig.request(0x28) == (0x12, 0x0011), "an error goes before"
+
+
+@pytest.mark.parametrize(
+    ("cycle", "taken"), [(250, True), (500, True), (1000, True), (2000, True), (750, False), (4000, False)]
+)
+def test_sync0_has_one_of_four_cycles(rig, cycle, taken):
+    assert rig.node.request_state(AlState.PRE_OP, AlState.SAFE_OP, [], ClockSetting(True, cycle * 1e-6), 0.0) == (
+        0 if taken else 0x0035
+    )
+    code = rig.download(0x1C32, 2, struct.pack("<I", 1000 * cycle))
+    assert code == (0 if taken else 0x06090030)
+
+
+def test_the_times_of_packets_are_measured(rig):
+    to_op(rig, 0x1701, 0x1B01)
+    assert value(rig, "3340", 4) == 0
+    for _ in range(3):
+        rig.exchange_image(bytes(40), 40)
+    assert value(rig, "3340", 4) == 1000  # us: a cycle passes with each frame
+
+
+def test_esi_and_eeprom_of_both_variants_are_the_same():
+    """M: both versions use the same description files."""
+    assert esi_text(find_device("tgz_d")) == esi_text(find_device("tgz_s"))
+    assert sii_content(find_device("tgz_d")) == sii_content(find_device("tgz_s"))
+    assert "FoE" not in esi_text(find_device("tgz_d"))
 
 
 # --- a master ---------------------------------------------------------------------------------------------------------
@@ -208,7 +256,7 @@ def test_a_master_takes_the_image_that_has_what_is_played_and_puts_the_factorys_
         assert (slave.output_size, slave.input_size) == (40, 40)
 
 
-TURN, TURN_INSIDE = 65_536, 2**28
+TURN, TURN_INSIDE = 2**20, 2**32
 NATIVE = {0x23C7: np.zeros((2, 2), int)}  # what is played before enabling selects the native image
 
 
@@ -231,24 +279,24 @@ def test_a_target_beyond_the_limits_is_refused_by_whatever_object_and_in_whateve
     for mode in ("csp", "ip"):
         motion.enable(drives, mode=mode)
         for name, turn in ((0x607A, TURN), ((0x60C1, 1), TURN), (0x23C7, TURN_INSIDE)):
-            with pytest.raises(SafetyError, match="beyond the limits -131072 to 131072; nothing was sent"):
+            with pytest.raises(SafetyError, match="beyond the limits -2097152 to 2097152; nothing was sent"):
                 drives.write(name, 3 * turn)
-        with pytest.raises(SafetyError, match=r"would lead to 13\d+, .*; nothing was sent"):
+        with pytest.raises(SafetyError, match=r"would lead to 21\d+, .*; nothing was sent"):
             drives.record([0x33C0, 0x6077], 0.1, {0x23C7: np.stack([ramp * TURN_INSIDE] * 2, axis=1).astype(int)})
         motion.disable(drives)
     assert np.abs(inside.machine.rotor_angle).max() < 0.1
 
 
 def test_a_target_of_64_bits_is_held_against_the_limits_by_all_of_them(within_two_turns):
-    """65,536 turns from zero 6064h shows 0, too: the target beside the axis is allowed, the one at zero is far away."""
+    """4,096 turns from zero 6064h shows 0, too: the target beside the axis is allowed, the one at zero is far away."""
     drives, inside = within_two_turns
-    set_lanes(inside.inside.records, "home_shift", np.full(2, -2.0 * np.pi * 65_536))
+    set_lanes(inside.inside.records, "home_shift", np.full(2, -2.0 * np.pi * 4096))
     drives.advance(0.01)
-    assert drives.read(0x6064) == pytest.approx(0, abs=50)
-    assert drives.read(0x33C0) == pytest.approx(2**44, abs=50 * 4096)
+    assert drives.read(0x6064) == pytest.approx(0, abs=800)
+    assert drives.read(0x33C0) == pytest.approx(2**44, abs=800 * 4096)
     motion.enable(drives, mode="csp")
     drives.write(0x23C7, 2**44 + TURN_INSIDE // 100)
-    with pytest.raises(SafetyError, match="would lead to -4294966641, beyond the limits"):
+    with pytest.raises(SafetyError, match="would lead to -4294956810, beyond the limits"):
         drives.write(0x23C7, TURN_INSIDE // 100)
 
 

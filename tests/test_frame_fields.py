@@ -382,9 +382,10 @@ def test_outputs_on_ethercat_are_refused_field_by_field_and_told_once():
     bus.take_image(0x1702)
     bus.turn(CSV)
     for limit in range(100):
-        bus.send({(TARGET_TORQUE, 0): -32768, (LIMIT + 0x100, 0): limit, (DIGITAL_OUTPUTS, 1): limit})
+        outputs = limit << 16
+        bus.send({(TARGET_TORQUE, 0): -32768, (LIMIT + 0x100, 0): limit, (DIGITAL_OUTPUTS, 1): outputs})
         found = [bus.port(key).read() for key in ((TARGET_TORQUE, 0), (LIMIT + 0x100, 0), (DIGITAL_OUTPUTS, 1))]
-        assert found == [0, limit, limit]
+        assert found == [0, limit, outputs]
     assert [data[:2] for data in bus.told] == [NOT_ACCEPTED]
     assert bus.plant.are_enabled
 

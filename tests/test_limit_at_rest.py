@@ -17,6 +17,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.commands.cli import app
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, read_current_limit
 from drive_env.drives.limit_at_rest import HELD, LimitAtRest
 
 LOOK = 0.05  # s
@@ -42,9 +43,10 @@ def test_an_encoder_that_is_stuck_is_told_though_the_drive_reports_no_fault(devi
     """On a TMCM-1636 it is 7.0 A of 7.0 A for ever, with a statusword of 0237h."""
     with EmulatedDrives(device, load="inertia", num_threads=1) as drives:
         drives.machine.fault("encoder_stuck")
-        set_off(drives)
+        set_off(drives, round(0.3 * drives.read(Role.POSITION_SCALE)[0]))
         when = told(drives, LimitAtRest(drives), 2.0)
-        status, current, _, limit = map(drives.read, READ)
+        status, current = map(drives.read, READ[:2])
+        current, limit = current * ampere_per_count(drives), read_current_limit(drives)
         assert cia402.matches(status, cia402.OPERATION_ENABLED).all()
         assert not cia402.matches(status, cia402.FAULT_BIT).any()
         assert current / limit == pytest.approx(1.0, abs=0.02)

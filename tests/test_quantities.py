@@ -42,7 +42,7 @@ def entry(unit, low=-(2**31), high=2**31 - 1):
         ("mA", "current", 0.001), ("V", "voltage", 1.0), ("0.1V", "voltage", 0.1), ("s", "time", 1.0),
         ("ms", "time", 0.001), ("10ms", "time", 0.01), ("100us", "time", 0.0001), ("us", "time", 1e-6),
         ("512 clocks", "time", 32e-6),  # of 16 MHz
-        ("inc 64", "angle", 2**-28),
+        ("1/2^32 rev", "angle", 2**-32),
     ],
 )  # fmt: skip
 def test_every_unit_is_so_much_of_its_dimensions_own(unit, dimension, value):
@@ -158,9 +158,9 @@ def test_what_has_a_scale_of_its_own_is_shown_with_it():
     ({}, {}, [None, None]), ({(0x608F, 1): (4096, 0)}, {}, [4096.0, None]),
     ({(0x2058, 0): (65536, 1)}, {Role.POSITION_SCALE: (0x2058, 0)}, [65536.0, 1.0]),
     (
-        {(0x6094, 1): (1, 7), (0x6094, 2): (1000, 2), (0x23C3, 0): (4000, 8000)},
+        {(0x6094, 1): (1, 7), (0x6094, 2): (1000, 2), (0x2107, 0): (4000, 8000)},
         {
-            Role.VELOCITY_NUMERATOR: (0x6094, 1), Role.VELOCITY_DIVISOR: (0x6094, 2), Role.PEAK_CURRENT: (0x23C3, 0)
+            Role.VELOCITY_NUMERATOR: (0x6094, 1), Role.VELOCITY_DIVISOR: (0x6094, 2), Role.PEAK_CURRENT: (0x2107, 0)
         },
         [(None, 0.001, 4.0), (None, 3.5, 8.0)],
     ),

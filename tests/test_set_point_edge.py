@@ -94,10 +94,10 @@ def test_a_move_begins_whatever_was_left_of_bit_4(device, before):
         motion.enable(drives, mode="pp")
         before(drives)
         start = drives.machine.rotor_angle.copy()
-        motion.move_to(drives, drives.read(0x6064) + WAY)
+        scale = drives.read(Role.POSITION_SCALE)
+        motion.move_to(drives, drives.read(0x6064) + np.rint(0.3 * scale).astype(int))
         drives.advance(0.2)
-        turn = 2.0 * np.pi / drives.read(Role.POSITION_SCALE)
-        np.testing.assert_allclose(drives.machine.rotor_angle - start, WAY * turn, rtol=0.02)
+        np.testing.assert_allclose(drives.machine.rotor_angle - start, 0.6 * np.pi, rtol=0.02)
 
 
 def test_a_home_without_a_method_enables_nothing(drives):

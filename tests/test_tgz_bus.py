@@ -22,9 +22,7 @@ from rigs.fault_injection import (
     DEAD_MASTER,
     EXPECTED,
     KINDS,
-    LIMITS,
-    RADIANS,
-    TURN,
+    SILENCE,
     FaultyBus,
     ObservedWorld,
     Truth,
@@ -49,6 +47,7 @@ from drive_env.commands.options import default_samples
 from drive_env.commands.scope import DEFAULT
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
+from drive_env.drives.limits import Limits
 from drive_env.firmware.record import set_lanes
 from drive_env.master.can.port import open_bus
 
@@ -57,6 +56,9 @@ RPM = 1000  # velocity units, as a drive is commissioned
 SPEED = 90 * RPM
 RAD_PER_S = SPEED / RPM * 2.0 * np.pi / 60.0
 D_MODE, PV_D_MODE, PP_D_MODE, WRONG = 0x2303, 6, 7, 0
+TURN = 2**20  # increments
+RADIANS = 2.0 * np.pi / TURN
+LIMITS = Limits(position=(-3 * TURN, 3 * TURN), silence=SILENCE)
 WATCHED = [0x6041, 0x6062, 0x6064, 0x606C, 0x6077]
 
 
@@ -215,8 +217,8 @@ def test_an_axis_that_turns_is_enabled_again_when_its_d_mode_follows_late(inside
         assert cia402.matches(drives.read(0x6041), cia402.OPERATION_ENABLED).all()
         drives.advance(0.3)
         before = drives.read(0x6064)
-        motion.move_to(drives, [1000, -1000], relative=True)
-        assert np.abs(drives.read(0x6064) - before - [1000, -1000]).max() <= 400
+        motion.move_to(drives, [16_000, -16_000], relative=True)
+        assert np.abs(drives.read(0x6064) - before - [16_000, -16_000]).max() <= 6400
 
 
 # --- a D-Mode that does not fit ------------------------------------------------------------------------------------
@@ -260,7 +262,7 @@ def test_an_axis_at_rest_that_is_switched_off_so_is_told_of_as_well(inside):
         with pytest.raises(SafetyError, match="axis 0 has ceased to take commands"):
             drives.advance(0.1)
 
-    assert run_lockstep(inside, session)[2] is None
+    assert run_lockstep(inside, session, limits=LIMITS)[2] is None
 
 
 def close(drives):
@@ -459,8 +461,8 @@ def test_python_canopen_moves_it_in_pp_and_is_ignored_with_another_d_mode(inside
             until(lambda: node.sdo[0x6041].raw & 0x1000, "the acknowledge")
             node.sdo[0x6040].raw = 0x0F
             until(lambda: node.sdo[0x6041].raw & 0x1400 == 0x0400, "target reached")
-            assert abs(node.sdo[0x6064].raw - TURN // 4) <= 400
-            assert abs(world.truth.theta()[-1, 0] / RADIANS - TURN / 4) <= 400
+            assert abs(node.sdo[0x6064].raw - TURN // 4) <= 6400
+            assert abs(world.truth.theta()[-1, 0] / RADIANS - TURN / 4) <= 6400
             node.sdo[D_MODE].raw = WRONG
             until(lambda: node.sdo[0x6041].raw & 0x24F == 0x40, "the drive's own stop")
             node.sdo[0x6040].raw = 0x06
@@ -508,19 +510,19 @@ def sessions(inside):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(inside, kind):
     session = sessions(inside)["taken_over"]
-    _, frames, _ = run_lockstep(inside, session)
+    _, frames, _ = run_lockstep(inside, session, limits=LIMITS)
     chosen = sample(random.Random(kind), frames, 2)
-    assert worst_of([(f"{kind} {k}", run_with(inside, session, kind, k)) for k in chosen]) == ""
+    assert worst_of([(f"{kind} {k}", run_with(inside, session, kind, k, LIMITS)) for k in chosen]) == ""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pp_move", "pv_run", "taken_over"])
 def test_a_fault_at_many_frames_leaves_no_axis_running(inside, name):
     session = sessions(inside)[name]
-    truth, frames, _ = run_lockstep(inside, session)
+    truth, frames, _ = run_lockstep(inside, session, limits=LIMITS)
     assert problems(truth) == []
     outcomes = []
     for k, kind in enumerate(KINDS):
         chosen = range(7 * k, frames, 40 * STRIDE)
-        outcomes += [(f"{kind} {frame}", run_with(inside, session, kind, frame)) for frame in chosen]
+        outcomes += [(f"{kind} {frame}", run_with(inside, session, kind, frame, LIMITS)) for frame in chosen]
     assert worst_of(outcomes) == ""

@@ -101,7 +101,7 @@ def test_v_k_and_v_ti_are_milliamperes_for_1000_rpm_and_the_time_that_doubles_th
 def test_p_k_and_p_sff_leave_a_lag_of_what_is_not_fed_forward():
     """In csp at a steady speed v the axis is v (1 - P-SFF) / P-K behind."""
     speed, count = 600.0 * RPM, 400
-    turn = 65536
+    turn = 2**20
     steps = np.rint(np.arange(count) * 1e-3 * speed / (2.0 * math.pi) * turn).astype(int)
     for share in (0, 500, 1000):
         with new_drives() as drives:

@@ -18,7 +18,7 @@ from drive_env.motors import MOTORS
 
 COUNT = 8
 RADIUS = 0.04 / (2.0 * math.pi)  # m, of a belt of 40 mm a turn
-INC = 65536 / 0.04  # increments per metre
+INC = 2**20 / 0.04  # increments per metre
 LEFT, RIGHT, HOME_LOW, HOME_HIGH = -0.23, 0.23, -0.06, -0.02  # m, mechanics/loads.py
 NEGATIVE_MASK, POSITIVE_MASK, HOME_MASK = 0x23C0, 0x23C1, 0x23C2
 REACHED, ATTAINED, ERROR = 0x0400, 0x1000, 0x2000  # statusword bits 10, 12, 13
@@ -95,8 +95,8 @@ def assert_homed(drives, method, edge, way):
         turn = 2.0 * math.pi
         beyond = way * (INDEX - edge / RADIUS) % turn  # rad from the edge to the next index
         assert (np.minimum(beyond, turn - beyond) > 0.02).all(), "no index lies so near that friction decides"
-        found = drives.machine.rotor_angle - position / 65536 * turn
-        np.testing.assert_allclose(found, edge / RADIUS + way * beyond, rtol=0, atol=2 * INDEX_COUNT + turn / 65536)
+        found = drives.machine.rotor_angle - position / 2**20 * turn
+        np.testing.assert_allclose(found, edge / RADIUS + way * beyond, rtol=0, atol=2 * INDEX_COUNT + turn / 2**20)
         assert (np.abs(position) < 30).all(), "it has come back to the index"
     assert drives.emergencies() == []
 

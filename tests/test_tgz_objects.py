@@ -20,7 +20,7 @@ from drive_env.firmware.record import get_lanes
 from mechanics.loads import find_load
 
 DEVICE = find_device("tgz_d")
-TURN = 65536
+TURN = 2**20
 RPM = 1000  # velocity units, as a drive is commissioned
 SEEN = (0x6041, 0x6061, 0x6062, 0x6064, 0x606B, 0x606C, 0x6077, 0x60F4)
 TRUE = ("theta_m", "omega_m", "i_q", "i_d", "i_q_ref", "stage_on", "u_q")
@@ -125,8 +125,8 @@ HOMING = FREE | {0x6098: 21, (0x6099, 1): 300 * RPM, (0x6099, 2): 60 * RPM, 0x60
 # Object: scene, one value, another.
 ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x2303: (Scene(switch_on), 3, 6),
-    0x23C3: (Scene(twist, rows={0x6071: 3000}), 4000, 8000),
-    0x23C5: (Scene(twist, rows={0x6071: 3000}), 32767, 1000),
+    0x2107: (Scene(twist, rows={0x6071: 3000}), 4000, 8000),
+    0x2506: (Scene(twist, rows={0x6071: 3000}), 4000, 100),
     0x23C6: (Scene(twist, rows={0x6071: 3000}), 0, 32_000),
     0x23C7: (Scene(hold, rows=FREE), 0, 2**22),
     0x2500: (Scene(twist, rows={0x6071: 3000}), 500, 1000),
@@ -136,8 +136,8 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x2701: (Scene(turn), 0, 50_000),
     0x2900: (Scene(follow, rows=FREE), 70_000, 140_000),
     0x2901: (Scene(follow, rows=FREE), 0, 1000),
-    0x23E0: (Scene(twist, rows={0x6071: 3000}), 5, 4),
-    0x23E1: (Scene(turn), 65536, 32768),
+    0x2109: (Scene(twist, rows={0x6071: 3000}), 5, 4),
+    0x2B01: (Scene(turn), 65536, 32768),
     0x23E2: (Scene(turn), 0, 1),
     0x23E3: (Scene(switch_on, rows={0x2303: 3}), 3, 0),
     0x23E4: (Scene(switch_on, rows={0x2303: 3}), 3, 0),
@@ -175,8 +175,21 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x6086: (Scene(go), 0, 1),
     0x60FF: (Scene(turn), 100 * RPM, 200 * RPM),
 }  # fmt: skip
+# Of the maker's registers.
+REGISTERS = (
+    0x2106, 0x2108, *range(0x210A, 0x210F), *range(0x230A, 0x230F), 0x2B00, 0x2B02, 0x2505, 0x2507, 0x2508,
+    0x2702, 0x2703, 0x2902, 0x2903, 0x3900, 0x3901, 0x3907, 0x3908, 0x390A, 0x390B, 0x390C,
+)  # fmt: skip
 # Objects whose effect other tests find.
 ELSEWHERE = {
+    **{(index, 0): "test_tgz_registers.py" for index in REGISTERS},
+    **{(index, 0): "texts, kept and shown" for index in (*range(0x2100, 0x2106), *range(0x2300, 0x2303))},
+    **{
+        (index, 0): "what it is of is not emulated: kept and shown"
+        for index in (0x200C, 0x200F, 0x2011, 0x2509, 0x2B03)
+    },
+    (0x200D, 0): "test_tgz.py: node-ID; test_ethercat_tgz.py: alias",
+    (0x2B04, 0): "its maker uses it for nothing",
     (0x25C0, 0): "test_tgz.py: images with which a drive begins",
     (0x25C1, 0): "the same",
     (0x25C2, 0): "test_tgz.py: the mapped parameters",
@@ -224,7 +237,7 @@ def test_an_object_has_an_effect_on_its_axis_and_on_no_other(name):
     acts_on_one_axis(name, 0)
 
 
-@pytest.mark.parametrize("name", [0x23C3, 0x2700, 0x6094, 0x60FF], ids=hex)
+@pytest.mark.parametrize("name", [0x2107, 0x2700, 0x6094, 0x60FF], ids=hex)
 def test_so_it_is_on_the_second_axis(name):
     acts_on_one_axis((name, 1) if name == 0x6094 else name, 1)
 

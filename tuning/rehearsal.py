@@ -16,7 +16,7 @@ from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count, to_counts
+from drive_env.drives.currents import ampere_per_limit, current_limit_roles, read_current_limit, to_counts
 from drive_env.drives.interface import bus_of
 from drive_env.master.ethercat.image_layout import INPUTS, OUTPUTS
 from drive_env.trials.demand import COMPUTED, is_recorded
@@ -331,8 +331,7 @@ def _envelope(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _limits(target: Target, axis: int) -> Iterator[Check]:
-    ampere = float(np.broadcast_to(ampere_per_count(target.drives), target.num_axes)[axis])
-    amperes, (index, _) = _read(target, Role.CURRENT_LIMIT, axis) * ampere, target.device.roles[Role.CURRENT_LIMIT]
+    amperes, (index, _) = read_current_limit(target.drives)[axis], target.device.roles[Role.CURRENT_LIMIT]
     text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded during identification"
     if amperes <= 0.0:
         yield Check("limits", NO, f"{text}; the drive's limit {index:04X}h is 0 A: set it to the motor's peak current")
@@ -369,6 +368,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     finite = all(np.isfinite(end).all() for end in ends)
     way = f"{round(float(np.min(here + ends[0])))}...{round(float(np.max(here + ends[1])))}" if finite else "any"
     amperes = int(np.max(to_counts(target.drives, target.current)))
+    limit = int(np.max(np.rint(target.current / ampere_per_limit(target.drives))))
     for gain in target.device.gains.rows:
         yield gain.key, f"1...{gain.highest}", f"gain on trial, {gain.title}", True
     yield (cia402.CONTROLWORD, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, reset a fault", False
@@ -382,7 +382,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     yield (cia402.PROFILE_VELOCITY, 0), f"1...{speed}", "speed of the moves", False
     for index in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
-    yield Role.CURRENT_LIMIT, f"up to {amperes}", "current limit during identification", False
+    for role in current_limit_roles(target.drives):
+        yield role, f"up to {limit}", "current limit during identification", False
     yield Role.OPEN_LOOP_CURRENT, f"0...{amperes}", "current of the encoder's check", False
     for role, wrong in FINDINGS.items():
         if role in target.device.roles:

@@ -398,7 +398,8 @@ class Node:
             assert isinstance(raw, int), "bit rate and node-ID are numbers"
             active[role] = raw = by_lss.get(lss_key, raw)
             self._module.set(role, raw)
-            self._module.set(f"active_{role}", raw)
+            if f"active_{role}" in objects:
+                self._module.set(f"active_{role}", raw)
         self._bit_rate, self.node_id = active["bit_rate"], active["node_id"]
         if self._activated_bit_rate is not None:
             self._bit_rate = self._activated_bit_rate

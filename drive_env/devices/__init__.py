@@ -193,6 +193,7 @@ class Device(NamedTuple):
     about: str = ""  # what a reader of its page must know besides its data
     parts: Mapping[tuple[int, int], Part] = MappingProxyType({})  # objects that show a part of another
     shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
+    kept_bits: Mapping[tuple[int, int], int] = MappingProxyType({})  # of a value that is written; others are ignored
     num_outputs: int = 4
     mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
     # What process data above an object's range are taken as, `HIGHEST` or `MASK`; of others the object stays as it was.
@@ -431,6 +432,7 @@ def _device(
         ethercat=ethercat_of(data.get("ethercat")),
         about=data.get("about", "").strip(),
         parts=parts_of({parse_key(text): row for text, row in data.get("parts", {}).items()}, parse_key),
+        kept_bits={parse_key(text): int(mask) for text, mask in data.get("kept_bits", {}).items()},
         shared_values=frozenset(parse_key(text) for text in data.get("shared_values", [])),
         num_outputs=data.get("outputs", 4),
         mode_gate={int(mode): needed for mode, needed in data.get("mode_gate", {}).items()},

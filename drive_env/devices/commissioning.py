@@ -100,6 +100,8 @@ def _servo(device: Device, motor: Motor) -> dict[str, float]:
     ramp = TORQUE * motor.rated_torque / (ROTORS * motor.inertia)  # rad/s^2
     current = min(PEAK * motor.rated_current, device.nominal_current)  # as far as the stage carries it for ever
     gains = bandwidth_gains(device, motor, ROTORS * motor.inertia, **BANDWIDTHS)
+    peak_ma = max(round(current * 10.0) * 100, 1)
+    rated_ma = max(round(1e3 * motor.rated_current / math.sqrt(2.0)), 1)
     return {
         "motor_type": 1 if brushed else 3,
         "encoder_init_mode": 0 if brushed else 1,  # use offset
@@ -108,7 +110,12 @@ def _servo(device: Device, motor: Motor) -> dict[str, float]:
         "encoder_counts": motor.encoder_counts,
         "hall_polarity": motor.hall_polarity,
         "hall_direction": motor.hall_direction,
-        "current_ma": max(round(current * 10.0) * 100, 1),
+        "current_ma": peak_ma,
+        "rated_rms_ma": rated_ma,
+        # Rounded up, so that the peak current limits alone.
+        "peak_over_rated_permille": math.ceil(1e3 * peak_ma / rated_ma),
+        "rated_rpm": max(motor.rated_speed * RPM, 1.0),
+        "thermal_time_s": motor.thermal_time,
         **dict(zip(device.gains.names, gains.tolist(), strict=True)),
         "line_inductance_per_volt": 2e3 * motor.L_q / device.supply_of(motor),  # mH between two terminals, per V
         "electrical_time_ms": 1e3 * motor.L_q / motor.R_s,

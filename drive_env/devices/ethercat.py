@@ -28,11 +28,13 @@ class EtherCatBehaviour(NamedTuple):
     Attributes:
         receive: What the master writes: sync manager 0.
         send: What it reads: sync manager 1.
-        bootstrap_receive: The same in Bootstrap.
-        bootstrap_send: The same in Bootstrap.
+        bootstrap_receive: The same in Bootstrap; None: the device has no Bootstrap.
+        bootstrap_send: The same in Bootstrap; None as well.
         outputs: Address of sync manager 2.
         inputs: Address of sync manager 3.
         only_on_can: Objects whose names begin so are not there on EtherCAT; "": all are.
+        described_as: Device whose EEPROM and description file it has; "": its own.
+        cycles: Cycles of SYNC0 that it takes [s]; empty: any from the shortest on.
         can_indices: Ranges of indices, first and last, that are not there on EtherCAT either.
         writable: Indices of objects that the EDS, which is CAN's, has read only, and that can be written on EtherCAT.
         shortest_cycle: Of SYNC0 [s].
@@ -41,13 +43,15 @@ class EtherCatBehaviour(NamedTuple):
 
     receive: Place
     send: Place
-    bootstrap_receive: Place
-    bootstrap_send: Place
     outputs: int
     inputs: int
     only_on_can: str
     shortest_cycle: float
     eeprom: int
+    bootstrap_receive: Place | None = None
+    bootstrap_send: Place | None = None
+    described_as: str = ""
+    cycles: tuple[float, ...] = ()
     can_indices: tuple[tuple[int, int], ...] = ()
     writable: tuple[int, ...] = ()
 
@@ -69,10 +73,15 @@ def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
     if missing:
         raise ValueError(f"ethercat lacks {', '.join(missing)}")
     row: dict[str, Any] = {key: Place(*value) if key in PLACES else value for key, value in data.items()}
+    row["cycles"] = tuple(data.get("cycles", ()))
+    if ("bootstrap_receive" in data) != ("bootstrap_send" in data):
+        raise ValueError("ethercat needs bootstrap_receive and bootstrap_send, or neither: the mailboxes in Bootstrap")
     row["can_indices"] = tuple((first, last) for first, last in data.get("can_indices", ()))
     row["writable"] = tuple(data.get("writable", ()))
     found = EtherCatBehaviour(**row)
     for name in PLACES:
+        if getattr(found, name) is None:
+            continue
         start, length = getattr(found, name)
         if length < LEAST_MAILBOX or not MEMORY[0] <= start <= MEMORY[1] - length:
             raise ValueError(

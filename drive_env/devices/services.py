@@ -52,6 +52,8 @@ class NodeQuirks(NamedTuple):
             is refused with 06090030h; "store": it reads as it was written.
         history_tells_number: 1003h has the first additional byte of the emergency in bits 24 to 29.
         further_axis_bit: Bits of 1001h that are set while an axis other than the first has an error.
+        unused_register_bits: Bits of 1001h that no error sets.
+        empty_history_reads_0: A sub-index of 1003h that has no error yet reads 0; else it is refused with 08000024h.
         stores_mapped: 1010h stores what a PDO can carry, too, unless it commands something.
         pdo_changes_while_on: A PDO's identifier and inhibit time can be written without setting its bit 31 before.
     """
@@ -60,6 +62,8 @@ class NodeQuirks(NamedTuple):
     pdo_changes_while_on: bool = False
     history_tells_number: bool = False
     further_axis_bit: int = 0
+    unused_register_bits: int = 0
+    empty_history_reads_0: bool = False
     stores_mapped: bool = False
 
 

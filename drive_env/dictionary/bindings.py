@@ -10,7 +10,7 @@ class Binding:
     """A row of a device's table of bindings.
 
     `event` names what a write sets off in the firmware: "controlword", "mode", "set_point" or nothing. `part` chooses
-    in a deep field.
+    in a deep field. An object that `shows` a field is not the one whose stored value a restart puts there.
     """
 
     index: int
@@ -19,3 +19,4 @@ class Binding:
     unit: str = "raw"
     part: int = 0
     event: str = ""
+    shows: bool = False

@@ -1,7 +1,8 @@
 """Objects that show a part of another object, of the same axis or of a certain axis of the node.
 
 A device's table `parts` has them: `of`, the object, or one for each axis of the node; `axis`, whose; `shift` and
-`bits`, which part of it: bits from `shift` on, or, where that is negative, the whole so many bits further up.
+`bits`, which part of it: bits from `shift` on, taken as a signed number with `signed`; or a `share` of its number, the
+first over the second; or another number for each of its own, by `table`.
 """
 
 from __future__ import annotations
@@ -18,14 +19,20 @@ class Part(NamedTuple):
     Attributes:
         of: The object, or one for each axis of the node.
         axis: Number in the node of the axis whose object it is; None: of the same axis.
-        shift: Lowest of its bits; negative: so many bits further up.
+        shift: Lowest of its bits.
         bits: How many of them.
+        signed: Whether their highest one is a sign.
+        table: Pairs of a number of the whole and what is shown for it, instead of bits.
+        share: Numerator and divisor of what is shown of the whole number instead; (0, 1) shows bits.
     """
 
     of: tuple[Key, ...]
     axis: int | None = None
     shift: int = 0
     bits: int = 32
+    signed: bool = False
+    share: tuple[int, int] = (0, 1)
+    table: tuple[tuple[int, int], ...] = ()
 
     def source(self, axis: int) -> Key:
         """Return the object that an axis of the node shows a part of."""
@@ -33,11 +40,18 @@ class Part(NamedTuple):
 
     def shown(self, raw: Any) -> Any:
         """Return the part of integers of the object."""
-        moved = raw >> self.shift if self.shift >= 0 else raw << -self.shift
-        return moved & ((1 << self.bits) - 1)
+        if self.table:
+            return sum((raw == whole) * shown for whole, shown in self.table)
+        numerator, divisor = self.share
+        if numerator:
+            return raw * numerator // divisor
+        found = (raw >> self.shift) & ((1 << self.bits) - 1)
+        return found - ((found >> (self.bits - 1)) << self.bits) if self.signed else found
 
     def put(self, raw: Any, part: Any) -> Any:
         """Return integers of the object with another part."""
+        if self.table:
+            return sum((part == shown) * whole for whole, shown in self.table)
         mask = ((1 << self.bits) - 1) << self.shift
         return (raw & ~mask) | ((part << self.shift) & mask)
 
@@ -45,6 +59,6 @@ class Part(NamedTuple):
 def parts_of(rows: Mapping[Key, Mapping[str, Any]], parse: Any) -> dict[Key, Part]:
     """Return a device's table; `parse` makes a key of its text."""
     return {
-        key: Part(tuple(parse(text) for text in row["of"]), row.get("axis"), row.get("shift", 0), row.get("bits", 32))
+        key: Part(tuple(parse(text) for text in row["of"]), **{k: v for k, v in row.items() if k != "of"})
         for key, row in rows.items()
     }

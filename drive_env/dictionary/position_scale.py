@@ -18,6 +18,7 @@ from mechanics.arrays import Floats
 
 # Units of position in a turn: by fewer no position could be held, and of more 32 bits hold fewer than 8 turns.
 COARSEST, FINEST = 100.0, float(2**28)
+TURN_INSIDE = 2.0**32  # increments of a revolution, of drives whose positions inside have 64 bits
 
 
 class PositionScale(NamedTuple):
@@ -31,7 +32,7 @@ def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
     """Return the scale of positions of a drive with these roles; None if it has none of the roles."""
     if Role.POSITION_SCALE in roles:
         return PositionScale((roles[Role.POSITION_SCALE],), lambda values: values[0])
-    inside = (Role.TURN_INSIDE, Role.POSITION_NUMERATOR, Role.POSITION_DIVISOR)
+    inside = (Role.POSITION_NUMERATOR, Role.POSITION_DIVISOR)
     if all(role in roles for role in inside):
         return PositionScale(tuple(roles[role] for role in inside), _units_of_turn)
     if Role.FULL_STEPS in roles and Role.MICROSTEPS in roles:
@@ -71,8 +72,8 @@ def velocity_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
 
 
 def _units_of_turn(values: Sequence[Floats]) -> Floats:
-    turn, numerator, divisor = values
-    return turn * divisor / numerator
+    numerator, divisor = values
+    return TURN_INSIDE * divisor / numerator
 
 
 def _microsteps(values: Sequence[Floats]) -> Floats:

@@ -48,7 +48,7 @@ UNITS = {
     "deg": EnteredUnit("angle", 1.0 / 360.0),
     "rad": EnteredUnit("angle", 0.5 / math.pi),
     "1/65536 rev": EnteredUnit("angle", 1.0 / 65536.0),
-    "inc 64": EnteredUnit("angle", 2.0**-28),
+    "1/2^32 rev": EnteredUnit("angle", 2.0**-32),
     "rev/s": EnteredUnit("speed", 1.0),
     "rpm": EnteredUnit("speed", 1.0 / 60.0),
     "rad/s": EnteredUnit("speed", 0.5 / math.pi),

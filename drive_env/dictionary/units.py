@@ -29,6 +29,7 @@ class Context(NamedTuple):
     rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
     velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
     peak_current: Any = math.nan  # of the motor [A], of which torques are parts
+    profile_bits: Any = 16.0  # of a revolution's increments of a profile generator, as a power of two
 
 
 class Unit(NamedTuple):
@@ -51,6 +52,10 @@ class Unit(NamedTuple):
 
 def _angle(context: Context) -> Any:
     return TWO_PI / context.position_scaler
+
+
+def _profile_angle(context: Context) -> Any:
+    return TWO_PI / 2.0**context.profile_bits
 
 
 RPM = TWO_PI / 60.0
@@ -108,14 +113,20 @@ UNITS: dict[str, Unit] = {
             lambda c: RPM * c.velocity_ratio,
             follows_scale=True,
         ),
+        Unit("pginc/s", "increments of the profile generator per second", _profile_angle, follows_scale=True),
+        Unit("pginc/s^2", "increments of the profile generator per second squared", _profile_angle, follows_scale=True),
         Unit(
             "1/32767 M-Ipeak",
             "parts of the motor's peak current, of which 32767 are the whole",
             lambda c: c.peak_current / 32767.0,
             follows_scale=True,
         ),
-        Unit("inc 64", "increments of the position inside, 2^28 a revolution", lambda c: TWO_PI / 2.0**28),
+        Unit("1/2^32 rev", "increments of the position inside, 2^32 a revolution", lambda c: TWO_PI / 2.0**32),
+        Unit("1/1000 M-Inull", "thousandths of the motor's nominal current", lambda c: 1e-3),
+        Unit("rev", "revolutions", lambda c: TWO_PI),
         Unit("1/1000", "thousandths", lambda c: 1e-3),
+        Unit("V", "volts", lambda c: 1.0),
+        Unit("100us", "tenths of a millisecond", lambda c: 1e-4),
         Unit("us", "microseconds", lambda c: 1e-6),
         Unit("percent", "hundredths", lambda c: 1e-2),
         Unit("mV/A", "millivolts per ampere, where 32 V are the whole link", lambda c: 1e-3 / 32.0),

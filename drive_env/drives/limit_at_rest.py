@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count, ampere_per_limit, highest_current
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from mechanics.arrays import Floats, Mask
@@ -37,6 +38,8 @@ class LimitAtRest:
         device = drives.device
         self.is_known = device is not None and Role.CURRENT_LIMIT in device.roles
         if device is not None and self.is_known:
+            self._counts_per_limit = np.asarray(ampere_per_limit(drives) / ampere_per_count(drives), float)
+            self._most = np.asarray(highest_current(drives) / ampere_per_count(drives), float)
             increments = np.asarray(drives.read(Role.POSITION_SCALE), float) / (2.0 * np.pi)
             self._slow = device.standstill * increments * per_increment(drives, cia402.VELOCITY_ACTUAL)
 
@@ -48,12 +51,12 @@ class LimitAtRest:
             status: 6041h, (num_axes,), as all that follow.
             current: 6077h.
             speed: 606Ch.
-            limit: The current limit, which counts as 6077h does.
+            limit: The current limit, as its object has it.
         """
         if not self.is_known:
             return np.zeros(self.axes, bool)
         enabled = cia402.matches(np.asarray(status), cia402.OPERATION_ENABLED)
-        most = np.asarray(limit)
+        most = np.minimum(np.asarray(limit) * self._counts_per_limit, self._most)
         pushes = enabled & (most > 0) & (np.abs(current) >= SHARE * most) & (np.abs(speed) <= self._slow)
         self._since = np.where(pushes, np.fmin(self._since, now), np.nan)
         return np.asarray(now - self._since >= HELD)

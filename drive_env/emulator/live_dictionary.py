@@ -25,6 +25,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import (
     PEAK_FIELD,
+    PROFILE_FIELD,
     RATIO_FIELD,
     SCALE_FIELD,
     SCALES,
@@ -65,8 +66,12 @@ class LiveDictionary:
         self._scales: dict[str, PositionScale] = {name: scale for name, scale in found.items() if scale is not None}
         # Objects whose write gives what is stored another meaning.
         self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
-        if Role.PEAK_CURRENT in device.roles:
-            self.scale_keys += (device.roles[Role.PEAK_CURRENT],)
+        self._single_scales = {
+            field: device.roles[role]
+            for field, role in ((PEAK_FIELD, Role.PEAK_CURRENT), (PROFILE_FIELD, Role.PROFILE_BITS))
+            if role in device.roles
+        }
+        self.scale_keys += tuple(self._single_scales.values())
         self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
@@ -340,10 +345,10 @@ class LiveDictionary:
             for name, scale in self._scales.items()
         }
         context = context._replace(**made)
-        peak = self.device.roles.get(Role.PEAK_CURRENT)
-        if peak is not None:
-            context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
-        known = [key for key in self._stored if key in self.codes]
+        for name, key in self._single_scales.items():
+            of_axes: dict[str, Any] = {name: self._from_od(self.codes[key], self._stored[key], context)}
+            context = context._replace(**of_axes)
+        known = [key for key in self._stored if key in self.codes and not self.device.bindings[key].shows]
         set_by = {key for key in known if self.entries.find(key).access not in ("ro", "const")}
         places = {(self.codes[key].field, self.codes[key].part) for key in set_by}
         bound = [
@@ -377,9 +382,8 @@ class LiveDictionary:
         )
         if not self._layout.has(RATIO_FIELD):
             return scales
-        return scales._replace(
-            velocity_ratio=self._scale_field(RATIO_FIELD), peak_current=self._scale_field(PEAK_FIELD)
-        )
+        of_axes: dict[str, Any] = {name: self._scale_field(name) for name in (RATIO_FIELD, PEAK_FIELD, PROFILE_FIELD)}
+        return scales._replace(**of_axes)
 
     def _scale_field(self, name: str) -> Floats:
         return get_lanes(self._records, name, self.num_axes).astype(float)
@@ -458,8 +462,9 @@ class LiveDictionary:
 
     def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Change a scale: stored values in units that follow it keep their integers, and change in SI."""
+        before = self.context()
         kept = [
-            (other, self._read(other))
+            (other, self._read(other), self.codes[other.index, other.sub])
             for other in self.entries
             if self._is_bound(other)
             and other.access not in ("ro", "const")
@@ -473,8 +478,10 @@ class LiveDictionary:
             made = scale.increments([self._read(self.entries.find(key)).astype(float) for key in scale.keys])
             set_lanes(self._records, name, made, where)
         self._scale_changes += 1
-        for other, value in kept:
-            self._set_field(other, value, where)
+        after = self.context()
+        for other, value, code in kept:
+            if np.any(code.factor(before) != code.factor(after)):
+                self._set_field(other, value, where)
 
     def _set_field(self, entry: Entry, raw: Integers, where: Mask) -> None:
         code = self.codes[entry.index, entry.sub]
@@ -484,6 +491,8 @@ class LiveDictionary:
 
     def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
+        if key in self.device.kept_bits:
+            raw = raw & self.device.kept_bits[key]
         before = self._values.get(key)
         if key in self.device.shared_values:
             node = np.arange(self.num_axes) // self.device.num_axes

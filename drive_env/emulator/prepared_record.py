@@ -33,7 +33,8 @@ Integers = NDArray[np.int64]
 SCALE_FIELD = "position_scaler"  # increments of a revolution
 RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit; of drives that have such
 PEAK_FIELD = "peak_current"  # of the motor [A]; of drives that tell torques in its parts
-SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, PEAK_FIELD})
+PROFILE_FIELD = "profile_bits"  # of drives whose profile generator counts in increments of its own
+SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, PEAK_FIELD, PROFILE_FIELD})
 
 
 class PreparedObject(NamedTuple):

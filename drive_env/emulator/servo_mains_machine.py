@@ -22,18 +22,18 @@ from mechanics.arrays import Mask
 AXES = 2  # that share a link
 OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off
 CHOPPER, CHOPPER_HYSTERESIS = 0.92, 0.025  # of the over-voltage: where the chopper begins, and how far it draws down
-OVERSPEED = 1.5  # of the rated speed
-# degC; class values. A thermostat of class F insulation, its sensor's limit just below, and a cabinet.
-THERMOSTAT, MOTOR_TEMPERATURE, AMBIENT = 155.0, 145.0, 60.0
+MOTOR_TEMPERATURE, AMBIENT = 145.0, 60.0  # degC; class values: below the sensor's limit (M-MaxResTerm), and a cabinet
 
 _NOT_HERE = {"stage.idle_current", "stage.supply_sinks"}  # the rectifier feeds only
 
 
 def motor_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return the parameters of a motor, in the order in which they are drawn, and those of the mains, never drawn."""
+    """Return the parameters of a motor, in the order in which they are drawn; those of mains and brake never are."""
     rows = servo_machine.motor_parameters(motor)
     for name in ("mains_phase_lost", "emergency_stop"):
         rows.append(MachineParameter(f"stage.{name}", "1", 0.0, 0.0, 0.0, 0.0))
+    for name, value in (("brake_opens_in", 0.04), ("brake_closes_in", 0.02)):  # usual for a brake that a spring closes
+        rows.append(MachineParameter(f"motor.{name}", "s", value, value, value, value))
     return rows
 
 
@@ -46,14 +46,13 @@ def set_constants(records: Records, device: Device, motor: Motor) -> None:
     records["chopper_hysteresis"] = CHOPPER_HYSTERESIS * device.overvoltage
     records["offset_limit"] = OFFSET_SHARE * device.current_full_scale
     records["current_range"] = device.current_full_scale
-    records["overspeed"] = OVERSPEED * motor.rated_speed
-    records["thermostat_temperature"] = THERMOSTAT
     records["motor_temperature"] = MOTOR_TEMPERATURE
     records["ambient_limit"] = AMBIENT
     for mode, needed in device.mode_gate.items():
         records["d_mode_needed"][:, mode, :] = needed
     for lane in range(LANES):  # three inputs for the switches of each axis of a module
         records["switch_input"][:, :, lane] = 3 * (lane % device.num_axes) + np.arange(3)
+        records["module_axis"][:, lane] = lane % device.num_axes
     # Of an absolute encoder, which knows the rotor's angle.
     records["motor_type"], records["commutation_mode"], records["encoder_init_mode"] = BLDC, ENCODER, USE_OFFSET
     records["pole_pairs"], records["encoder_steps"] = motor.n_p, motor.encoder_counts
@@ -86,6 +85,8 @@ SERVO_MAINS = MachineKind(
         "stage.brake_thermal_time": field("brake_thermal_time"),
         "stage.mains_phase_lost": field("mains_phase_lost"),
         "stage.emergency_stop": field("emergency_stop"),
+        "motor.brake_opens_in": field("brake_opens_in"),
+        "motor.brake_closes_in": field("brake_closes_in"),
     },
     noise=SERVO.noise,
     connect=connect,

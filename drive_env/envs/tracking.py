@@ -16,7 +16,7 @@ from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
-from drive_env.drives.currents import counts_per_ampere
+from drive_env.drives.currents import counts_per_ampere, read_current_limit
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control
@@ -429,7 +429,10 @@ class Tracking(VectorEnvironment):
         scales = np.empty((drives.num_axes, 4))
         scales[:, 0] = config.amplitude * self._per_turn
         scales[:, 1] = config.speed * self._speed_counts
-        torque = self._per_turn / drives.read(Role.FULL_STEPS) if self._is_stepper else drives.read(Role.CURRENT_LIMIT)
+        if self._is_stepper:
+            torque = self._per_turn / drives.read(Role.FULL_STEPS)
+        else:
+            torque = read_current_limit(drives) * counts_per_ampere(drives)
         scales[:, 2] = torque
         full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": torque}
         scales[:, 3] = full[str(config.mode)] * (config.offset if config.action == "offset" else 1.0)

@@ -145,6 +145,10 @@ class Application(Protocol):
     layout: SlaveLayout
 
     @property
+    def identification(self) -> int:
+        """Number that answers an identification request (AL control bit 5); 0: the device has none."""
+
+    @property
     def output_size(self) -> int:
         """Bytes that the master writes by sync manager 2, as they are mapped now; 0: none."""
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from drive_env.cia402 import State
 from drive_env.dictionary.aborts import WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.ethercat.application import (
     AlState,
@@ -26,7 +27,7 @@ from drive_env.ethercat.coe_information import SdoInformation
 from drive_env.ethercat.coe_sdo import CoeSdoServer
 from drive_env.ethercat.ethercat_objects import entries_on_ethercat
 from drive_env.ethercat.object_descriptions import describe
-from drive_env.ethercat.sii_content import sii_content
+from drive_env.ethercat.sii_content import configuration, sii_content
 from drive_env.ethercat.synchronisation import Synchronisation
 from drive_env.node.axis import ObjectPort
 from drive_env.node.node_axes import NodeAxes
@@ -92,7 +93,8 @@ class CoeNode:
         self.state = AlState.INIT
         self.layout = SlaveLayout(
             MailboxPlace(*behaviour.receive), MailboxPlace(*behaviour.send), behaviour.outputs, behaviour.inputs,
-            MailboxPlace(*behaviour.bootstrap_receive), MailboxPlace(*behaviour.bootstrap_send),
+            *(None if place is None else MailboxPlace(*place)
+              for place in (behaviour.bootstrap_receive, behaviour.bootstrap_send)),
         )  # fmt: skip
         self._device = device
         self._axes = NodeAxes(drives, first_axis, spare)
@@ -120,6 +122,14 @@ class CoeNode:
         self._information = SdoInformation(describe(device), behaviour.send.length)
         self._sii = sii_content(device, serial)
         self._waiting: bytes | None = None  # outputs that take effect with SYNC0
+        self._number = device.canopen.objects.get("node_id")  # object of the node's number
+        # Objects of measured times: register of the device, and when the last event was [s].
+        self._times: dict[Role, tuple[ObjectPort, float]] = {}
+
+    @property
+    def identification(self) -> int:
+        """Number of the node, of a device that keeps it in a register of its own; else 0."""
+        return self._objects.value(*self._number) if self._number else 0
 
     # --- process data -------------------------------------------------------------------------------------------------
     @property
@@ -135,6 +145,7 @@ class CoeNode:
     def outputs(self, data: bytes, now: float) -> None:
         """Let outputs take effect at once or, with SYNC0, at its next pulse."""
         self._synchronisation.outputs_came(now)
+        self._measure(Role.PACKET_TIME, now)
         if self._synchronisation.has_sync0:
             self._waiting = data
         else:
@@ -166,6 +177,9 @@ class CoeNode:
         self._synchronisation.restart()
         self._axes.restart()
         self._objects.restore(NODE_ID, self._store.sections.get("communication", {}))
+        if self._number is not None:
+            self._objects.set("node_id", self._stored_number())
+        self._times.clear()
         self._image.restart()
         self._errors.restart()
         self._sdo.close()
@@ -251,8 +265,25 @@ class CoeNode:
 
     # --- EEPROM -------------------------------------------------------------------------------------------------------
     def read_sii(self) -> bytes:
-        """Return the EEPROM's content."""
-        return self._sii
+        """Return the EEPROM's content; a device whose number is the alias has it in its words."""
+        if self._number is None:
+            return self._sii
+        words = configuration(self._stored_number())
+        return words + self._sii[len(words) :]
+
+    def _stored_number(self) -> int:
+        assert self._number is not None, "asked for of a device that has one alone"
+        factory = self._objects.factory(NODE_ID)[self._number]
+        return int(self._store.sections.get("bus", {}).get(self._number, factory))
+
+    def _measure(self, role: Role, now: float) -> None:
+        """Write the time since the last event [us], of a device that has a register for it."""
+        key = self._device.roles.get(role)
+        if key is None:
+            return
+        port, before = self._times.get(role, (self.dictionary.port(*key), now))
+        port.write(round(1e6 * (now - before)))
+        self._times[role] = (port, now)
 
     def write_sii(self, content: bytes) -> None:
         """Store the EEPROM that the master has written."""

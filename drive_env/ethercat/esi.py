@@ -21,6 +21,7 @@ from drive_env.ethercat.sii_content import (
     MODES,
     bootstrap,
     configuration,
+    described,
     entry_of,
     has_ready_images,
     identity,
@@ -42,6 +43,7 @@ def esi_text(device: Device) -> str:
     """Return the ESI of a device, as `drive-env esi` prints it; ValueError for one without EtherCAT."""
     if device.ethercat is None:
         raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
+    device = described(device)
     vendor, _, _ = identity(device)
     root = ET.Element("EtherCATInfo", Version="1.6")
     maker = ET.SubElement(root, "Vendor")
@@ -84,7 +86,8 @@ def _device(parent: ET.Element, device: Device) -> None:
     ET.SubElement(
         mailbox, "CoE", SdoInfo="1", PdoAssign="1", PdoConfig=configures, CompleteAccess="1", SegmentedSdo="1"
     )
-    ET.SubElement(mailbox, "FoE")
+    if behaviour.bootstrap_receive is not None:  # it has files there alone
+        ET.SubElement(mailbox, "FoE")
     clock = ET.SubElement(one, "Dc")
     for name, activation in MODES:
         mode = ET.SubElement(clock, "OpMode")
@@ -94,7 +97,8 @@ def _device(parent: ET.Element, device: Device) -> None:
     eeprom = ET.SubElement(one, "Eeprom")
     _text(eeprom, "ByteSize", str(behaviour.eeprom))
     _text(eeprom, "ConfigData", configuration()[:14].hex())
-    _text(eeprom, "BootStrap", bootstrap(behaviour).hex())
+    if behaviour.bootstrap_receive is not None:
+        _text(eeprom, "BootStrap", bootstrap(behaviour).hex())
 
 
 def _types(parent: ET.Element, objects: dict[int, ObjectDescription]) -> None:

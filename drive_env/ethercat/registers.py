@@ -62,7 +62,7 @@ REGISTERS = (
     Register(RESET, 1, 0, 0xFF, "ESC reset"),
     Register(DL_CONTROL, 4, 0x0007C001, 0x0107FFFB, "DL control"),
     Register(DL_STATUS, 2, 0, 0, "DL status"),
-    Register(AL_CONTROL, 2, 1, 0x001F, "AL control"),
+    Register(AL_CONTROL, 2, 1, 0x003F, "AL control"),
     Register(AL_STATUS, 2, 1, 0, "AL status"),
     Register(AL_STATUS_CODE, 2, 0, 0, "AL status code"),
     Register(PDI_CONTROL, 2, 0, 0, "PDI control, ESC configuration"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from drive_env.devices import Device
+from drive_env.devices import Device, find_device
 from drive_env.devices.ethercat import EtherCatBehaviour
 from drive_env.devices.image_rows import fixed_images
 from drive_env.ethercat.object_descriptions import ObjectDescription, describe
@@ -32,6 +32,12 @@ def identity(device: Device) -> tuple[int, int, int]:
     values = [dictionary.find((0x1018, sub)).default for sub in (1, 2, 3)]
     vendor, product, revision = (value if isinstance(value, int) else 0 for value in values)
     return vendor, product, revision
+
+
+def described(device: Device) -> Device:
+    """Return the device whose EEPROM and description file a device has: itself, or the one that its data name."""
+    other = "" if device.ethercat is None else device.ethercat.described_as
+    return find_device(other) if other else device
 
 
 def title(device: Device) -> str:
@@ -91,7 +97,7 @@ def sii_content(device: Device, serial: int = 0, alias: int = 0) -> bytes:
     Raises:
         ValueError: For a device without EtherCAT, or whose content is longer than its EEPROM.
     """
-    behaviour = device.ethercat
+    behaviour, device = device.ethercat, described(device)
     if behaviour is None:
         raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
     objects = describe(device)
@@ -114,14 +120,15 @@ def configuration(alias: int = 0) -> bytes:
 
 
 def bootstrap(behaviour: EtherCatBehaviour) -> bytes:
-    """Return words 0014h to 0017h: the mailboxes in Bootstrap."""
-    return struct.pack("<4H", *behaviour.bootstrap_receive, *behaviour.bootstrap_send)
+    """Return words 0014h to 0017h: the mailboxes in Bootstrap, 0 without it."""
+    none = (0, 0)
+    return struct.pack("<4H", *(behaviour.bootstrap_receive or none), *(behaviour.bootstrap_send or none))
 
 
 def _head(device: Device, behaviour: EtherCatBehaviour, serial: int, alias: int) -> bytes:
     mailboxes = struct.pack("<4H", *behaviour.receive, *behaviour.send)
     head = configuration(alias) + struct.pack("<4I", *identity(device), serial) + bytes(8)
-    head += bootstrap(behaviour) + mailboxes + struct.pack("<H", COE | FOE)
+    head += bootstrap(behaviour) + mailboxes + struct.pack("<H", COE | (FOE if behaviour.bootstrap_receive else 0))
     return head.ljust(BEFORE_CATEGORIES - 4, b"\0") + struct.pack("<2H", behaviour.eeprom // 128 - 1, 1)
 
 
@@ -136,7 +143,8 @@ def _general(device: Device, strings: _Strings) -> bytes:
     group = strings.number("Drives")
     details = COE_DETAILS | (0 if has_ready_images(device) else HAS_CONFIGURATION)
     # Group, image, order and name; reserved; CoE, FoE, EoE; SoE, DS402, SysMan; flags; current; group; ports.
-    content = struct.pack("<4B", group, 0, order, name) + bytes((0, details, 1, 0, 0, device.num_axes, 0, 0))
+    files = int(device.ethercat is not None and device.ethercat.bootstrap_receive is not None)
+    content = struct.pack("<4B", group, 0, order, name) + bytes((0, details, files, 0, 0, device.num_axes, 0, 0))
     content += struct.pack("<hBBH", 0, 0, 0, 0x0011)  # two ports, MII both
     return _category(GENERAL, content.ljust(32, b"\0"))
 

@@ -19,8 +19,8 @@ from drive_env.ethercat.application import (
 from drive_env.ethercat.controller import SlaveController
 
 S, Code = AlState, AlStatusCode
-STATE, ACKNOWLEDGE = 0x0F, 0x10  # of AL control
-ERROR = 0x10  # of AL status
+STATE, ACKNOWLEDGE, IDENTIFY = 0x0F, 0x10, 0x20  # of AL control
+ERROR, IDENTIFIED = 0x10, 0x20  # of AL status
 TRANSITIONS = frozenset((
     (S.INIT, S.PRE_OP), (S.INIT, S.BOOTSTRAP), (S.BOOTSTRAP, S.INIT),
     (S.PRE_OP, S.INIT), (S.PRE_OP, S.SAFE_OP),
@@ -63,11 +63,13 @@ class StateMachine:
     def power_on(self) -> None:
         """Be in Init."""
         self.state, self.has_error, self.code = S.INIT, False, Code.NO_ERROR
+        self._identifies = False
         self._show()
 
     def request(self, control: int, now: float) -> None:
         """Act on the master's write to AL control."""
         wanted = control & STATE
+        self._identifies = bool(control & IDENTIFY)
         if self.has_error and not control & ACKNOWLEDGE and wanted >= self.state:
             return
         if wanted not in AlState.__members__.values():
@@ -115,6 +117,10 @@ class StateMachine:
         self._show()
 
     def _show(self) -> None:
+        number = self._application.identification
+        if self._identifies and number and not self.has_error:  # ETG.1020: in place of a code
+            self._controller.put_al_status(self.state | IDENTIFIED, number)
+            return
         self._controller.put_al_status(self.state | (ERROR if self.has_error else 0), self.code)
 
     def _check(self, new: AlState, now: float) -> AlStatusCode:

@@ -49,6 +49,7 @@ class Synchronisation:
         assert device.ethercat is not None, "a device without EtherCAT is not synchronised"
         self._may_change = may_change
         self._shortest = device.ethercat.shortest_cycle
+        self._cycles = [round(cycle / NANOSECOND) for cycle in device.ethercat.cycles]
         own = ethercat_objects(device)
         self._factory = {(index, sub): int(one.default) for index in SYNCHRONISATION for sub, one in own[index].items()}
         self.restart()
@@ -80,9 +81,11 @@ class Synchronisation:
     def begin(self, clock: ClockSetting) -> AlStatusCode:
         """Take the clocks as they are set before Safe-Op; return why that cannot be, or NO_ERROR.
 
-        A cycle of SYNC0 that the device cannot keep up with is refused; 0 means a single pulse and is taken.
+        A cycle of SYNC0 that the device cannot keep up with, or does not know, is refused; 0 means a single pulse and
+        is taken.
         """
-        if clock.has_sync0 and clock.sync0_cycle < self._shortest:
+        known = not self._cycles or round(clock.sync0_cycle / NANOSECOND) in (0, *self._cycles)
+        if clock.has_sync0 and (clock.sync0_cycle < self._shortest or not known):
             return AlStatusCode.DC_CYCLE_TIME
         if not clock.has_sync0 and WITH_SYNC0 in (self._values[index, TYPE] for index in SYNCHRONISATION):
             return AlStatusCode.DC_SYNC_CONFIGURATION
@@ -133,3 +136,6 @@ class Synchronisation:
             raise ObjectAccessError(
                 VALUE_TOO_LOW, f"{entry.label} = {raw} ns is below {self._shortest / NANOSECOND:.0f} ns"
             )
+        if entry.sub == CYCLE_TIME and self._cycles and raw not in self._cycles:
+            known = ", ".join(map(str, self._cycles))
+            raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw} ns; this slave knows {known}")

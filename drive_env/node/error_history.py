@@ -51,9 +51,11 @@ class ErrorHistory:
 
     Args:
         depth: Number of sub-indices.
+        reads_0: A sub-index that holds no error yet reads 0.
     """
 
-    def __init__(self, depth: int) -> None:
+    def __init__(self, depth: int, *, reads_0: bool = False) -> None:
+        self._reads_0 = reads_0
         self._errors: deque[int] = deque(maxlen=depth)
 
     def add(self, code: int, axis: int = 0, number: int = 0) -> None:
@@ -62,10 +64,12 @@ class ErrorHistory:
             self._errors.appendleft(code | axis << 16 | (number & 0x3F) << 24)
 
     def read(self, sub: int) -> int:
-        """Return a sub-index; 08000024h for one that holds no error yet."""
+        """Return a sub-index; 08000024h, or 0, for one that holds no error yet."""
         if sub == 0:
             return len(self._errors)
         if sub > len(self._errors):
+            if self._reads_0:
+                return 0
             raise ObjectAccessError(NO_DATA, f"1003h:{sub:02X} holds no error; there are {len(self._errors)}")
         return self._errors[sub - 1]
 

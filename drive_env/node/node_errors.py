@@ -72,7 +72,9 @@ class NodeErrors:
         self._last_of: dict[Hashable, int] = {}  # last axis whose a condition is, for 1001h
         self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
         self.conditions: dict[Hashable, ErrorCondition] = {}
-        self.history = ErrorHistory(depth)
+        quirks = device.canopen.quirks
+        self.history = ErrorHistory(depth, reads_0=quirks.empty_history_reads_0)
+        self._told_bits = ~quirks.unused_register_bits
 
     def add_objects(self, objects: NodeObjects) -> None:
         """Let 1001h and, where the device has it, 1003h show them."""
@@ -95,7 +97,7 @@ class NodeErrors:
             if axis is not without:
                 register |= self._of_axis(number, axis.error_register)
         for key, condition in self.conditions.items():
-            register |= self._of_axis(self._last_of[key], condition.error_register)
+            register |= self._of_axis(self._last_of[key], condition.error_register & self._told_bits)
         return register
 
     def _of_axis(self, number: int, register: int) -> int:
@@ -122,7 +124,7 @@ class NodeErrors:
         for axis in axes:
             emergency = self._device.emergencies[told].of_axis(axis)
             self._told_last = axis
-            self._sink.push(emergency, self.register() | condition.error_register)
+            self._sink.push(emergency, self.register() | condition.error_register & self._told_bits)
             self.history.add(emergency.code, axis, self._number_of(emergency))
         self._flush(now)
 

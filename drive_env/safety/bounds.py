@@ -174,7 +174,7 @@ def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rot
         settled + np.where(known_scale, SLACK_TURNS * rotor.scale, 0.0),
         velocity,
         count,
-        _magnitude(drives, given(limits.current, drives.num_axes), drives.description.role(Role.CURRENT_LIMIT)),
+        _current(drives, given(limits.current, drives.num_axes)),
         _magnitude(
             drives,
             _at_scale(given(limits.following_error, drives.num_axes), of_rotors.following * rotor.scale),
@@ -229,6 +229,28 @@ def _ampere(drives: WatchedDrives) -> Floats:
     return np.asarray(np.nan_to_num(np.broadcast_to(factor, (drives.num_axes,))), float)
 
 
+def current_limits(drives: WatchedDrives) -> tuple[Key, ...]:
+    """Return the objects that limit a drive's current: none, one, or one for each sign."""
+    role = drives.description.role
+    found = (role(Role.CURRENT_LIMIT), role(Role.CURRENT_LIMIT_NEGATIVE))
+    return tuple(key for key in found if key is not None)
+
+
+def counts_per_limit(drives: WatchedDrives) -> Floats:
+    """Return how many counts of 6077h one of the current limit is: 1, unless it counts parts of the nominal current."""
+    key, ampere = drives.description.role(Role.NOMINAL_CURRENT), _ampere(drives)
+    if key is None:
+        return np.ones(drives.num_axes)
+    return np.asarray(read_own(drives, key, 0) * 1e-6 / np.where(ampere > 0.0, ampere, np.inf), float)
+
+
+def _current(drives: WatchedDrives, user: Floats) -> Integers:
+    """Return the greatest current [counts of 6077h]: the user's, or the drive's, of two signs the lower one."""
+    counts, keys = counts_per_limit(drives), current_limits(drives)
+    found = [_magnitude(drives, user, key, counts) for key in keys] or [_magnitude(drives, user, None)]
+    return np.asarray(np.min(found, axis=0), np.int64)
+
+
 REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filter may show of a rotor at rest
 
 
@@ -258,11 +280,14 @@ def _at_scale(user: Floats, now: Floats) -> Floats:
     return np.where(np.isfinite(now), np.maximum(np.floor(now + 1e-6), 1.0), user)
 
 
-def _magnitude(drives: WatchedDrives, user: Floats, key: Key | None) -> Integers:
-    """Return the user's limit, or the drive's if it has one; 0 and the end of the type switch the drive's off."""
+def _magnitude(drives: WatchedDrives, user: Floats, key: Key | None, counts: Floats | float = 1.0) -> Integers:
+    """Return the user's limit, or the drive's if it has one; 0 and the end of the type switch the drive's off.
+
+    One of the drive's is `counts` of the user's.
+    """
     if np.isnan(user).any() and key is not None:
         found = read_own(drives, key, NO_LIMIT)
-        own = np.where((found <= 0) | (found >= 2**31 - 1), NO_LIMIT, found)
+        own = np.where((found <= 0) | (found >= 2**31 - 1), NO_LIMIT, np.floor(found * counts)).astype(np.int64)
     else:
         own = np.full(len(user), NO_LIMIT, np.int64)
     chosen = np.where(np.isnan(user) | np.isinf(user), 0.0, user).astype(np.int64)

@@ -12,10 +12,18 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.position_scale import TURN_INSIDE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.axes import Axes
-from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
+from drive_env.safety.bounds import (
+    QUICK_STOP_DECELERATION,
+    SLACK_TURNS,
+    counts_per_limit,
+    current_limits,
+    increments_per_count,
+    read_own,
+)
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
 from drive_env.safety.objects import (
@@ -83,7 +91,7 @@ class Commands:
     def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
-        self._current_limit = drives.description.role(Role.CURRENT_LIMIT)
+        self._current_limits = current_limits(drives)
         self._is_stepped = drives.description.role(Role.MICROSTEPS) is not None
         self._scale_objects = scale_objects(drives.description)
         self._axes = axes
@@ -126,10 +134,9 @@ class Commands:
         """Return targets by another object than 607Ah in increments of 6064h, as it counts now."""
         if key == INTERPOLATED_POSITION:
             return raw
-        role = self._drives.description.role
-        turn, actual = role(Role.TURN_INSIDE), role(Role.POSITION_INSIDE)
-        assert turn is not None and actual is not None, "a drive with a target inside has both"
-        scale = self._axes.rotor.scale / read_own(self._drives, turn, 1)
+        actual = self._drives.description.role(Role.POSITION_INSIDE)
+        assert actual is not None, "a drive with a target inside has it"
+        scale = self._axes.rotor.scale / TURN_INSIDE
         # 6064h is the lower end of the position inside, whose turns of 32 bits it does not tell.
         above = read_own(self._drives, actual, 0) * scale - read_own(self._drives, POSITION, 0)
         return np.rint(raw * scale - 2.0**32 * np.rint(above / 2.0**32)).astype(np.int64)
@@ -384,8 +391,8 @@ class Commands:
 
     def _check_magnitude(self, entry: Entry, raw: Integers, where: Mask, played: Mapping[Entry, Integers]) -> None:
         key = (entry.index, entry.sub)
-        if key == self._current_limit:
-            limit = self._own_current_limit()
+        if key in self._current_limits:
+            limit, raw = self._own_current_limit(), np.floor(raw * counts_per_limit(self._drives)).astype(np.int64)
         elif key in _MAGNITUDES:
             limit = getattr(self._limits.bounds(), _MAGNITUDES[key])
         else:
@@ -536,8 +543,8 @@ class Commands:
             )
 
     def _current_origin(self, key: Key) -> str:
-        is_its_own = self._current_limit is None or key == self._current_limit
-        own = "the drive's" if is_its_own or self._current_limit is None else f"{self._current_limit[0]:04X}h"
+        is_its_own = not self._current_limits or key in self._current_limits
+        own = "the drive's" if is_its_own else f"{self._current_limits[0][0]:04X}h"
         return self._limits.origin(self._limits.user.current, "current", own)
 
     def _velocity_origin(self, axis: int) -> str:

@@ -39,6 +39,7 @@ from drive_env.safety.bounds import (
     POSITION_HIGH,
     POSITION_LOW,
     QUICK_STOP_DECELERATION,
+    current_limits,
     motion_gains,
 )
 from drive_env.safety.commands import Commands
@@ -204,7 +205,7 @@ class Envelope:
     def _is_limit(self, key: Key) -> bool:
         """Return whether limits, or the way of a stop, depend on an object."""
         gains = motion_gains(self._drives.device).values()
-        return key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT) or key in gains
+        return key in _BOUNDS or key in current_limits(self._drives) or key in gains
 
     def _note_mode(self, key: Key, where: Mask) -> None:
         """Note that an axis may ignore commands for a moment, until both of its modes have changed."""

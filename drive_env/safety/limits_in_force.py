@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.cia402 import Key
-from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import NO_LIMIT, Limits
 from drive_env.fieldbus.errors import RefusedError
 from drive_env.safety.axes import Axes
@@ -20,6 +19,8 @@ from drive_env.safety.bounds import (
     POSITION_LOW,
     Bounds,
     RotorLimits,
+    counts_per_limit,
+    current_limits,
     read_bounds,
     read_own,
     rotor_limits,
@@ -141,12 +142,14 @@ class LimitsInForce:
                 np.where(bounds.high < NO_LIMIT, bounds.high + bounds.slack + offset, math.inf),
                 True,
             )
+        counts = counts_per_limit(self._drives)
+        in_its_unit = np.where(bounds.current < NO_LIMIT, np.floor(bounds.current / counts), NO_LIMIT)
         for key, limit, highest in (
-            (self._drives.description.role(Role.CURRENT_LIMIT), self.user.current, bounds.current),
+            *((key, self.user.current, in_its_unit) for key in current_limits(self._drives)),
             (FOLLOWING_WINDOW, self.user.following_error, bounds.following),
             (MAX_PROFILE_VELOCITY, self.user.velocity, bounds.velocity),
         ):
-            if limit is not None and key is not None:
+            if limit is not None:
                 wanted[key] = (np.where(highest < NO_LIMIT, highest, math.inf), True)
         if self.user.velocity is not None and self._axes.is_counted and np.all(self._axes.rotor.scale > 1.0):
             wanted[MAX_MOTOR_SPEED] = (np.ceil(60.0 * bounds.velocity / self._axes.rotor.scale), True)

@@ -96,6 +96,7 @@ class Manual(NamedTuple):
         hot: Temperature [degC] of a stage that the drive ends in fault.
         hot_told: The emergencies of it: code, error register, additional bytes ("axis": the motor's number).
         further_axis: Bit of 1001h of axes other than the first.
+        refused: 1001h while process data are not taken.
         lost: Emergencies of a lost heartbeat: code, and additional bytes; one of each axis where they name it.
         stopped: The same of a node that is stopped (NMT) while an axis is enabled.
         before_mode: What must be written for a mode: index, step to the next axis, raw value by mode, bytes.
@@ -128,6 +129,7 @@ class Manual(NamedTuple):
     refuses: frozenset[int] = frozenset()
     commands: frozenset[int] = frozenset()
     stores_mapped: bool = False
+    refused: int = 0x21
 
 
 STOPS = {0: "STOPPED", 1: "OPERATIONAL", 2: "STOPPED"}  # manual of the TMCM-1636, table 41
@@ -183,8 +185,19 @@ MANUALS = (
     ),
     Manual(
         "tgz_d",
-        # Its registers lie 100h apart as 3325h and 3425h do; 333Eh is once in the module.
-        areas=((0x2300, 0x23FF, 0x100), (0x3300, 0x333D, 0x100), (0x333F, 0x33FF, 0x100), PROFILE_AREA),
+        # Its registers lie 100h apart as 3325h and 3425h do, but for what the module has once.
+        areas=(
+            *((0x2100 + 0x200 * k, 0x210F + 0x200 * k, 0x100) for k in (0, 2, 3, 4)),
+            *(
+                (0x2300, 0x230C, 0x100),
+                (0x230F, 0x23FF, 0x100),
+                (0x3900, 0x390F, 0x100),
+                (0x2B00, 0x2B02, 0x100),
+                (0x2B04, 0x2B0F, 0x100),
+            ),
+            *((0x3301, 0x3328, 0x100), (0x332B, 0x333D, 0x100), (0x333F, 0x333F, 0x100), (0x3341, 0x33FF, 0x100)),
+            PROFILE_AREA,
+        ),
         pdo_set=0,
         error_behaviour={0: "PRE_OPERATIONAL", 1: "OPERATIONAL", 2: "STOPPED"},  # CiA 301
         inhibit_unit=1e-4,  # CiA 301
@@ -198,8 +211,11 @@ MANUALS = (
         groups={1: ("communication", "profile", "motor 0", "motor 1", "module")},
         shared=frozenset((0x60FE, 0x68FE, 0x60FD, 0x68FD)),
         refuses=frozenset((0x1C12, 0x1C13, 0x1C32, 0x1C33)),  # CoE
-        commands=frozenset((0x4001, 0x23C6, 0x23C7, 0x24C6, 0x24C7)),
+        commands=frozenset(
+            (0x4001, *(index + step for index in (0x23C6, 0x23C7, 0x3908, 0x390A) for step in (0, 0x100)))
+        ),
         stores_mapped=True,  # every parameter is mappable by the table of objects
+        refused=0x01,  # error register: bit 5 is not used
     ),
     Manual(
         "tmcm3313",

@@ -12,7 +12,6 @@ from drive_env.ethercat.world import EtherCatWorld
 from rigs.ethercat_rig import STATION, Rig
 
 COE = 3
-MAILBOXES = "00 10 00 01 26 00 01 00  00 11 00 01 22 00 01 00"  # 1000h and 1100h, 256 bytes each
 
 
 class CoeRig(Rig):
@@ -36,7 +35,9 @@ class CoeRig(Rig):
 
     def bring_to(self, state, station=STATION, outputs=30, inputs=30):
         if self.slave.state is AlState.INIT:
-            self.write(0x0800, MAILBOXES)
+            layout = self.node.layout
+            for address, place, control in ((0x0800, layout.receive, 0x26), (0x0808, layout.send, 0x22)):
+                self.write(address, struct.pack("<HHBBBB", place.start, place.length, control, 0, 1, 0))
             assert self.request(2) == (2, 0)
         if state is AlState.PRE_OP:
             return
@@ -48,23 +49,24 @@ class CoeRig(Rig):
 
     def configure(self, outputs, inputs):
         """Set sync managers 2 and 3 and the FMMUs of both."""
+        places = self.node.layout.outputs, self.node.layout.inputs
         self.write(0x0810, bytes(16))
-        self.write(0x0810, struct.pack("<HHBBBB", 0x1200, outputs, 0x64, 0, 1, 0))
-        self.write(0x0818, struct.pack("<HHBBBB", 0x1300, inputs, 0x20, 0, 1, 0))
-        self.write(0x0600, struct.pack("<IHBBHBBB", 0x10000, outputs, 0, 7, 0x1200, 0, 2, 1))
-        self.write(0x0610, struct.pack("<IHBBHBBB", 0x10000 + outputs, inputs, 0, 7, 0x1300, 0, 1, 1))
+        self.write(0x0810, struct.pack("<HHBBBB", places[0], outputs, 0x64, 0, 1, 0))
+        self.write(0x0818, struct.pack("<HHBBBB", places[1], inputs, 0x20, 0, 1, 0))
+        self.write(0x0600, struct.pack("<IHBBHBBB", 0x10000, outputs, 0, 7, places[0], 0, 2, 1))
+        self.write(0x0610, struct.pack("<IHBBHBBB", 0x10000 + outputs, inputs, 0, 7, places[1], 0, 1, 1))
 
     def ask(self, service, content):
         """Return the services and contents of all messages that answer a CoE request; emergencies are kept aside."""
         self.number = self.number % 7 + 1
         message = struct.pack("<HHBB", len(content) + 2, 0, 0, COE | self.number << 4)
         message += struct.pack("<H", service << 12) + content
-        assert self.write(0x1000, message.ljust(256, b"\0")) == 1
+        assert self.write(self.node.layout.receive.start, message.ljust(256, b"\0")) == 1
         return self.answers()
 
     def answers(self):
         found = []
-        while (data := self.read(0x1100, 256)) is not None:
+        while (data := self.read(self.node.layout.send.start, 256)) is not None:
             length, _, _, kind = struct.unpack_from("<HHBB", data)
             if kind & 15 != COE:
                 found.append((-(kind & 15) - 1, data[6 : 6 + length]))

@@ -48,6 +48,8 @@ def sii(alias=ALIAS, sizes=(4, 6)):
 class EchoDevice:
     """Outputs come back as inputs, with two bytes that count cycles; a CoE message comes back as it was."""
 
+    identification = 0
+
     def __init__(self, layout=LAYOUT, sizes=(4, 6)):
         self.layout = layout
         self.output_size, self.input_size = sizes

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.currents import read_current_limit
 from drive_env.whole_file import content_hash
 from mechanics.arrays import Floats
 
@@ -309,7 +309,7 @@ def envelope(target: Target) -> dict[str, float]:
         "current during identification [A]": np.full(target.num_axes, target.current),
     }
     if (limit := target.device.roles.get(Role.CURRENT_LIMIT)) is not None:
-        rows[f"current in moves, {limit[0]:04X}h [A]"] = target.drives.read(limit) * ampere_per_count(target.drives)
+        rows[f"current in moves, {limit[0]:04X}h [A]"] = read_current_limit(target.drives)
     names = [""] if target.num_axes == 1 else [f"axis {axis}: " for axis in range(target.num_axes)]
     return {f"{name}{what}": float(row[axis]) for axis, name in enumerate(names) for what, row in rows.items()}
 

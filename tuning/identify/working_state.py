@@ -19,7 +19,7 @@ from drive_env import cia402, motion
 from drive_env.devices.gains import bandwidth_gains
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count, to_counts
+from drive_env.drives.currents import read_current_limit, write_current_limit
 from drive_env.drives.interface import Drives, axis_number
 from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
@@ -41,8 +41,8 @@ STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is al
 def borrowed(device: Device) -> tuple[ObjectName, ...]:
     """Return the objects that experiments change, in the order of giving them back, as far as the device has them."""
     names: tuple[ObjectName, ...] = (
-    Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
-    Role.ENCODER_STEPS, *FINDINGS,
+    Role.CURRENT_LIMIT, Role.CURRENT_LIMIT_NEGATIVE, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE,
+    Role.COMMUTATION, Role.POLE_PAIRS, Role.ENCODER_STEPS, *FINDINGS,
     cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
     Role.LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
     (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
@@ -169,9 +169,9 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
         unwired = fresh & (drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
         if Role.LIMIT_SWITCHES in target.device.roles:
             drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
-    own = before[Role.CURRENT_LIMIT] * ampere_per_count(drives)
+    own = read_current_limit(drives)
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
-    drives.write(Role.CURRENT_LIMIT, to_counts(drives, current), where=axes)
+    write_current_limit(drives, current, axes)
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)

@@ -16,8 +16,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.devices.gains import check_linear_model
-from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.currents import ampere_per_count, read_current_limit
 from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
@@ -241,8 +240,7 @@ class _Measurement:
     # --- how strongly ---------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
         """Return the highest permitted current [A]: the user's limit, or the drive's own."""
-        own = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)
-        return np.asarray(np.minimum(self._target.current, own))
+        return np.asarray(np.minimum(self._target.current, read_current_limit(self._target.drives)))
 
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
         """Return the response to a weak excitation; an axis that oscillates gets softer gains first, if it may."""
@@ -374,7 +372,7 @@ class _Measurement:
         return np.asarray(found)
 
     def _note_limits(self, peak: Floats, where: Mask) -> None:
-        limit = self._target.drives.read(Role.CURRENT_LIMIT) * ampere_per_count(self._target.drives)
+        limit = read_current_limit(self._target.drives)
         for axis in np.flatnonzero(where & (peak > 0.98 * limit)):
             self._notes[axis].append(
                 f"the current reached its limit, {limit[axis]:.2f} A, more than the excitation: the loop oscillates, "

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from drive_env import cia402, motion
-from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count, to_counts
+from drive_env.drives.currents import ampere_per_count, read_current_limit, to_counts
 from drive_env.trials.positioning import CYCLE, wrapped
 from mechanics.arrays import Floats, Mask
 from tuning.rules.lags import slow_enough, velocity_lag
@@ -135,7 +134,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     drives, n = target.drives, target.num_axes
     axes = np.ones(n, bool) if where is None else where
     dry = np.zeros(n) if coulomb is None else np.nan_to_num(np.asarray(coulomb, float))
-    limit = OF_LIMIT * drives.read(Role.CURRENT_LIMIT) * ampere_per_count(drives)
+    limit = OF_LIMIT * read_current_limit(drives)
     height = np.minimum(
         np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
     )

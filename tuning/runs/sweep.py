@@ -19,7 +19,7 @@ from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices.gain_set import PID_ON_RAMP, ClosedLoop
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.currents import ampere_per_count, read_current_limit
 from drive_env.drives.speeds import per_increment_of
 from drive_env.drives.trace import Trace
 from drive_env.phase_current import run_and_standby
@@ -334,7 +334,7 @@ def _record(
         signals = {
             "speed_rpm": np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
             "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * ampere_per_count(drives),
-            "current_limit": drives.read(Role.CURRENT_LIMIT).astype(np.float64) * ampere_per_count(drives),
+            "current_limit": read_current_limit(drives),
         }
     recording = MoveRecording(
         t=t,

@@ -74,6 +74,13 @@ def clip(x, limit):
 
 
 @inlined
+def between(x, low, high):
+    """Return x limited to low and high; a nan stays nan."""
+    x = low if x < low else x
+    return high if x > high else x
+
+
+@inlined
 def exponential(x):
     """Return exp(x) to 1e-15 for -1 <= x <= 0; below, the series is applied to x/8 and squared three times."""
     y = x * 0.125

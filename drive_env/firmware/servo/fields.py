@@ -39,6 +39,8 @@ PARAMETERS = (
     Field("hall_interpolation", "f8", "", "2070h:03"),
     Field("hall_offset", "f8", "rad", "2070h:04, electrical angle"),
     # --- data of the device and of its power stage ----------------------------------------------------------------
+    Field("voltage_low", "f8", "1", "share of it that negative outputs of the current regulators may have", 1.0),
+    Field("voltage_high", "f8", "1", "the same of positive ones", 1.0),
     Field("duty_limit", "f8", "1", "radius of the voltage circle as a share of the supply", 0.5773502691896258),
     Field("adc_step", "f8", "A", "one step of the current measurement"),
     Field("adc_step_lsb", "f8", "LSB", "one step of the current measurement in the ADC's register"),

@@ -6,7 +6,7 @@ x = clip(x + P I e), out = clip(P e + x), both at the output's limit, without ba
 
 from __future__ import annotations
 
-from drive_env.firmware.common.arithmetic import clip
+from drive_env.firmware.common.arithmetic import between, clip
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 
@@ -51,10 +51,11 @@ def current_loop(drive):
         limit = 1.0 if drive.angle_source[lane] == 5.0 else drive.duty_limit[lane]
         p_d = drive.current_p_d[lane] * error_d
         p_q = drive.current_p[lane] * error_q
-        sum_d = clip(drive.current_sum_d[lane] + p_d * drive.current_i[lane], limit) * on
-        sum_q = clip(drive.current_sum_q[lane] + p_q * drive.current_i[lane], limit) * on
-        duty_d = clip(p_d + sum_d, limit)
-        duty_q = clip(p_q + sum_q, limit)
+        low, high = -limit * drive.voltage_low[lane], limit * drive.voltage_high[lane]
+        sum_d = between(drive.current_sum_d[lane] + p_d * drive.current_i[lane], low, high) * on
+        sum_q = between(drive.current_sum_q[lane] + p_q * drive.current_i[lane], low, high) * on
+        duty_d = between(p_d + sum_d, low, high)
+        duty_q = between(p_q + sum_q, low, high)
         length = (duty_d * duty_d + duty_q * duty_q) ** 0.5
         scale = on * (limit / length if length > limit else 1.0)
         duty_d = duty_d * scale

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drive_env.firmware.common import causes, fsa, start_up
-from drive_env.firmware.common.brake import CLOSED
+from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT
 from drive_env.firmware.common.modes import CSP, acts_as
 from drive_env.firmware.common.protection import (
     BLOCKS_NEGATIVE,
@@ -49,7 +49,7 @@ def watch_motion(drive, lane, dt):
     # The mean of the period: of a current that oscillates faster, single values are whatever moment they are of.
     asked = drive.asked_mean[lane]
     drive.asked_mean[lane] = 0.0
-    most = REVERSE_SHARE * drive.i_max[lane] * drive.current_share[lane]
+    most = REVERSE_SHARE * (drive.i_high[lane] if asked > 0.0 else -drive.i_low[lane])
     omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
     # It gains speed against the current. One that oscillates has it against the current, too, and loses it then.
     gained = omega - drive.omega_before[lane]
@@ -66,8 +66,9 @@ def watch_motion(drive, lane, dt):
     way = 1.0 if asked > 0.0 else -1.0
     so_far = way * drive.reverse_time[lane]
     drive.reverse_time[lane] = way * ((so_far if so_far > 0.0 else 0.0) + dt) if runs_away else 0.0
+    mode = drive.brake_mode[lane]
     held = (
-        drive.brake_mode[lane] == CLOSED
+        (mode == CLOSED or (mode == WITH_OUTPUT and drive.brake_opened[lane] == 0))
         and drive.stage_on[lane] > 0.0
         and abs(drive.velocity_demand[lane]) > drive.standstill[lane]
         and abs(slow) <= drive.standstill[lane]
@@ -102,8 +103,9 @@ def current_measurement(drive, lane, told):
 
 @stage
 def motor_thermostat(drive, lane, told):
-    """Return whether the winding's thermostat has opened."""
-    return drive.T_winding[lane] > drive.thermostat_temperature[lane]
+    """Return whether the resistance of the motor's sensor is beyond its limits; a feedback without one has none."""
+    found = drive.sensor_resistance[lane]
+    return found > 0.0 and (found < drive.sensor_lowest[lane] or found > drive.sensor_highest[lane])
 
 
 @stage
@@ -133,7 +135,11 @@ def over_speed(drive, lane, told):
 
 @stage
 def contouring(drive, lane, told):
-    """Return whether the axis has been farther from its demand than 6065h for longer than 6066h."""
+    """Return whether the axis is farther from its demand than P-Max..., or than 6065h for longer than 6066h."""
+    most = drive.error_turns[lane] + drive.error_angle[lane]
+    by_position = drive.drive_function[lane] > 0.0 and drive.loop_level[lane] == 2.0
+    if by_position and 0.0 < most < abs(drive.position_demand[lane] - drive.theta_meas[lane]):
+        return True
     # Whole milliseconds; half a period keeps the sum's rounding out.
     return drive.following_time[lane] > drive.following_error_time[lane] + 5e-4
 
@@ -167,8 +173,8 @@ def brake_resistance(drive, lane, told):
 
 @stage
 def i2t(drive, lane, told):
-    """Return whether the stage's I2t budget is used up."""
-    return drive.overload[lane] > 1.0
+    """Return whether the stage's I2t budget is used up, or the motor has more than M-Inull in the mean."""
+    return drive.overload[lane] > 1.0 or drive.mean_motor_current[lane] > drive.nominal_motor_current[lane]
 
 
 @stage

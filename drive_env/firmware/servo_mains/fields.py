@@ -3,7 +3,7 @@
 Names that a device binds, or a test reads:
 
 - peak_current: M-Ipeak [A]: what 32767 of every torque object is, which are currents in the record
-- i_max: limit of the current of its own [A], beside M-Ipeak
+- i_low, i_high: what C-LimN, C-LimP, M-Ipeak and the image leave of the current [A]; i_max is the greater of them
 - target_torque: 6071h [A]: set-point of cst and pt, feed-forward in csp and ip, with torque_offset (loops.py)
 - image_limit: current limit of the process images, raw: 0 none, 32767 no current at all
 - velocity_ratio: 6094h: rpm of a velocity unit; only units read it
@@ -33,21 +33,39 @@ PARAMETERS = (
     *mains_link.PARAMETERS,
     # --- parameters and commands that the dictionary writes -------------------------------------------------------
     Field("peak_current", "f8", "A", "M-Ipeak of the motor"),
+    Field("nominal_motor_current", "f8", "A", "M-Inull of the motor, RMS", 1e9),
+    Field("motor_thermal_time", "f8", "s", "M-ThermTimeConst; 0: its I2t is not watched"),
+    Field("commutation_shift", "f8", "rad", "M-CommutOffset, mechanical angle"),
+    Field("sensor_lowest", "f8", "ohm", "M-MinResTerm: resistance of the motor's sensor below which it is an error"),
+    Field("sensor_highest", "f8", "ohm", "M-MaxResTerm: the same above which", 1e9),
+    Field("static_brake", "i4", "", "M-StaticBrake: 1: a brake at the output"),
+    Field("hardware_delay", "f8", "s", "D-DelayEnable_Hwen: from the enable input's edge until an axis is enabled"),
+    Field("unbrake_delay", "f8", "s", "D-DelayUnbrake_Enable: from current in the motor to the brake's release"),
+    Field("feedback_type", "i4", "", "F-Type"),
+    Field("feedback_resolution", "f8", "1/rev", "F-Resolution"),
+    Field("feedback_pulses", "f8", "1/rev", "F-IncrEnc"),
     Field("current_integration", "f8", "s", "C-Ti: integration time of the current regulators; 0: no integrator"),
     Field("velocity_integration", "f8", "s", "V-Ti: integration time of the velocity regulator; 0: no integrator"),
+    Field("limit_negative", "f8", "1", "C-LimN: limit of negative currents, as amplitudes in units of M-Inull"),
+    Field("limit_positive", "f8", "1", "C-LimP: the same of positive ones"),
+    Field("speed_low", "f8", "rad/s", "V-LimN: limit of negative speeds that the position loop asks for", 1e9),
+    Field("speed_high", "f8", "rad/s", "V-LimP: the same of positive ones", 1e9),
+    Field("error_angle", "f8", "rad", "P-MaxAngleError"),
+    Field("error_turns", "f8", "rad", "P-MaxRevolError"),
     Field("image_limit", "f8", "1/32767", "share of M-Ipeak that is taken away: 0 none, 32767 all"),
     Field("velocity_ratio", "f8", "rpm", "6094h: of a velocity unit", 1.0),
+    Field("profile_bits", "f8", "", "BitsPerRevol: only units read it", 16.0),
     Field("d_mode", "i4", "", "2303h, 2403h"),
     Field("following_error_time", "f8", "s", "6066h: for which the error may be outside of 6065h"),
     Field("negative_switch_mask", "i4", "", "inputs that are the negative limit switch; 0: there is none"),
     Field("positive_switch_mask", "i4", "", "the same of the positive one"),
     Field("home_switch_mask", "i4", "", "the same of the home switch"),
     # --- data of the device and of its motor ----------------------------------------------------------------------
+    Field("module_axis", "i4", "", "which axis of its module it is"),
     Field("d_mode_needed", "i4", "", "D-Mode that each mode of operation needs; 0: any", depth=d_mode.MOST_MODES),
     Field("overspeed", "f8", "rad/s", "speed that is an error", 1e9),
     Field("offset_limit", "f8", "A", "current that may be measured while the stage is off", 1e9),
     Field("current_range", "f8", "A", "of the current measurement", 1e9),
-    Field("thermostat_temperature", "f8", "K", "of the winding above 0 degC, at which its thermostat opens", 1e9),
     Field("motor_temperature", "f8", "K", "of the winding above 0 degC, as its sensor tells it, that is an error", 1e9),
     Field("ambient_limit", "f8", "K", "ambient temperature above 0 degC that is an error", 1e9),
     # --- the machine as it is -------------------------------------------------------------------------------------
@@ -60,6 +78,8 @@ PARAMETERS = (
 STATE = (
     *servo.STATE,
     *mains_link.STATE,
+    Field("i_low", "f8", "A", "least current that may be asked for"),
+    Field("i_high", "f8", "A", "greatest current that may be asked for"),
     Field("torque_feed_forward", "f8", "A", "what csp and ip add to the set-point of the current"),
     Field("disconnected", "i4", "", "1: the D-Mode does not fit, the master is ignored"),
     Field("following_time", "f8", "s", "for which the following error has been outside of its window"),
@@ -70,4 +90,15 @@ STATE = (
     Field("stuck_time", "f8", "s", "for which the brake has held the motor although it was to move"),
     Field("digital_inputs", "i4", "", "4000h: levels of the module's inputs, bits 0 to 7"),
     Field("input_word", "i4", "", "60FDh: the same in bits 16 to 23"),
+    Field("axis_inputs", "i4", "", "Digital_Inputs: every second of them, from the axis' own on"),
+    Field("angle_shifted", "f8", "rad", "what angle_zero has of commutation_shift, electrical angle"),
+    Field("hardware_time", "f8", "s", "for which the enable input has been closed"),
+    Field("phase_square", "f8", "A^2", "mean square of each phase's current", depth=3),
+    Field("phase_rms", "f8", "A", "Ia_rms to Ic_rms", depth=3),
+    Field("motor_square", "f8", "A^2", "mean square of the motor's current by its thermal time constant"),
+    Field("mean_motor_current", "f8", "A", "aI2t: the root of it"),
+    Field("sensor_resistance", "f8", "ohm", "Motor_temperature: of the motor's sensor; 0: it has none"),
+    Field("feedback_link", "f8", "", "DSL_status: 1: a feedback by Hiperface DSL answers"),
+    Field("period_count", "f8", "", "Monitor-Counter: periods since power-on"),
+    Field("drive_status", "f8", "", "aDriveStatus"),
 )

@@ -36,6 +36,8 @@ def read_module_inputs(drive, rates):
             levels |= drive.inputs_set[first + 1] | pressed(drive, first + 1)
         drive.digital_inputs[lane] = levels & ((1 << NUMBER) - 1)
         drive.input_word[lane] = drive.digital_inputs[lane] << LEVELS_SHIFT
+        own = drive.digital_inputs[lane] >> drive.module_axis[lane]
+        drive.axis_inputs[lane] = (own & 1) | (own >> 1 & 2) | (own >> 2 & 4) | (own >> 3 & 8)
 
 
 @stage

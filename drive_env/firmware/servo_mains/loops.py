@@ -9,14 +9,16 @@ current = M-Ipeak", 32767 is full limitation. Taken is the straight line between
 
     i_most = M-Ipeak (32767 - limit) / 32767
 
-and what lies above 32767 is full limitation, too.
+and what lies above 32767 is full limitation, too. C-LimN and C-LimP limit each sign besides, in thousandths of M-Inull
+(in mA of amplitude: C-Lim M-Inull / 1000, as the maker's page has it), V-LimN and V-LimP what the position loop asks
+for.
 """
 
 from __future__ import annotations
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa
-from drive_env.firmware.common.arithmetic import clip
+from drive_env.firmware.common.arithmetic import between
 from drive_env.firmware.common.modes import CSP, acts_as, is_blocked
 from drive_env.firmware.common.modes.cyclic import NO_SET_POINT
 from drive_env.firmware.record import LANES
@@ -27,12 +29,16 @@ FULL_LIMITATION = 32767.0
 
 @inlined
 def share_current(drive):
-    """Write current_share, what M-Ipeak and the current limit leave of i_max, and torque_demand_share."""
+    """Write i_low, i_high: what C-LimN, C-LimP, M-Ipeak and the images leave; i_max, and torque_demand_share."""
     for lane in range(LANES):
-        i_max, peak = drive.i_max[lane], drive.peak_current[lane]
+        peak, nominal = drive.peak_current[lane], drive.nominal_motor_current[lane]
         most = peak * (1.0 - drive.image_limit[lane] / FULL_LIMITATION)
         most = most if most > 0.0 else 0.0
-        drive.current_share[lane] = most / i_max if most < i_max else 1.0
+        low, high = drive.limit_negative[lane] * nominal, drive.limit_positive[lane] * nominal
+        low, high = (low if low < most else most), (high if high < most else most)
+        drive.i_low[lane] = -low
+        drive.i_high[lane] = high
+        drive.i_max[lane] = low if low > high else high
         drive.torque_demand_share[lane] = drive.i_q_ref[lane] / peak if peak > 0.0 else 0.0
 
 
@@ -67,17 +73,19 @@ def motion_loops(drive):
         position_error = drive.position_demand[lane] - drive.theta_meas[lane]
         demand = drive.velocity_demand[lane]
         ahead = drive.feed_forward[lane] * demand
-        omega_ref = drive.position_p[lane] * position_error + ahead if level == 2 else demand
+        asked = between(drive.position_p[lane] * position_error + ahead, -drive.speed_low[lane], drive.speed_high[lane])
+        omega_ref = asked if level == 2 else demand
         error = omega_ref - drive.omega_meas[lane]
-        i_max = drive.i_max[lane] * drive.current_share[lane]
+        low, high = drive.i_low[lane], drive.i_high[lane]
         proportional = drive.velocity_p[lane] * error
-        total = clip(drive.velocity_sum[lane] + proportional * drive.velocity_i[lane], i_max)
-        i_loop = clip(clip(proportional + total, i_max) + drive.torque_feed_forward[lane], i_max)
-        i_direct = clip(drive.torque_demand[lane], i_max)
+        total = between(drive.velocity_sum[lane] + proportional * drive.velocity_i[lane], low, high)
+        i_loop = between(between(proportional + total, low, high) + drive.torque_feed_forward[lane], low, high)
+        i_direct = between(drive.torque_demand[lane], low, high)
         # While torque is commanded the integrator follows it, or a change to a velocity mode would jump.
-        total = clip(i_direct - proportional, i_max) if level == 0 else total
+        total = between(i_direct - proportional, low, high) if level == 0 else total
         i_ref = i_direct if level == 0 else i_loop
-        on = drive.drive_function[lane]
+        # A current that waits for the brake holds the axis meanwhile.
+        on = 1.0 if drive.drive_function[lane] > 0.0 or drive.holding[lane] == 1 else 0.0
         drive.position_error[lane] = position_error
         drive.omega_ref[lane] = omega_ref
         drive.velocity_error[lane] = error

@@ -36,6 +36,13 @@ from drive_env.firmware.servo_mains.mains_link import (
     watch_link,
 )
 from drive_env.firmware.servo_mains.power import convert_energy
+from drive_env.firmware.servo_mains.registers import (
+    energise,
+    find_readings,
+    forget_readings,
+    read_settings,
+    tell_status,
+)
 from mechanics.compiled import stage
 
 
@@ -77,18 +84,14 @@ def read_mains(drive, rates):
 
 @stage
 def prepare_link(drive, rates):
-    """Compute what the ticks need as quotients, and look after the link."""
+    """Take the settings in, compute what the ticks need as quotients, and look after the link."""
+    read_settings(drive, rates.period)
+    find_readings(drive, rates.period)
     derive_sensors(drive)
     find_integral_shares(drive, rates.tick, rates.window)
     share_current(drive)
     watch_link(drive, rates.period)
     derive_link(drive, rates.tick)
-
-
-@stage
-def tell_errors(drive, lane):
-    """Write the error register: a bit for each error that holds, or is shown until the reset."""
-    drive.status_flags[lane] = drive.cause_flags[lane]
 
 
 @stage
@@ -111,12 +114,12 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_link, read_module_inputs),
     measure=(find_switches, servo_causes.watch_phases, causes.watch_motion),
-    switch=(servo_causes.forget_peaks, d_mode.look_at_gate, alignment.commutate, tell_sensor),
-    tell=(feed_forward_current, tell_errors),
+    switch=(servo_causes.forget_peaks, d_mode.look_at_gate, alignment.commutate, energise, tell_sensor),
+    tell=(feed_forward_current, tell_status),
     end_period=(find_what_is_needed,),
     window=(read_motion, regulate_motion, read_mains, prepare_winding),
     tick=(run_tick,),
-    power_on=(power_on, tell_counts, connect, forget_link),
+    power_on=(power_on, tell_counts, connect, forget_readings, forget_link),
     halt=(halt, forget_link),
     remote=d_mode.is_remote,
     tells_all=True,  # TGZ manual, 1003h: each error bit generates one entry
