@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, get_type_hints
 
 import typer
 
@@ -116,6 +116,7 @@ def object_name(text: str) -> ObjectName:
 class BusOptions:
     """Options that name drives on a bus; `grouped` gives a command those of a kind in place of its argument of it."""
 
+    PANEL: ClassVar[str] = "Which drive"
     interface: Interface = None
     channel: Channel = None
     device: DeviceName = DEFAULT_DEVICE
@@ -210,8 +211,11 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def options_of(group: type[Any]) -> list[inspect.Parameter]:
-    """Return the options that the fields of a dataclass are."""
+    """Return the options that the fields of a dataclass are; `--help` shows them under its `PANEL`."""
     hints = get_type_hints(group, include_extras=True)
+    for field in fields(group):
+        for option in getattr(hints[field.name], "__metadata__", ()):
+            option.rich_help_panel = group.PANEL
     return [
         inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
         for f in fields(group)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 
 import typer
 
@@ -48,6 +48,7 @@ def _from_file(context: typer.Context, path: Path | None) -> Path | None:
 class MethodOptions:
     """The options that only some methods have; one that is not given has its default here."""
 
+    PANEL: ClassVar[str] = "How gains are found"
     rule: Annotated[
         str | None,
         typer.Option("--rule", help="With --by rule: the rule by name.", show_default=RULE_BY_DEFAULT),

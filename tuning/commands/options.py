@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 
 import typer
 
@@ -136,6 +136,7 @@ Resume = Annotated[bool, typer.Option("--resume", help="Continue a stopped run w
 class DriveOptions:
     """The options that name a drive, emulated or on a bus; `takes` gives them to a command."""
 
+    PANEL: ClassVar[str] = "Which drive"
     bus: Bus = False
     device: DeviceName = DEFAULT_DEVICE
     eds: ForeignEds = None
