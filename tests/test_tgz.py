@@ -489,7 +489,26 @@ def test_both_axes_have_the_same_outputs_by_either_object(wire):
 def test_every_parameter_is_stored_also_those_of_rpdos_and_the_outputs_mask(wire):
     """1010h stores settings (M has no list of them); what commands an axis or sets outputs begins anew."""
     known, changed = wire.drives.device.new_dictionary(5), {}
-    commands = {0x23C6, 0x3908, 0x390A, 0x4001, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B2, 0x60C1, 0x60FF}
+    commands = {
+        0x23C6,
+        0x23C8,
+        *range(0x3100, 0x3105),
+        0x3109,
+        0x310A,
+        0x333C,
+        0x3904,
+        0x3905,
+        0x3908,
+        0x390A,
+        0x4001,
+        0x6040,
+        0x6060,
+        0x6071,
+        0x607A,
+        0x60B2,
+        0x60C1,
+        0x60FF,
+    }
     own = [entry for entry in known if entry.index >= 0x2000 and entry.bits <= 32 and entry.access in ("rw", "rww")]
     own = [entry for entry in own if entry.index not in (0x200D, 0x2011, 0x2509, 0x2609)]  # node-ID; take 0 alone
     # 60FEh:01 is what 4001h is a part of.
@@ -497,7 +516,7 @@ def test_every_parameter_is_stored_also_those_of_rpdos_and_the_outputs_mask(wire
     for entry in writable:
         base = wire.drives.device.locate(entry.index)[1]
         before = wire.value(entry.index, entry.sub)
-        for raw in {0x3F0000, 1, 2, 3, 0, 0x1721, 0x1B21, 9} - {before}:
+        for raw in {0x3F0000, 1, 2, 3, 0, 0x1721, 0x1B21, 9, 2000} - {before}:
             fits = raw < 1 << entry.bits - entry.signed
             if fits and wire.download(entry.index, entry.sub, raw, entry.bits // 8) == 0:
                 changed[entry.index, entry.sub] = base in commands

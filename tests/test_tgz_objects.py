@@ -177,7 +177,7 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
 }  # fmt: skip
 # Of the maker's registers.
 REGISTERS = (
-    0x2106, 0x2108, *range(0x210A, 0x210F), *range(0x230A, 0x230F), 0x2B00, 0x2B02, 0x2505, 0x2507, 0x2508,
+    0x2010, 0x2106, 0x2108, *range(0x210A, 0x210F), *range(0x230A, 0x230F), 0x2B00, 0x2B02, 0x2505, 0x2507, 0x2508,
     0x2702, 0x2703, 0x2902, 0x2903, 0x3900, 0x3901, 0x3907, 0x3908, 0x390A, 0x390B, 0x390C,
 )  # fmt: skip
 # Objects whose effect other tests find.
@@ -187,6 +187,21 @@ ELSEWHERE = {
     **{
         (index, 0): "what it is of is not emulated: kept and shown"
         for index in (0x200C, 0x200F, 0x2011, 0x2509, 0x2B03)
+    },
+    **{
+        (index, 0): "test_tgz_own_commands.py"
+        for index in (
+            0x23C8,
+            0x23C9,
+            0x23CA,
+            *range(0x3100, 0x3105),
+            0x3109,
+            0x310A,
+            0x333C,
+            0x3904,
+            0x3905,
+            0x3909,
+        )
     },
     (0x200D, 0): "test_tgz.py: node-ID; test_ethercat_tgz.py: alias",
     (0x2B04, 0): "its maker uses it for nothing",

@@ -19,6 +19,36 @@ from drive_env.firmware.record import get_lanes, set_lanes
 DEVICE = find_device("tgz_d")
 RPM = math.pi / 30.0
 TURN = 2**32
+TABLE = """
+C-Type1 2000 - ro|C-Type2 2001 - ro|C-Type3 2002 - ro|C-Type4 2003 - ro|C-Type5 2004 - ro|C-HWVer 2005 - ro
+C-FWVer 2006 - ro|C-FWBuild1 2007 - ro|C-FWBuild2 2008 - ro|C-FWBuild3 2009 - ro|C-FWBuild4 200A - ro
+C-FWBuild5 200B - ro|C-IPAddress 200C - rw|C-ID 200D - rw|C-SyncTime 200E - ro|C-Enable_1G 200F - rw
+C-SetCycleTime 2010 - rw|C-UserProgStart 2011 - rw|M-Name1 2100 2200 rw|M-Name2 2101 2201 rw
+M-Name3 2102 2202 rw|M-Name4 2103 2203 rw|M-Name5 2104 2204 rw|M-Name6 2105 2205 rw|M-Inull 2106 2206 rw
+M-Ipeak 2107 2207 rw|M-Nmax 2108 2208 rw|M-Polepairs 2109 2209 rw|M-CommutOffset 210A 220A rw
+M-MinResTerm 210B 220B rw|M-MaxResTerm 210C 220C rw|M-StaticBrake 210D 220D rw|M-ThermTimeConst 210E 220E rw
+D-Name1 2300 2400 rw|D-Name2 2301 2401 rw|D-Name3 2302 2402 rw|D-Mode 2303 2403 rw
+D-DelayEnable_Hwen 230A 240A rw|D-DelayUnbrake_Enable 230B 240B rw|D-DelayDisable_Brake 230C 240C rw
+D-VoltDCLinkMinErrLim 230D - rw|D-VoltDCLinkMaxErrLim 230E - rw|C-K 2500 2600 rw|C-Ti 2501 2601 rw
+C-KDr 2502 2602 rw|C-Tc 2503 2603 rw|C-Filt 2504 2604 rw|C-LimN 2505 2605 rw|C-LimP 2506 2606 rw
+C-VoltLimMin 2507 2607 rw|C-VoltLimMax 2508 2608 rw|C-CogCompFac 2509 2609 rw|V-K 2700 2800 rw|V-Ti 2701 2801 rw
+V-LimN 2702 2802 rw|V-LimP 2703 2803 rw|V-Tfb 2704 2804 rw|V-Tv 2705 2805 rw|V-FiFact 2706 2806 rw
+P-K 2900 2A00 rw|P-SFF 2901 2A01 rw|P-MaxAngleError 2902 2A02 rw|P-MaxRevolError 2903 2A03 rw
+F-Type 2B00 2C00 rw|F-Resolution 2B01 2C01 rw|F-IncrEnc 2B02 2C02 rw|F-ExtIncrEnc 2B03 - rw
+F-ResolverPoles 2B04 2C04 rw|K-Command 3100 3200 rw|K-I 3101 3201 rw|K-V 3102 3202 rw|K-P_Angle 3103 3203 rw
+K-P_Revol 3104 3204 rw|K-DigitalOutputForce_Set 3109 3209 rw|K-DigitalOutputForce_Clr 310A 320A rw
+Monitor-Counter 3300 - ro|aIa 3301 3401 ro|aIb 3302 3402 ro|aIc 3303 3403 ro|aIq 3306 3406 ro|aId 3307 3407 ro
+aAngle 3310 3410 ro|aRevol 3311 3411 ro|aSpeed 3312 3412 ro|aSpeedError 3314 3414 ro|aAngleError 331C 341C ro
+aRevolError 331D 341D ro|aDriveStatus 3325 3425 ro|aDriveError 3326 3426 ro|aDriveWarning 3327 3427 ro
+AnInput 3328 3428 ro|VoltDCLink 3329 - ro|OnChipTemp 332A - ro|ec_SetPointAngle 332B 342B ro
+ec_SetPointRevol 332C 342C ro|ec_control 332D 342D ro|ec_currentSetPoint 332E 342E ro
+ec_currentLimit 332F 342F ro|Digital_Inputs 3330 3430 ro|Motor_temperature 3331 3431 ro|rIq 3332 3432 ro
+Ia_rms 3333 3433 ro|Ib_rms 3334 3434 ro|Ic_rms 3335 3435 ro|aI2t 3337 3437 ro|rAngle 3338 3438 ro
+rRevol 3339 3439 ro|rSpeed 333A 343A ro|DSL_status 333B 343B ro|DO 333C 343C rw|C-PackeTime 3340 - ro
+Acc 3900 3A00 rw|Dec 3901 3A01 rw|APosAngle 3902 3A02 ro|APosRevol 3903 3A03 ro|DPosAngle 3904 3A04 rw
+DPosRevol 3905 3A05 rw|ASpeed 3906 3A06 ro|PosSpeed 3907 3A07 rw|Speed 3908 3A08 rw|Mode 3909 3A09 rw
+Rdy 390A 3A0A rw|Type 390B 3A0B rw|BitsPerRevol 390C 3A0C rw
+"""
 OVER_VOLTAGE, UNDER_VOLTAGE, BRAKE, MOTOR_HOT, FEEDBACK, COMMUTATION, OVER_SPEED, I2T = 3, 4, 6, 9, 12, 13, 14, 25
 
 
@@ -45,6 +75,23 @@ def turn(drives, speed, seconds=0.4):
     motion.enable(drives, mode="pv")
     drives.write(cia402.TARGET_VELOCITY, f"{speed} rpm")
     drives.advance(seconds)
+
+
+# --- the table ----------------------------------------------------------------------------------------------------
+def test_the_dictionary_has_the_makers_table():
+    """Number of both axes and access of each register; a name has its group where it would be unclear without."""
+    known, seen = DEVICE.new_dictionary(), 0
+    for line in TABLE.split("\n"):
+        for found in filter(None, line.split("|")):
+            name, first, second, access = found.split()
+            assert known.find((int(first, 16), 0)).access == access, name
+            if second != "-":
+                assert int(second, 16) == int(first, 16) + 0x100
+                entry = known.find((int(second, 16), 0))
+                assert DEVICE.locate(entry.index) == (1, int(first, 16)) and entry.access == access, name
+            assert known.find((int(first, 16), 0)).name.rpartition(" ")[2] == name
+            seen += 1
+    assert seen == 124
 
 
 # --- the motor --------------------------------------------------------------------------------------------------------
@@ -167,6 +214,19 @@ def test_the_levels_of_the_link_are_those_of_both_axes():
             assert wire.download(index, 0, before, 4) == 0
             wire.wait(3)
             motion.reset_fault(drives)
+
+
+def test_c_setcycletime_is_the_time_in_which_a_set_point_is_reached():
+    """csp with 2 ms: the demand is half way after the first, and there after the second."""
+    with new_drives() as drives:
+        drives.write("C-SetCycleTime", 2000)
+        drives.advance(0.002)
+        motion.enable(drives, mode="csp")
+        trace = drives.record([0x6062], 0.006, {cia402.TARGET_POSITION: np.array([0, 0, 1000, 1000, 1000, 1000])})
+        demand = trace[0x6062][:, 0] - trace[0x6062][0, 0]
+        assert 400 < demand[3] < 600 or 400 < demand[4] < 600
+        with pytest.raises(ObjectAccessError):
+            drives.write("C-SetCycleTime", 3000)
 
 
 # --- enabling and the brake -------------------------------------------------------------------------------------------

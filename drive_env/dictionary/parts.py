@@ -53,6 +53,7 @@ class Part(NamedTuple):
         if self.table:
             return sum((part == shown) * whole for whole, shown in self.table)
         mask = ((1 << self.bits) - 1) << self.shift
+        mask -= (mask >> 63) << 64  # as a signed number of 64 bits
         return (raw & ~mask) | ((part << self.shift) & mask)
 
 

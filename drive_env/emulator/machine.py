@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors
+# Of drives with two axes: outputs of an axis, which is every second one, and where they are in the native control.
+AXES, AXIS_OUTPUTS, NATIVE_OUTPUTS = 2, 3, 28
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
 _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
@@ -289,10 +291,28 @@ class Machines:
 
     @property
     def outputs(self) -> Integers:
-        """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,)."""
-        read = self.drives.read
-        pins = (1 << self.inside.device.num_outputs) - 1
-        return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & pins
+        """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,).
+
+        A drive whose axes have registers of their own for every second output sets and clears them by these, too.
+        """
+        read, device = self.drives.read, self.inside.device
+        pins = (1 << device.num_outputs) - 1
+        set_ = (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & pins
+        if Role.OUTPUTS_OWN not in device.roles:
+            return set_
+        own = read(Role.OUTPUTS_OWN) | read(Role.OUTPUTS_SET) | read(Role.NATIVE_CONTROL) >> NATIVE_OUTPUTS
+        return (set_ | self._of_both(own)) & ~self._of_both(read(Role.OUTPUTS_CLEAR)) & pins
+
+    def _of_both(self, own: Integers) -> Integers:
+        """Return the outputs of a module by those of its axes: the first has outputs 0, 2, 4, the second 1, 3, 5."""
+        count = self.inside.device.num_axes
+        number = np.arange(len(own))
+        spread = sum(((own >> bit & 1) << (AXES * bit)) << number % count for bit in range(AXIS_OUTPUTS))
+        found = np.zeros(len(own), np.int64)
+        for axis in range(count):
+            mate = number - number % count + axis
+            found |= np.where(mate < len(own), spread[np.minimum(mate, len(own) - 1)], 0)
+        return found
 
     @property
     def digital_inputs(self) -> Integers:

@@ -71,7 +71,9 @@ class NodeDictionary:
         key = (entry.index, entry.sub)
         is_command = key in self._module.commands or key in self._device.unsupported
         stores_mapped = self._device.canopen.quirks.stores_mapped
-        if entry.pdo_mappable and not (stores_mapped and not self._commands(key)):
+        if stores_mapped and self._commands(key):
+            return None
+        if entry.pdo_mappable and not stores_mapped:
             return None
         if entry.access not in WRITTEN or entry.bits is None or is_command:
             return None
@@ -85,7 +87,7 @@ class NodeDictionary:
         return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
 
     def _commands(self, key: tuple[int, int]) -> bool:
-        """Return whether an object that a PDO can carry commands something."""
+        """Return whether an object commands something."""
         axis_0 = self._device.locate(key[0])[1]
         if (axis_0, key[1]) == cia402.OUTPUTS_MASK:
             return False

@@ -97,6 +97,9 @@ class Commands:
         self._axes = axes
         self._limits = limits
         self._modes = modes
+        role = drives.description.role
+        # Objects that enable otherwise than a controlword, and the bits by which they do: mask and value.
+        self._enables = {role(Role.SERVICE_COMMAND): (3, 1), role(Role.NATIVE_CONTROL): (2, 2)}
         self._target_inside = drives.description.role(Role.TARGET_INSIDE)
         self._set_points: dict[Key, Integers] = {}  # as they were written or read last
 
@@ -259,6 +262,11 @@ class Commands:
         self, entry: Entry, raw: Integers, where: Mask, played: Mapping[Entry, Integers] | None = None
     ) -> None:
         key = (entry.index, entry.sub)
+        if key in self._enables and np.any((raw & self._enables[key][0] == self._enables[key][1]) & where):
+            raise SafetyError(
+                f"{entry.label} enables a motor beside the controlword, where limits and stops of this program do not "
+                "reach it; nothing was sent. Enable by 6040h"
+            )
         if self._is_other_target(key):
             self._check_position(entry, self._target(key, raw), where, LED_MODES)
         elif key in (TARGET_POSITION, POSITION_OFFSET):

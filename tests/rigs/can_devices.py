@@ -191,6 +191,7 @@ MANUALS = (
             *(
                 (0x2300, 0x230C, 0x100),
                 (0x230F, 0x23FF, 0x100),
+                (0x3100, 0x31FF, 0x100),
                 (0x3900, 0x390F, 0x100),
                 (0x2B00, 0x2B02, 0x100),
                 (0x2B04, 0x2B0F, 0x100),
@@ -212,7 +213,28 @@ MANUALS = (
         shared=frozenset((0x60FE, 0x68FE, 0x60FD, 0x68FD)),
         refuses=frozenset((0x1C12, 0x1C13, 0x1C32, 0x1C33)),  # CoE
         commands=frozenset(
-            (0x4001, *(index + step for index in (0x23C6, 0x23C7, 0x3908, 0x390A) for step in (0, 0x100)))
+            (
+                0x4001,
+                *(
+                    index + step
+                    for index in (
+                        0x23C6,
+                        0x23C7,
+                        0x23C8,
+                        0x23C9,
+                        0x23CA,
+                        *range(0x3100, 0x3105),
+                        0x3109,
+                        0x310A,
+                        0x333C,
+                        0x3904,
+                        0x3905,
+                        0x3908,
+                        0x390A,
+                    )
+                    for step in (0, 0x100)
+                ),
+            )
         ),
         stores_mapped=True,  # every parameter is mappable by the table of objects
         refused=0x01,  # error register: bit 5 is not used

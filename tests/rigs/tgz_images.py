@@ -16,7 +16,7 @@ STRUCTURES = """
 1702 int32 - uint32 68FF uint32 - uint16 6840 int16 6871 uint16 24C6 int16 -
 1703 int32 - uint32 - uint32 60FE:1 uint16 6040 int16 6071 uint16 23C6 int16 -
 1703 int32 - uint32 - uint32 - uint16 6840 int16 6871 uint16 24C6 int16 -
-1721 int64 23C7 uint32 6040 int16 6071 uint16 23C6 int64 24C7 uint32 6840 int16 6871 uint16 24C6
+1721 int64 23C7 uint32 23C8 int16 6071 uint16 23C6 int64 24C7 uint32 24C8 int16 6871 uint16 24C6
 1721 uint32 - uint32 - uint32 -
 1B01 int32 6064 int32 606C uint32 60FD uint16 6041 int16 6077 uint16 4002:1 uint16 4003:1
 1B01 int32 6864 int32 686C int32 333E uint16 6841 int16 6877 uint16 4002:2 uint16 4003:2

@@ -250,3 +250,4 @@ CAUSES = (
     # The axis has left its limits: no command, and nothing else ends with it.
     Cause(FAULT_RESET, WARN, 0x00, 0x0),
 )
+FAULTS = sum(1 << row for row, cause in enumerate(CAUSES) if cause.reaction in (CUT, STOP))  # as bits of `present`

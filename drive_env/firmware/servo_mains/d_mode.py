@@ -37,8 +37,13 @@ def is_remote(drive, lane):
 
 @stage
 def look_at_gate(drive, lane, dt):
-    """Connect or disconnect the axis, once per period; one that is disconnected while it moves is stopped."""
-    if fits(drive, lane):
+    """Connect or disconnect the axis, once per period; one that is disconnected while it moves is stopped.
+
+    One that the service program has enabled (own_commands.py) is connected after it has stopped.
+    """
+    has_fit = fits(drive, lane)
+    drive.gate_fits[lane] = 1 if has_fit and drive.mode[lane] != 0 else 0
+    if has_fit and drive.service[lane] == 0:
         drive.disconnected[lane] = 0
         return
     if drive.disconnected[lane] == 0:

@@ -42,11 +42,17 @@ def read_settings(drive, dt):
         delay = (drive.unbrake_delay[lane] if has_brake else 0.0) + (wait if wait > 0.0 else 0.0)
         # While an axis waits for it the delay is the one of the command.
         drive.enable_delay[lane] = drive.enable_delay[lane] if drive.transition_pending[lane] == 4 else delay
-    for pair in range(LANES // 2):  # the levels of a link are those of its first axis
+    for pair in range(LANES // 2):  # what a module has once is its first axis'
         first, second = 2 * pair, 2 * pair + 1
         shared = drive.link_shared[second] > 0.5
         drive.undervoltage[second] = drive.undervoltage[first] if shared else drive.undervoltage[second]
         drive.overvoltage[second] = drive.overvoltage[first] if shared else drive.overvoltage[second]
+        drive.set_cycle[second] = drive.set_cycle[first] if shared else drive.set_cycle[second]
+    for lane in range(LANES):
+        is_new = drive.set_cycle[lane] != drive.cycle_seen[lane]
+        drive.cycle_seen[lane] = drive.set_cycle[lane]
+        drive.interpolation_value[lane] = 1e3 * drive.set_cycle[lane] if is_new else drive.interpolation_value[lane]
+        drive.interpolation_index[lane] = -3.0 if is_new else drive.interpolation_index[lane]
 
 
 @inlined
@@ -102,6 +108,7 @@ def tell_status(drive, lane):
 def forget_readings(drive, lane):
     """Begin anew: nothing counted, nothing measured."""
     drive.angle_shifted[lane] = 0.0
+    drive.cycle_seen[lane] = drive.set_cycle[lane]
     drive.hardware_time[lane] = 0.0
     drive.motor_square[lane] = 0.0
     drive.period_count[lane] = 0.0

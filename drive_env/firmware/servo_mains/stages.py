@@ -20,7 +20,7 @@ from drive_env.firmware.servo.stages import (
     tell_sensor,
     warm,
 )
-from drive_env.firmware.servo_mains import causes, d_mode, fields
+from drive_env.firmware.servo_mains import causes, d_mode, fields, own_commands
 from drive_env.firmware.servo_mains.inputs import find_switches, read_module_inputs
 from drive_env.firmware.servo_mains.loops import (
     feed_forward_current,
@@ -114,12 +114,20 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_link, read_module_inputs),
     measure=(find_switches, servo_causes.watch_phases, causes.watch_motion),
-    switch=(servo_causes.forget_peaks, d_mode.look_at_gate, alignment.commutate, energise, tell_sensor),
-    tell=(feed_forward_current, tell_status),
+    switch=(
+        servo_causes.forget_peaks,
+        d_mode.look_at_gate,
+        own_commands.obey_native_control,
+        own_commands.obey_service,
+        alignment.commutate,
+        energise,
+        tell_sensor,
+    ),
+    tell=(feed_forward_current, own_commands.give_back, tell_status),
     end_period=(find_what_is_needed,),
     window=(read_motion, regulate_motion, read_mains, prepare_winding),
     tick=(run_tick,),
-    power_on=(power_on, tell_counts, connect, forget_readings, forget_link),
+    power_on=(power_on, tell_counts, connect, own_commands.forget_commands, forget_readings, forget_link),
     halt=(halt, forget_link),
     remote=d_mode.is_remote,
     tells_all=True,  # TGZ manual, 1003h: each error bit generates one entry

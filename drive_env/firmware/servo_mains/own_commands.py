@@ -1,0 +1,169 @@
+"""Commands that are not CiA 402's: control of the native image, and K-Command of the service modes.
+
+The native image's control (bit 0 clear errors, bit 1 enable the power stage) acts at its edges, as the same commands do
+of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation.
+
+K-Command (bits 1 and 0 are 01: enable; bit 3: clear errors) is that of the maker's service program. It acts while the
+master is disconnected or has no mode (6060h is 0), in the modes of the D-Mode: K-I, K-V or K-P_Angle and K-P_Revol are
+the set-point in 1, 2 and 3, Speed of the profile generator in 6, and DPosAngle and DPosRevol in 7 (Speed, with its Mode
+0). An axis that is enabled so stops by a quick stop, and its power goes off, when K-Command, the D-Mode, or a mode that
+fits says so; the master is connected after that alone. It is enabled again by another 0 to 01 of K-Command, never by
+one that was there before an error, or before power-on.
+"""
+
+from __future__ import annotations
+
+from drive_env import cia402
+from drive_env.firmware.common import fsa, modes
+from drive_env.firmware.common.modes import CSP, CST, CSV, PP, PV, pp
+from drive_env.firmware.servo_mains.causes import FAULTS
+from drive_env.firmware.servo_mains.d_mode import QUICK_STOP
+from mechanics.compiled import stage
+
+CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, SPEED_PROFILE, POSITION_PROFILE = 1, 2, 3, 6, 7  # D-Mode
+CLEAR, ENABLE = 0x01, 0x02  # bits of the native image's control
+SERVICE_MASK, SERVICE_ENABLE, SERVICE_CLEAR = 0x03, 0x01, 0x08  # of K-Command
+SHUTDOWN, SWITCH_ON, OPERATE = (
+    int(cia402.COMMANDS[name].value) for name in ("shutdown", "switch on", "enable operation")
+)
+NEW_SET_POINT = int(cia402.NEW_SET_POINT)
+
+
+@stage
+def clear_errors(drive, lane):
+    """Leave fault if none of its causes is there."""
+    fsa.reset_fault(drive, lane, drive.present[lane] & FAULTS == 0)
+
+
+@stage
+def step_up(drive, lane):
+    """Give the next command on the way to operation enabled; return whether the axis is there."""
+    state = drive.fsa[lane]
+    if state == fsa.ENABLED:
+        return True
+    word = SHUTDOWN if state == fsa.DISABLED else (OPERATE if state == fsa.SWITCHED else SWITCH_ON)
+    drive.controlword[lane] = OPERATE if drive.transition_pending[lane] == 4 else word
+    fsa.command(drive, lane)
+    return False
+
+
+@stage
+def obey_native_control(drive, lane, dt):
+    """Act on the edges of the native image's control."""
+    control = int(drive.native_control[lane]) & (CLEAR | ENABLE)
+    before = drive.native_before[lane]
+    drive.native_before[lane] = control
+    if control & ~before & CLEAR:
+        clear_errors(drive, lane)
+    if control & ~before & ENABLE:
+        drive.native_wants[lane] = 1
+        if drive.d_mode[lane] == POSITION_MODE and drive.mode[lane] != CSP:
+            modes.request_mode(drive, lane, CSP)
+            drive.disconnected[lane] = 0
+    if before & ~control & ENABLE:
+        drive.native_wants[lane] = 0
+        drive.controlword[lane] = SHUTDOWN
+        fsa.command(drive, lane)
+    failed = drive.fsa[lane] == fsa.FAULTED or drive.fsa[lane] == fsa.REACTING or drive.disconnected[lane] == 1
+    if drive.native_wants[lane] == 1 and (failed or step_up(drive, lane)):
+        drive.native_wants[lane] = 0
+
+
+@stage
+def service_mode(drive, lane):
+    """Return the mode of operation that a D-Mode is to K-Command; 0: none."""
+    own = drive.d_mode[lane]
+    if own == CURRENT_MODE:
+        return CST
+    if own == VELOCITY_MODE:
+        return CSV
+    if own == POSITION_MODE:
+        return CSP
+    if own == SPEED_PROFILE or (own == POSITION_PROFILE and drive.profile_mode[lane] == 0):
+        return PV
+    return PP if own == POSITION_PROFILE else 0
+
+
+@stage
+def obey_service(drive, lane, dt):
+    """Enable, stop and lead an axis by K-Command; writes `service`: 0 off, 1 on, 2 stopping."""
+    wants = drive.service_command[lane] & SERVICE_MASK == SERVICE_ENABLE
+    clears = drive.service_command[lane] & SERVICE_CLEAR
+    if clears and not drive.service_before[lane] & SERVICE_CLEAR and drive.gate_fits[lane] == 0:
+        clear_errors(drive, lane)
+    rises = wants and drive.service_before[lane] & SERVICE_MASK != SERVICE_ENABLE
+    drive.service_before[lane] = drive.service_command[lane]
+    mode = service_mode(drive, lane)
+    faulted = drive.fsa[lane] == fsa.FAULTED or drive.fsa[lane] == fsa.REACTING
+    alone = drive.disconnected[lane] == 1 or drive.mode[lane] == 0
+    is_off = drive.drive_function[lane] == 0.0 and not faulted
+    if drive.service[lane] == 0 and rises and alone and is_off and mode != 0:
+        drive.service[lane] = 1
+        drive.service_mode[lane] = mode
+        drive.disconnected[lane] = 1
+    if drive.service[lane] == 1 and faulted:
+        drive.service[lane] = 2
+    if drive.service[lane] == 1:
+        if not wants or mode != drive.service_mode[lane] or drive.gate_fits[lane] == 1:
+            drive.service[lane] = 2
+            drive.controlword[lane] = QUICK_STOP
+            fsa.command(drive, lane)
+        else:
+            step_up(drive, lane)
+    if drive.service[lane] == 2 and drive.drive_function[lane] == 0.0:
+        drive.service[lane] = 0
+    if drive.service[lane] == 1 and drive.fsa[lane] == fsa.ENABLED:
+        if drive.service_leads[lane] == 0:  # no position of before moves it
+            drive.service_leads[lane] = 1
+            drive.service_position[lane] = drive.theta_meas[lane]
+            drive.profile_position[lane] = drive.theta_meas[lane]
+        lead(drive, lane, mode)
+    else:
+        drive.service_leads[lane] = 0
+
+
+@stage
+def lead(drive, lane, mode):
+    """Put mode and set-points of the service in place of the master's, for this period."""
+    drive.masters_mode[lane] = drive.mode[lane]
+    drive.masters_torque[lane] = drive.target_torque[lane]
+    drive.masters_velocity[lane] = drive.target_velocity[lane]
+    drive.masters_position[lane] = drive.target_position[lane]
+    drive.leads[lane] = 1
+    drive.mode[lane] = mode
+    drive.target_torque[lane] = drive.service_current[lane] - drive.torque_offset[lane] if mode == CST else 0.0
+    if mode == CSV:
+        drive.target_velocity[lane] = drive.service_velocity[lane]
+    elif mode == CSP:
+        drive.target_position[lane] = drive.service_position[lane]
+    elif mode == PP:
+        drive.target_position[lane] = drive.profile_position[lane]
+        new = drive.set_point_valid[lane] == 0 or drive.profile_position[lane] != drive.profile_taken[lane]
+        if drive.mode_display[lane] == PP and new:
+            drive.profile_taken[lane] = drive.profile_position[lane]
+            drive.controlword[lane] = OPERATE | NEW_SET_POINT
+            pp.new_set_point(drive, lane, OPERATE)
+            drive.controlword[lane] = OPERATE
+    if mode in (CSV, CSP):
+        drive.set_point_fresh[lane] = 1
+
+
+@stage
+def give_back(drive, lane):
+    """Give the master its mode and its set-points back, as it wrote them."""
+    if drive.leads[lane] == 1:
+        drive.leads[lane] = 0
+        drive.mode[lane] = drive.masters_mode[lane]
+        drive.target_torque[lane] = drive.masters_torque[lane]
+        drive.target_velocity[lane] = drive.masters_velocity[lane]
+        drive.target_position[lane] = drive.masters_position[lane]
+
+
+@stage
+def forget_commands(drive, lane):
+    """Begin anew: no command of before acts."""
+    drive.native_before[lane] = int(drive.native_control[lane]) & (CLEAR | ENABLE)
+    drive.native_wants[lane] = 0
+    drive.service_before[lane] = drive.service_command[lane]
+    drive.service[lane] = 0
+    drive.leads[lane] = 0
