@@ -92,7 +92,8 @@ class CoeNode:
         self.state = AlState.INIT
         self.layout = SlaveLayout(
             MailboxPlace(*behaviour.receive), MailboxPlace(*behaviour.send), behaviour.outputs, behaviour.inputs,
-            MailboxPlace(*behaviour.bootstrap_receive), MailboxPlace(*behaviour.bootstrap_send),
+            behaviour.bootstrap_receive and MailboxPlace(*behaviour.bootstrap_receive),
+            behaviour.bootstrap_send and MailboxPlace(*behaviour.bootstrap_send),
         )  # fmt: skip
         self._device = device
         self._axes = NodeAxes(drives, first_axis, spare)
