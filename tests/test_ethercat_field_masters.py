@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
+import subprocess
 
+import numpy as np
 import pytest
 from rigs.coe_rig import CoeRig
 from rigs.ethercat_segment import EmulatedSegment
@@ -11,12 +14,17 @@ from rigs.field_masters import AXES, CODESYS, ENABLED, HAS_STATE, ICUBE, STARTUP
 from rigs.namespaces import needs_namespaces, seen_by
 from rigs.namespaces import spaces as spaces
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, EtherCatDrives, motion
 from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.ethercat.pcap_log import PcapLog
 from drive_env.master.ethercat.ethercat_master import ImageSizes, Sync0
+from drive_env.master.ethercat.frame_master import FrameMaster
+from drive_env.master.ethercat.frame_ways import CallWay
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
+from drive_env.master.parameters import parameters
 
 CYCLES, SETTLING = 150, 200
+TSHARK = shutil.which("tshark")
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +82,31 @@ def test_a_start_up_can_be_repeated(pre_op, name):
     assert (pre_op.node.output_size, pre_op.node.input_size) == STARTUPS[name].sizes
 
 
+@pytest.mark.skipif(TSHARK is None, reason="tshark is not installed (Debian: apt install tshark)")
+@pytest.mark.parametrize("name", STARTUPS)
+def test_wireshark_reads_the_same_writes_and_no_malformed_frame(drives, name, tmp_path):
+    startup, path, rig = STARTUPS[name], tmp_path / "startup.pcap", CoeRig(drives)
+    with PcapLog(path) as log:
+        rig.world.segment.listeners.append(log.add)
+        rig.bring_to(AlState.PRE_OP)
+        answers(rig, startup)
+        outputs, inputs = startup.sizes
+        rig.bring_to(AlState.OP, outputs=outputs, inputs=inputs)
+        moved(lambda images: [rig.exchange_image(images[0], inputs)[0]], startup)
+
+    def dissected(*arguments):
+        done = subprocess.run([TSHARK, "-r", path, *arguments], capture_output=True, text=True, timeout=60.0)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    assert dissected("-Y", "_ws.malformed") == []
+    sent = "ecat_mailbox.coe.sdoccsid && eth.src[0] == 01"  # as they left the master
+    fields = ("ecat_mailbox.coe.sdoidx", "ecat_mailbox.coe.sdosub")
+    found = dissected("-Y", sent, "-T", "fields", *(part for field in fields for part in ("-e", field)))
+    read = [tuple(int(word, 16) for word in line.split()) for line in found]
+    assert read == [(index, sub or 0) for index, sub, _ in startup.rows()]
+
+
 def test_codesys_with_the_assignment_taken_away_first(pre_op):
     whole = [row for row in CODESYS.rows() if row[1] is None]
     for index in (0x1C12, 0x1C13):
@@ -99,6 +132,26 @@ def test_six_axes_of_two_modules_under_icube_s_configuration(sync0):
         found = moved(lambda images: master.exchange(images, 1.0), ICUBE, slaves=2)
         assert found == pytest.approx([CYCLES * 4 * k for k in range(1, 7)], abs=40)
         master.close()
+
+
+@pytest.mark.parametrize("name", STARTUPS)
+def test_our_master_works_where_another_left_its_mapping_and_puts_it_back(pre_op, name):
+    """Gaps are in it, which no image of ours has."""
+    objects = (0x1600, 0x1A00, 0x1C12, 0x1C13)
+    assert {code for _, code in answers(pre_op, STARTUPS[name])} == {0}
+    left = [pre_op.upload(index, complete=True) for index in objects]
+    master = FrameMaster(CallWay(pre_op.world.receive))
+    with EtherCatDrives("tmcm3313", master=master, nodes=(0,), pace="lockstep") as drives:
+        drives.record([0x6041, 0x6064], 0.002, {0x607A: np.tile(drives.read(0x6064), (2, 1))})  # maps both images
+        motion.enable(drives, mode="csp")
+        start = drives.read(0x6064)
+        targets = start + np.minimum(np.arange(CYCLES + 50), CYCLES)[:, None] * 4
+        trace = drives.record([0x6041, 0x6064], (CYCLES + 50) * 0.001, {0x607A: targets})
+        np.testing.assert_allclose(trace[0x6064][-1] - start, CYCLES * 4, atol=40)
+        backed_up = {(entry.index, entry.sub) for entry in parameters(drives)}
+        assert {(index, 1) for index in objects} <= backed_up, "on EtherCAT they are parameters"
+    pre_op.bring_to(AlState.PRE_OP)
+    assert [pre_op.upload(index, complete=True) for index in objects] == left
 
 
 def igh(master, position, rows):

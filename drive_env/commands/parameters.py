@@ -95,7 +95,7 @@ def diff(
         if other is not None:
             if names_a_bus(context):
                 raise ValueError(f"{file} is compared with {other}, and with no drive; leave the bus out, or {other}")
-            dictionary = describe(bus.device, eds).dictionary
+            dictionary = describe(bus.device, eds, on_ethercat=True).dictionary  # either file may be of that bus
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             _tell_of_changes(file)
             _tell_of_changes(other)
@@ -136,11 +136,12 @@ def restore(
     """
     from drive_env.fieldbus.description import describe
     from drive_env.master.identity import check_same_drive, read_identity
+    from drive_env.master.open_drives import is_ethercat
     from drive_env.master.parameter_files import checked_origin, load_parameters
     from drive_env.master.parameters import check_no_commands
 
     with errors_as_exit_codes():
-        known = describe(bus.device, eds)
+        known = describe(bus.device, eds, is_ethercat(bus.interface))
         wanted = load_parameters(file, known.dictionary)
         written, axis_then = checked_origin(file, unchecked=unchecked)
         check_no_commands(wanted, file, known.hints)

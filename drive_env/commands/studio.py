@@ -63,6 +63,7 @@ def studio(
     with errors_as_exit_codes():
         check_extra()
         from drive_env.fieldbus.description import describe
+        from drive_env.master.open_drives import is_ethercat
         from drive_env.studio import server
         from drive_env.studio.gate import checked_token, is_loopback, new_token
         from drive_env.studio.pages import studio_pages
@@ -77,7 +78,7 @@ def studio(
         if not listen:
             raise ValueError("--listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in")
         device = bus.device
-        described = describe(device, eds)
+        described = describe(device, eds, is_bus and is_ethercat(bus.interface))
         opener = _bus(described, bus, eds) if is_bus else _machine(device, load, motor, factory, seed)
         title = _title(described, bus) if is_bus else f"{device}, emulated, load {load}"
         named = {"interface": bus.interface, "channel": bus.channel, "nodes": bus.node, "bitrate": bus.bitrate}

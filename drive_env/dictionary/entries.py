@@ -97,6 +97,15 @@ def eds_text(path: Path | EdsText) -> str:
     return _source(path)[0]
 
 
+def written_objects(path: Path | EdsText, indices: Iterable[int]) -> dict[int, ODArray | ODRecord]:
+    """Return objects that an EDS has read only as those of a fieldbus that can write them, by index."""
+    found = {index: copy.deepcopy(read_eds(path)[index]) for index in indices}
+    for item in found.values():
+        for member in item.values():
+            member.access_type = "rw"
+    return found
+
+
 def _source(path: Path | EdsText) -> tuple[str, str]:
     """Return an EDS's text and where it is from."""
     return (path.text, path.name) if isinstance(path, EdsText) else (_read_text(path), str(path))

@@ -6,13 +6,11 @@ By 1C00h a master reads what each sync manager does, by the object of an image w
 
 from __future__ import annotations
 
-import copy
-
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drive_env.devices import Device
 from drive_env.devices.image_rows import TYPES, FixedImage, fixed_images
-from drive_env.dictionary.entries import ObjectDictionary, read_eds
+from drive_env.dictionary.entries import ObjectDictionary, written_objects
 from drive_env.node.process_image import SYNC_MANAGER_TYPES, SYNCHRONISATION
 
 U8, U16, U32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
@@ -42,7 +40,7 @@ def ethercat_objects(device: Device) -> dict[int, ODArray | ODRecord]:
     dictionary = device.new_dictionary()
     images = fixed_images(device.presets.parent)
     found = {index: _image(index, image, dictionary) for index, image in images.items()}
-    found |= {index: _written(read_eds(device.eds)[index]) for index in device.ethercat.writable}
+    found |= written_objects(device.eds, device.ethercat.writable)
     if not dictionary.has(SYNC_MANAGER_TYPES):
         found[SYNC_MANAGER_TYPES] = _object(
             ODArray("Sync manager type", SYNC_MANAGER_TYPES),
@@ -68,14 +66,6 @@ def _object(
         member.data_type, member.access_type, member.default = kind, access, default
         member.pdo_mappable = False
         item.add_member(member)
-    return item
-
-
-def _written(item: ODArray | ODRecord) -> ODArray | ODRecord:
-    """Return an object of the EDS as one that can be written."""
-    item = copy.deepcopy(item)
-    for member in item.values():
-        member.access_type = "rw"
     return item
 
 

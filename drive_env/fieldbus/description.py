@@ -17,7 +17,7 @@ from drive_env.cia402 import Key
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.drive_eds import axes_of, read_types
-from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName, written_objects
 from drive_env.dictionary.roles import Role
 
 CYCLE = 0.001  # communication cycle where the device says nothing else [s]
@@ -181,8 +181,13 @@ class Description:
         return self.dictionary.has(name)
 
 
-def describe(device: str | None, eds: str | Path | None) -> Description:
+def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = False) -> Description:
     """Return the description of a known device by name, or of any other by its EDS.
+
+    Args:
+        device: The name.
+        eds: The EDS in place of it.
+        on_ethercat: Objects can be written that the EDS of a known device, which is CAN's, has read only.
 
     Raises:
         ValueError: For an unknown name, or a file that is no EDS of a drive.
@@ -191,9 +196,12 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
         if device is None:
             raise ValueError("give the name of a device, or the EDS of the drive")
         known = find_device(device)
+        dictionary = known.new_dictionary()
+        if on_ethercat and known.ethercat is not None:
+            dictionary = dictionary.including(written_objects(known.eds, known.ethercat.writable).values())
         return Description(
             known.name,
-            known.new_dictionary(),
+            dictionary,
             known.num_axes,
             known,
             known.master,

@@ -74,7 +74,7 @@ class EtherCatDrives(BusDrives):
         for option in options:
             of_can = f"{option} is for CAN; leave it out with interface={interface!r}"
             raise ValueError(of_can if option in OF_CAN else f"EtherCatDrives takes no {option!r}")
-        description = describe(device, eds)
+        description = describe(device, eds, on_ethercat=True)
         description.timeout = None if timeout is None else check_timeout(timeout)
         for name, value in timeouts.items():
             entry = description.dictionary.find(name)

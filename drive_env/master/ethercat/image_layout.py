@@ -70,15 +70,13 @@ class ImagePlanner:
         self._by_key = {(entry.index, entry.sub): (entry, 0) for entry in known} | {
             key: (entry, axis) for key, (entry, axis) in description.of_further_axes().items()
         }
-        device = description.device
-        self._behaviour = None if device is None else device.ethercat
-        images = {} if device is None else fixed_images(device.presets.parent)
+        images = {} if description.device is None else fixed_images(description.device.presets.parent)
         self._ready_made: dict[int, list[ImageLayout]] = {OUTPUTS: [], INPUTS: []}
         for pdo, image in images.items():
             fields = [(None if one.is_name else one.key, TYPES[one.type][1]) for one in image.fields]
             self._ready_made[OUTPUTS if image.is_output else INPUTS].append(self._of_fields(pdo, fields))
 
-        for direction, indices in MAPPINGS.items() if self._behaviour is not None else ():
+        for direction, indices in MAPPINGS.items() if description.device is not None else ():
             for entry in known:
                 if entry.sub == 0 and entry.index in indices and self._is_ready_made(entry.index):
                     subs = range(1, int(entry.default) + 1)
@@ -182,8 +180,8 @@ class ImagePlanner:
 
     def _is_ready_made(self, pdo: int) -> bool:
         """Return whether a mapping object cannot be written."""
-        known, writable = self._description.dictionary, () if self._behaviour is None else self._behaviour.writable
-        return known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const") and pdo not in writable
+        known = self._description.dictionary
+        return known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const")
 
     def _of_raws(self, pdos: Sequence[int], mapped: Sequence[int]) -> ImageLayout:
         """Return the ready-made image of mapping entries, in as many parts as there are mapping objects."""
