@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -50,6 +51,7 @@ def new_from_eds(
     """
     from drive_env.devices import find_device
     from drive_env.devices.new_device import LIST_NAME, new_device
+    from drive_env.ethercat.sii_content import sii_content
     from drive_env.motors import find_motor
 
     with errors_as_exit_codes():
@@ -70,8 +72,14 @@ def new_from_eds(
             eds, folder, chosen, velocity_unit=velocity_unit, acceleration_unit=acceleration_unit, esi=esi,
             product=product, on_ethercat=is_ethercat,
         )  # fmt: skip
-        device = find_device(str(folder if len(folder.parts) > 1 else Path(folder)))
-        device.preset(chosen)
+        try:
+            device = find_device(str(folder))
+            device.preset(chosen)
+            if is_ethercat:
+                sii_content(device)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)  # it would be refused the next time
+            raise
         if json:
             print_json({
                 "folder": str(folder),

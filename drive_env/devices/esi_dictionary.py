@@ -60,6 +60,8 @@ class _Dictionary:
     def __init__(self, dictionary: ET.Element) -> None:
         self._objects = dictionary.findall("Objects/Object")
         self._types = {text_of(one, "Name"): one for one in reversed(dictionary.findall("DataTypes/DataType"))}
+        self._basic_of: dict[str, int | None] = {}
+        self._members_of: dict[str, list[_Member]] = {}
         self._sections: dict[str, Section] = {}
         self._left_out: list[Repair] = []
 
@@ -73,7 +75,7 @@ class _Dictionary:
                 self._left_out.append(Repair(f"[{name}]", "stands twice: the first counts"))
                 continue
             self._object(index, one)
-            if len(self._sections) > MOST_ENTRIES:
+            if len(self._sections) + len(self._left_out) > MOST_ENTRIES:
                 raise ValueError(
                     f"its dictionary has more than {MOST_ENTRIES} entries; leave out those that you do not need"
                 )
@@ -87,7 +89,9 @@ class _Dictionary:
             found = self._value(kind, title, one.find("Flags"), info, f"[{name}]")
             self._sections[name] = found | {"ObjectType": f"0x{VAR:X}"}
             return
-        members = list(self._members(kind, f"Dictionary, {name}h"))
+        if kind not in self._members_of:
+            self._members_of[kind] = list(self._members(kind, f"Dictionary, {name}h"))
+        members = self._members_of[kind]
         if not members:
             self._left_out.append(Repair(f"[{name}]", f"was left out: its type {kind!r} is not known here"))
             return
@@ -106,6 +110,11 @@ class _Dictionary:
     # --- types ------------------------------------------------------------------------------------------------------
     def _basic(self, kind: str) -> int | None:
         """Return the data type of CiA 301 that a type is; None for one with sub-indices, or one that is not known."""
+        if kind not in self._basic_of:
+            self._basic_of[kind] = self._look_up(kind)
+        return self._basic_of[kind]
+
+    def _look_up(self, kind: str) -> int | None:
         for _ in range(DEEPEST_TYPE):
             plain = kind.upper()
             if plain in TYPES:

@@ -25,7 +25,6 @@ from drive_env.devices.vendor_esi import (
     MOST_ENTRIES,
     RX_PDOS,
     TX_PDOS,
-    EsiPdo,
     VendorEsi,
     one_line,
 )
@@ -198,17 +197,25 @@ class _Maker:
 
     # --- images -----------------------------------------------------------------------------------------------------
     def _of_esi(self, esi: VendorEsi) -> list[_Pdo]:
-        return [self._pdo(pdo.index, pdo.name, pdo.is_output, pdo.is_fixed, self._raws_of_esi(pdo)) for pdo in esi.pdos]
-
-    def _raws_of_esi(self, pdo: EsiPdo) -> list[tuple[int, int, int]]:
-        """Return index, sub-index and bits of an image's entries; objects that the dictionary lacks are added."""
-        rows = []
-        for entry in pdo.entries:
-            key = (entry.index, entry.sub)
-            if entry.index and key not in self._types and entry.bits in WIDTHS:
-                self._add(key, entry.bits, entry.name, entry.type, is_output=pdo.is_output)
-            rows.append((entry.index, entry.sub, entry.bits))
-        return rows
+        added: set[Key] = set()
+        for pdo in esi.pdos:
+            for entry in pdo.entries:
+                key = (entry.index, entry.sub)
+                if entry.index and key not in self._types and key not in added and entry.bits in WIDTHS:
+                    self._add(key, entry.bits, entry.name, entry.type, is_output=pdo.is_output)
+                    added.add(key)
+        if added:
+            self._read_types()
+        return [
+            self._pdo(
+                pdo.index,
+                pdo.name,
+                pdo.is_output,
+                pdo.is_fixed,
+                [(one.index, one.sub, one.bits) for one in pdo.entries],
+            )
+            for pdo in esi.pdos
+        ]
 
     def _add(self, key: Key, bits: int, name: str, type_name: str, *, is_output: bool) -> None:
         index, sub = key
@@ -231,7 +238,6 @@ class _Maker:
         else:
             self._sections[object_section(index)] = row | {"ObjectType": "0x7"}
         self._changes.append((f"[{index:04X}:{sub}]", "is in an image and not in the dictionary: it was added"))
-        self._read_types()
 
     def _of_eds(self) -> list[_Pdo]:
         found = []

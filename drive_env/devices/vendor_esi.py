@@ -29,6 +29,7 @@ MANAGERS = ("MBoxOut", "MBoxIn", "Outputs", "Inputs")  # of a drive with CoE: sy
 ROLE = 0x0F  # bits of a control byte: kind and direction
 RX_PDOS, TX_PDOS = range(0x1600, 0x1800), range(0x1A00, 0x1C00)
 MOST_PDOS, MOST_ENTRIES = 254, 254  # that 1C12h and a mapping object can list
+MOST_IN_ALL, MOST_MODES = 4_000, 32  # entries of all images, operation modes of clocks
 MOST_BITS = 8 * 1486  # of an entry: a frame's data
 MOST_EEPROM = 1 << 20  # bytes
 NOT_HERE = ("EoE", "AoE", "SoE", "VoE")
@@ -141,6 +142,11 @@ def one_line(text: str | None) -> str:
 def is_set(element: ET.Element | None, name: str) -> bool:
     """Return whether an attribute says yes."""
     return element is not None and element.get(name, "0").strip().lower() in ("1", "true")
+
+
+def _check_number(found: int, what: str, most: int) -> None:
+    if found > most:
+        raise ValueError(f"it has {found} {what}; {most} are read. Leave out those that you do not need")
 
 
 class _Reader:
@@ -272,6 +278,7 @@ class _Reader:
         return places
 
     def _clocks(self, one: ET.Element) -> Iterator[ClockMode]:
+        _check_number(len(one.findall("Dc/OpMode")), "Dc/OpMode", MOST_MODES)
         for k, mode in enumerate(one.findall("Dc/OpMode"), 1):
             what = f"Dc/OpMode {k}"
             values = []
@@ -307,10 +314,8 @@ class _Reader:
         coe, known = one.find("Mailbox/CoE"), set()
         for tag, indices, manager in (("RxPdo", RX_PDOS, 2), ("TxPdo", TX_PDOS, 3)):
             rows = one.findall(tag)
-            if len(rows) > MOST_PDOS:
-                raise ValueError(
-                    f"it has {len(rows)} {tag}; {MOST_PDOS} are read. Leave out those that you do not need"
-                )
+            _check_number(len(rows), tag, MOST_PDOS)
+            _check_number(sum(len(row.findall("Entry")) for row in rows), f"entries of {tag}", MOST_IN_ALL)
             for k, row in enumerate(rows, 1):
                 index = number(row.findtext("Index"), f"{tag} {k}/Index", indices.start, indices.stop - 1)
                 what = f"{tag} {index:04X}h"
@@ -320,6 +325,7 @@ class _Reader:
                 sm = row.get("Sm")
                 if sm is not None and number(sm, f"{what}/@Sm", 0, U8) != manager:
                     raise ValueError(f"{what}/@Sm is {sm}; {tag} lie in sync manager {manager}")
+                _check_number(len(row.findall("Exclude")), f"Exclude of {what}", MOST_PDOS)
                 exclude = tuple(number(x.text, f"{what}/Exclude", 0, U16) for x in row.findall("Exclude"))
                 yield EsiPdo(
                     index,
