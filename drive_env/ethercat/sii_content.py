@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import unicodedata
 from pathlib import Path
 
 from drive_env.devices import Device
@@ -80,13 +81,14 @@ def image_size(objects: dict[int, ObjectDescription], direction: int) -> int:
 
 
 class _Strings:
-    """Strings of the EEPROM, counted from 1."""
+    """Strings of the EEPROM, counted from 1; of ASCII, since masters read other letters in several ways, or not."""
 
     def __init__(self) -> None:
         self.all: list[bytes] = []
 
     def number(self, text: str) -> int:
-        encoded = text.encode("latin-1", "replace")[:255]
+        plain = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
+        encoded = "".join(plain).encode("ascii", "replace")[:255]
         if encoded not in self.all:
             if len(self.all) == 255:
                 return 0
