@@ -15,12 +15,14 @@ import stat
 import sys
 import tokenize
 import tomllib
+import xml.etree.ElementTree as ET
 import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
+from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +35,7 @@ MOST_ARRAYS = 500_000_000  # bytes of the arrays in an .npz, unpacked
 MOST_ENTRIES = 10_000  # arrays in an .npz
 DEEPEST = 40  # tables and lists in one another
 MOST_VALUES = 1_000_000  # in a table, each mention of a YAML alias counted
+MOST_ELEMENTS = 500_000  # of an XML: the ESI of a maker's whole series has some 300,000
 MOST_TOML_VALUES = 200_000  # and parts of keys: each part of a dotted key is a table
 
 # What tomllib takes no heed of is looked for before it begins: its memory grows with the square of a key's parts. Each
@@ -158,6 +161,47 @@ def parse_json(text: str | bytes) -> Any:
 def read_json(path: str | Path) -> Any:
     """Return the value in a JSON file; raises as `parse_json` and `read_text`."""
     return parse_json(read_text(path))
+
+
+def parse_xml(content: bytes) -> ET.Element:
+    """Return the root of an XML document; names of elements are without their namespaces.
+
+    A document type is refused: entities, which may grow without end or name other files, can only be declared in one.
+
+    Raises:
+        UntrustedFileError: If it is not XML, has a document type, or exceeds a limit.
+    """
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    depth = count = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, count
+        depth, count = depth + 1, count + 1
+        if depth > DEEPEST:
+            raise UntrustedFileError(f"its elements lie more than {DEEPEST} deep in one another")
+        if count > MOST_ELEMENTS:
+            raise UntrustedFileError(f"it has more than {MOST_ELEMENTS} elements; leave out those that you do not need")
+        builder.start(tag.rpartition(":")[2], attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag.rpartition(":")[2])
+
+    def refuse(*_: object) -> NoReturn:
+        raise UntrustedFileError("it has a document type (<!DOCTYPE ...>), which is not read; delete that declaration")
+
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, builder.data
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(content, True)
+        return builder.close()
+    except expat.ExpatError as error:
+        raise UntrustedFileError(f"it is not XML: {error}") from None
+    except (LookupError, ValueError) as error:
+        if isinstance(error, UntrustedFileError):
+            raise
+        raise UntrustedFileError(f"it is not XML in an encoding that is known: {_one_line(error)}") from None
 
 
 def read_rows(path: str | Path) -> Iterator[list[str]]:

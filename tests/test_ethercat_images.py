@@ -129,17 +129,17 @@ def test_what_one_axis_alone_has_is_no_entry_of_the_image(planner, one):
     ((0x60410110,), None),  # nor that sub-index
 ])  # fmt: skip
 def test_of_the_image_that_a_slave_has_each_axis_must_have_the_same(planner, one, mapped, entries):
-    layout = planner.parsed(INPUTS, 0x1A00, mapped)
+    layout = planner.parsed(INPUTS, [0x1A00], mapped)
     assert layout == (None if entries is None else planner.free(0x1A00, one(*entries)))
 
 
 @pytest.mark.parametrize("pdo", [0x1602, 0x1A02], ids=["const", "ro"])
 def test_an_image_that_cannot_be_written_is_taken_as_it_is(planner, pdo):
     """What is reserved (no index) and what no program can name is left out, as what begins within a byte."""
-    layout = planner.parsed(INPUTS, pdo, (0x68410010, 0x00000008, 0x12340010, 0x60640020, 0x20010010))
+    layout = planner.parsed(INPUTS, [pdo], (0x68410010, 0x00000008, 0x12340010, 0x60640020, 0x20010010))
     assert layout.mapped is None and layout.pdo == pdo
     assert shape(layout) == ([(0x6041, 1, 0, 2), (0x6064, 0, 5, 4), (0x2001, 0, 9, 2), (0x2001, 1, 9, 2)], 11)
-    layout = planner.parsed(INPUTS, pdo, (0x00000004, 0x60410010, 0x00000004, 0x60640010, 0x60770020, 0x00000003))
+    layout = planner.parsed(INPUTS, [pdo], (0x00000004, 0x60410010, 0x00000004, 0x60640010, 0x60770020, 0x00000003))
     assert shape(layout) == ([(0x6064, 0, 3, 2), (0x6077, 0, 5, 2)], 10), "the narrower of field and object"
 
 
@@ -196,7 +196,7 @@ def tgz_planner(tgz):
 
 def test_ready_made_images_are_those_of_the_device_s_data(tgz, tgz_planner):
     """1701h: 20 bytes of each axis, with what is reserved; 6060h and others are in none."""
-    layout = tgz_planner.parsed(OUTPUTS, 0x1701, ())
+    layout = tgz_planner.parsed(OUTPUTS, [0x1701], ())
     assert layout.mapped is None and layout.size == 40
     find = tgz.dictionary.find
     places = layout.places(tgz)
@@ -206,12 +206,12 @@ def test_ready_made_images_are_those_of_the_device_s_data(tgz, tgz_planner):
     assert tgz_planner.completed(OUTPUTS, layout) is layout
     assert find(0x607A) in tgz_planner.carried(OUTPUTS) and find(0x607A) not in tgz_planner.carried(INPUTS)
     assert find(0x6064) in tgz_planner.carried(INPUTS)
-    assert tgz_planner.parsed(INPUTS, 0x1701, (1 << 16,)) is None, "it is one of outputs"
+    assert tgz_planner.parsed(INPUTS, [0x1701], (1 << 16,)) is None, "it is one of outputs"
 
 
 def test_the_first_ready_made_image_that_has_what_is_wanted_is_taken(tgz, tgz_planner):
     find = tgz.dictionary.find
-    current = tgz_planner.parsed(OUTPUTS, 0x1703, ())
+    current = tgz_planner.parsed(OUTPUTS, [0x1703], ())
     assert tgz_planner.plan(OUTPUTS, (find(0x6071),), current) is current
     assert tgz_planner.plan(OUTPUTS, (find(0x607A), find(0x6040)), current).pdo == 0x1701
     with pytest.raises(ObjectAccessError, match=f"^{find(0x6060).label} is in no image of this drive, for every axis "):
@@ -228,7 +228,7 @@ def test_the_image_of_a_slave_is_read(drive, planner, one, slave):
     slave.objects[INPUTS, 1] = bytes.fromhex("02 1A FF FF")  # more bytes than the type has
     slave.put(0x1A02, 4, 0x60410010)
     slave.objects[0x1A02, 1] += b"\xff"
-    assert images.found(INPUTS, planner) == planner.parsed(INPUTS, 0x1A02, [0x60410010])
+    assert images.found(INPUTS, planner) == planner.parsed(INPUTS, [0x1A02], [0x60410010])
     slave.put(INPUTS, 2, 0x1A03)
     assert images.found(INPUTS, planner) == planner.free(0x1A03, ()), "it has no entries"
     slave.put(INPUTS, 2, 0x1A00, 0x1A01)
@@ -265,7 +265,7 @@ def test_an_image_that_has_its_entries_is_only_assigned(drive, planner, one, sla
     images = SlaveImages(slave, drive)
     images.change(INPUTS, planner.free(0x1A00, one(0x6041)))
     assert slave.take() == ["1C13:00 00", "1C13:00 00", "1C13:01 00 1A", "1C13:00 01"]
-    ready_made = planner.parsed(INPUTS, 0x1A02, ())
+    ready_made = planner.parsed(INPUTS, [0x1A02], ())
     images.change(INPUTS, ready_made)
     assert slave.take() == ["1C13:00 00", "1C13:00 00", "1C13:01 02 1A", "1C13:00 01"]
     images.change(INPUTS, ready_made)

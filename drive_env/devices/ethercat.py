@@ -6,6 +6,7 @@ Vendor, product and revision are those of its dictionary (1018h), and its proces
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from mechanics.near_names import did_you_mean
@@ -20,6 +21,49 @@ class Place(NamedTuple):
 
     start: int
     length: int
+
+
+class ClockMode(NamedTuple):
+    """An operation mode of the clocks, as a configurator offers it: `Dc/OpMode` of ETG.2000; times in ns.
+
+    Attributes:
+        name: Its name.
+        title: What a person reads.
+        activation: Value of 0980h: 0 without clocks, 0300h with SYNC0.
+        cycle0: Cycle of SYNC0; 0: the factor's share of the master's cycle.
+        factor0: That share; 0: none is said.
+        shift0: By how much SYNC0 is late.
+        cycle1: Cycle of SYNC1.
+        factor1: Its share of SYNC0's cycle.
+        shift1: By how much SYNC1 is late.
+    """
+
+    name: str
+    title: str
+    activation: int
+    cycle0: int = 0
+    factor0: int = 0
+    shift0: int = 0
+    cycle1: int = 0
+    factor1: int = 0
+    shift1: int = 0
+
+
+class PdoRule(NamedTuple):
+    """Rules of a configurator for a mapping object: whether it must be assigned, and those that it excludes."""
+
+    mandatory: bool = False
+    exclude: tuple[int, ...] = ()
+
+
+CLOCKS = (
+    ClockMode("FreeRun", "Free run or synchronous with sync manager", 0x0000),
+    ClockMode("DC", "Distributed clocks, SYNC0", 0x0300),
+)
+CONTROLS = (0x26, 0x22, 0x64, 0x20)  # of sync managers 0 to 3
+# What a CoE server may have, as ETG.2000 names it. PdoConfig is of devices whose mapping objects can be written.
+COE_ATTRIBUTES = ("SdoInfo", "PdoAssign", "PdoConfig", "PdoUpload", "CompleteAccess", "SegmentedSdo")
+COE = ("SdoInfo", "PdoAssign", "CompleteAccess", "SegmentedSdo")
 
 
 class EtherCatBehaviour(NamedTuple):
@@ -39,21 +83,34 @@ class EtherCatBehaviour(NamedTuple):
         writable: Indices of objects that the EDS, which is CAN's, has read only, and that can be written on EtherCAT.
         shortest_cycle: Of SYNC0 [s].
         eeprom: Size [bytes].
+        order: Type as its maker writes it; "": the device's name.
+        controls: Control bytes of sync managers 0 to 3.
+        coe: What its ESI says of CoE, PdoConfig besides.
+        has_foe: Whether its ESI and SII say that it takes files.
+        clocks: Operation modes of its clocks.
+        pdos: A configurator's rules for mapping objects; without a row, images that are not assigned together
+            exclude each other.
     """
 
     receive: Place
     send: Place
     outputs: int
     inputs: int
-    only_on_can: str
     shortest_cycle: float
     eeprom: int
     bootstrap_receive: Place | None = None
     bootstrap_send: Place | None = None
     described_as: str = ""
     cycles: tuple[float, ...] = ()
+    only_on_can: str = ""
     can_indices: tuple[tuple[int, int], ...] = ()
     writable: tuple[int, ...] = ()
+    order: str = ""
+    controls: tuple[int, ...] = CONTROLS
+    coe: tuple[str, ...] = COE
+    has_foe: bool = True
+    clocks: tuple[ClockMode, ...] = CLOCKS
+    pdos: Mapping[int, PdoRule] = MappingProxyType({})
 
     def has(self, index: int, name: str) -> bool:
         """Return whether an object is there on EtherCAT."""
@@ -77,17 +134,28 @@ def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
     if ("bootstrap_receive" in data) != ("bootstrap_send" in data):
         raise ValueError("ethercat needs bootstrap_receive and bootstrap_send, or neither: the mailboxes in Bootstrap")
     row["can_indices"] = tuple((first, last) for first, last in data.get("can_indices", ()))
-    row["writable"] = tuple(data.get("writable", ()))
+    for key in ("writable", "coe", "controls"):
+        if key in data:
+            row[key] = tuple(data[key])
+    if "clocks" in data:
+        row["clocks"] = tuple(ClockMode(**one) for one in data["clocks"])
+    row["pdos"] = {
+        int(index, 16): PdoRule(one.get("mandatory", False), tuple(one.get("exclude", ())))
+        for index, one in data.get("pdos", {}).items()
+    }
     found = EtherCatBehaviour(**row)
     for name in PLACES:
-        if getattr(found, name) is None:
+        place = getattr(found, name)
+        if place is None:
             continue
-        start, length = getattr(found, name)
+        start, length = place
         if length < LEAST_MAILBOX or not MEMORY[0] <= start <= MEMORY[1] - length:
             raise ValueError(
                 f"ethercat.{name} = {start:04X}h, {length} bytes: a mailbox has {LEAST_MAILBOX} bytes or more, between "
                 f"{MEMORY[0]:04X}h and {MEMORY[1]:04X}h"
             )
+    if (found.bootstrap_receive is None) != (found.bootstrap_send is None):
+        raise ValueError("ethercat has one mailbox of Bootstrap; name bootstrap_receive and bootstrap_send, or neither")
     if found.eeprom % 128 or not found.eeprom:
         raise ValueError(f"ethercat.eeprom = {found.eeprom} bytes must be a multiple of 128")
     return found

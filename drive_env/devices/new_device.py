@@ -1,6 +1,6 @@
-"""A device's folder from a vendor's EDS: dictionary, bindings, roles, gains, class values, a list of open questions.
+"""A device's folder from a vendor's EDS or ESI: dictionary, bindings, roles, gains, class values, open questions.
 
-Everything that the EDS says is taken; what it does not say and the emulator needs is a class value or an object of the
+Everything that the file says is taken; what it does not say and the emulator needs is a class value or an object of the
 emulator's own, in the manufacturer's area where the EDS has none; each is in the list. An object of the EDS that has no
 effect here stays an entry that can be read and written, and is listed as such.
 """
@@ -17,6 +17,7 @@ from canopen.objectdictionary import ODVariable
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.devices.eds_process_data import repair_process_data
+from drive_env.devices.new_images import EtherCatPart, ethercat_part
 from drive_env.devices.standard_objects import (
     BY_THEMSELVES,
     GAINS,
@@ -30,12 +31,13 @@ from drive_env.devices.standard_objects import (
     OwnObject,
 )
 from drive_env.devices.variants import TYPES
+from drive_env.devices.vendor_esi import read_esi
 from drive_env.devices.vendor_units import vendor_units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds
 from drive_env.dictionary.eds_values import number_of
-from drive_env.dictionary.entries import INTEGER_TYPES, eds_file
+from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_file
 from drive_env.dictionary.units import find_unit
 from drive_env.whole_file import files_to_be
 
@@ -124,26 +126,48 @@ class NewDevice(NamedTuple):
 
 
 def new_device(
-    eds: Path, folder: Path, motor: Motor, *, velocity_unit: str = "", acceleration_unit: str = ""
+    eds: Path | None,
+    folder: Path,
+    motor: Motor,
+    *,
+    velocity_unit: str = "",
+    acceleration_unit: str = "",
+    esi: Path | None = None,
+    product: str = "",
+    on_ethercat: bool = False,
 ) -> NewDevice:
-    """Write the folder of a device that its EDS describes; return the notes that a person must read.
+    """Write the folder of a device that its EDS or ESI describes; return the notes that a person must read.
 
     Args:
-        eds: The vendor's file.
+        eds: The vendor's EDS; None where its ESI has the dictionary.
         folder: To be made.
         motor: Whose rated current is the base of thousandths.
-        velocity_unit: Unit of speeds, "rpm", "pps", "0.1 rpm" ..., where the EDS tells none.
+        velocity_unit: Unit of speeds, "rpm", "pps", "0.1 rpm" ..., where the file tells none.
         acceleration_unit: The same of accelerations.
+        esi: The vendor's ESI, for a device on EtherCAT with its images and identity; None without one.
+        product: Which device of an ESI with several.
+        on_ethercat: Make a device on EtherCAT of an EDS alone.
 
     Raises:
-        ValueError: For a file that is the EDS of no CiA 402 drive, a folder that exists, or an unknown unit.
+        ValueError: For a file that describes no CiA 402 drive, a folder that exists, or an unknown unit.
     """
     if folder.exists():
         raise ValueError(f"{folder} exists already, and is not overwritten; choose another folder with --out")
+    if eds is not None and not eds.is_file():
+        raise ValueError(f"there is no EDS at {eds}; give the path of the drive's .eds file")
     for unit in (velocity_unit, acceleration_unit):
         if unit:
             find_unit(unit)
-    draft = _Draft(eds, motor, velocity_unit, acceleration_unit)
+    part = None
+    if esi is not None:
+        part = ethercat_part(eds, read_esi(esi, product), str(esi))
+    elif eds is None:
+        raise ValueError("no file is given; name the drive's EDS, its ESI, or both: --eds drive.eds --esi drive.xml")
+    elif on_ethercat:
+        part = ethercat_part(eds, None, str(eds))
+    source = eds if part is None else part.eds
+    assert source is not None, "an EDS, or what was made of an ESI"
+    draft = _Draft(source, (esi or eds or folder).name, motor, velocity_unit, acceleration_unit, part)
     made = draft.made(folder)
     files: dict[Path, str | bytes] = {folder / name: text for name, text in draft.files(folder).items()}
     try:
@@ -157,12 +181,18 @@ def new_device(
 
 
 class _Draft:
-    """The device of one EDS in the making."""
+    """The device of one EDS in the making; `part` is what EtherCAT makes of it, None on CAN."""
 
-    def __init__(self, eds: Path, motor: Motor, velocity_unit: str, acceleration_unit: str) -> None:
-        self._eds, self._motor = eds, motor
-        if not eds.is_file():
-            raise ValueError(f"there is no EDS at {eds}; give the path of the drive's .eds file")
+    def __init__(
+        self,
+        eds: Path | EdsText,
+        name: str,
+        motor: Motor,
+        velocity_unit: str,
+        acceleration_unit: str,
+        part: EtherCatPart | None,
+    ) -> None:
+        self._eds, self._name, self._motor, self._part = eds, name, motor, part
         self._file: EdsFile = eds_file(eds)
         try:
             self._types: Types = read_types(eds)
@@ -185,8 +215,12 @@ class _Draft:
         self._take_current_limit()
         self._add_own_objects()
         self._correct_defaults()
-        self._changes += [Note(*row) for row in repair_process_data(self._sections, self._types)]
-        self._tell_of_communication()
+        if part is None:
+            self._changes += [Note(*row) for row in repair_process_data(self._sections, self._types)]
+            self._tell_of_communication()
+        else:
+            self._fill_in += [Note(*row) for row in part.class_values]
+            self._changes += [Note(*row) for row in part.changes]
         self._tell_of_units()
         self._drop_twinless()
 
@@ -464,9 +498,9 @@ class _Draft:
     def _device_toml(self, folder: Path) -> str:
         text = TEMPLATE.read_text(encoding="utf-8")
         info, current = self._sections.get("DeviceInfo", {}), self._motor.rated_current
-        title = " ".join(filter(None, (info.get("VendorName"), info.get("ProductName")))) or self._eds.stem
+        title = " ".join(filter(None, (info.get("VendorName"), info.get("ProductName")))) or Path(self._name).stem
         head = (
-            f"# Made from {self._eds.name} by drive-env new; {LIST_NAME} lists what a person must fill in.\n"
+            f"# Made from {self._name} by drive-env new; {LIST_NAME} lists what a person must fill in.\n"
             f"name = {_quoted(folder.name)}\ntitle = {_quoted(title)}\neds = {_quoted(EDS_NAME)}\n"
             f'firmware = "servo"\naxes = {self._axes}\n'
         )
@@ -478,7 +512,7 @@ class _Draft:
         )
         if info.get("LSS_Supported", "0") not in ("", "0"):
             text += "\n[canopen.services]\nlss = true\n"
-        return f"{head}{text}\n{self._tables()}"
+        return f"{head}{text}\n{self._tables()}" + ("" if self._part is None else f"\n{self._part.toml()}")
 
     def _axis_offsets(self) -> str:
         rows = [

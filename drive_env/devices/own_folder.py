@@ -75,6 +75,12 @@ def check_scale(roles: Mapping[Role, Key], dictionary: ObjectDictionary) -> None
     scale = position_scale(roles)
     if scale is None:
         return
+    for key in scale.keys:
+        if not isinstance(dictionary.find(key).default, int):
+            raise ValueError(
+                f"{dictionary.find(key).label} counts positions and is not an integer; correct its DataType: 0x7 "
+                "(UNSIGNED32)"
+            )
     values = [dictionary.find(key).default for key in scale.keys]
     with np.errstate(divide="ignore", invalid="ignore"):
         units = float(scale.increments([np.array(float(value)) for value in values]))

@@ -32,7 +32,7 @@ def read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
     return types
 
 
-def _check_values(path: Path, types: Mapping[Key, ODVariable]) -> None:
+def _check_values(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> None:
     """Raise ValueError for an object of which sub-index 0 is no value, but counts other sub-indices or is missing."""
     for index in sorted({index for index, sub in types if sub > 0}):
         axis, first = divmod(index - cia402.PROFILE_AREAS.start, cia402.AXIS_OFFSET)
@@ -49,13 +49,13 @@ def _check_values(path: Path, types: Mapping[Key, ODVariable]) -> None:
         )
 
 
-def _line_of(path: Path, index: int) -> str:
+def _line_of(path: Path | EdsText, index: int) -> str:
     """Return ", line n" of an object's first section in an EDS; nothing where it has none."""
     found = (place and place[0] == index for place in map(place_of_line, eds_text(path).splitlines()))
     return next((f", line {number}" for number, is_it in enumerate(found, 1) if is_it), "")
 
 
-def axes_of(path: Path, types: Mapping[Key, ODVariable]) -> int:
+def axes_of(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> int:
     """Return how many axes an EDS describes.
 
     Raises:

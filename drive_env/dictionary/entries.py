@@ -70,6 +70,9 @@ class EdsText:
         """Return the text, as a path does."""
         return self.text
 
+    def __str__(self) -> str:
+        return self.name
+
 
 def read_eds(path: Path | EdsText, node_id: int = 1) -> canopen.ObjectDictionary:
     """Return python-canopen's model of an EDS, put right first: real files are not as CiA 306 has them.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 
 from drive_env.devices import Device
+from drive_env.devices.ethercat import COE_ATTRIBUTES, ClockMode, PdoRule
 from drive_env.dictionary.entries import read_eds
 from drive_env.ethercat.object_descriptions import (
     ARRAY,
@@ -17,18 +18,18 @@ from drive_env.ethercat.object_descriptions import (
     describe,
 )
 from drive_env.ethercat.sii_content import (
-    CONTROLS,
-    MODES,
     bootstrap,
+    coe_attributes,
     configuration,
     described,
     entry_of,
-    has_ready_images,
     identity,
     image_size,
+    is_fixed,
     mapped,
     not_assigned,
     title,
+    type_of,
 )
 from drive_env.node import mapping
 from drive_env.node.process_image import INPUTS, OUTPUTS
@@ -64,7 +65,7 @@ def _device(parent: ET.Element, device: Device) -> None:
     objects = describe(device)
     _, product, revision = identity(device)
     one = ET.SubElement(parent, "Device", Physics="YY")
-    _text(one, "Type", device.name.upper(), ProductCode=_hex(product, 8), RevisionNo=_hex(revision, 8))
+    _text(one, "Type", type_of(device), ProductCode=_hex(product, 8), RevisionNo=_hex(revision, 8))
     _text(one, "Name", title(device), LcId=LOCALE_ENGLISH)
     _text(one, "GroupType", GROUP)
     profile = ET.SubElement(one, "Profile")
@@ -76,29 +77,39 @@ def _device(parent: ET.Element, device: Device) -> None:
         _text(one, "Fmmu", name)
     sizes = (behaviour.receive.length, behaviour.send.length, image_size(objects, OUTPUTS), image_size(objects, INPUTS))
     starts = (behaviour.receive.start, behaviour.send.start, behaviour.outputs, behaviour.inputs)
-    for name, size, start, control in zip(MANAGERS, sizes, starts, CONTROLS, strict=True):
+    for name, size, start, control in zip(MANAGERS, sizes, starts, behaviour.controls, strict=True):
         places = {"DefaultSize": str(size), "StartAddress": _hex(start), "ControlByte": _hex(control, 2), "Enable": "1"}
         _text(one, "Sm", name, **places)
     for tag, direction, manager in (("RxPdo", OUTPUTS, 2), ("TxPdo", INPUTS, 3)):
         _pdos(one, device, objects, tag, direction, manager)
     mailbox = ET.SubElement(one, "Mailbox")
-    configures = "0" if has_ready_images(device) else "1"
-    ET.SubElement(
-        mailbox, "CoE", SdoInfo="1", PdoAssign="1", PdoConfig=configures, CompleteAccess="1", SegmentedSdo="1"
-    )
-    if behaviour.bootstrap_receive is not None:  # it has files there alone
+    known = coe_attributes(behaviour, objects)
+    told = [name for name in COE_ATTRIBUTES if name in known or name != "PdoUpload"]
+    ET.SubElement(mailbox, "CoE", {name: str(int(name in known)) for name in told})
+    if behaviour.has_foe:
         ET.SubElement(mailbox, "FoE")
-    clock = ET.SubElement(one, "Dc")
-    for name, activation in MODES:
-        mode = ET.SubElement(clock, "OpMode")
-        _text(mode, "Name", "DC" if activation else "FreeRun")
-        _text(mode, "Desc", name)
-        _text(mode, "AssignActivate", _hex(activation))
+    if behaviour.clocks:
+        clock = ET.SubElement(one, "Dc")
+        for mode in behaviour.clocks:
+            _clock(ET.SubElement(clock, "OpMode"), mode)
     eeprom = ET.SubElement(one, "Eeprom")
     _text(eeprom, "ByteSize", str(behaviour.eeprom))
     _text(eeprom, "ConfigData", configuration()[:14].hex())
     if behaviour.bootstrap_receive is not None:
         _text(eeprom, "BootStrap", bootstrap(behaviour).hex())
+
+
+def _clock(parent: ET.Element, mode: ClockMode) -> None:
+    _text(parent, "Name", mode.name)
+    _text(parent, "Desc", mode.title)
+    _text(parent, "AssignActivate", _hex(mode.activation))
+    for name, cycle, factor, shift in (
+        ("Sync0", mode.cycle0, mode.factor0, mode.shift0),
+        ("Sync1", mode.cycle1, mode.factor1, mode.shift1),
+    ):
+        if cycle or factor or shift:
+            _text(parent, f"CycleTime{name}", str(cycle), **({"Factor": str(factor)} if factor else {}))
+            _text(parent, f"ShiftTime{name}", str(shift))
 
 
 def _types(parent: ET.Element, objects: dict[int, ObjectDescription]) -> None:
@@ -178,20 +189,23 @@ def _flags(parent: ET.Element, entry: EntryDescription) -> None:
 def _pdos(
     parent: ET.Element, device: Device, objects: dict[int, ObjectDescription], tag: str, direction: int, manager: int
 ) -> None:
-    """Write the images of a direction; of ready-made ones each excludes the others."""
-    assigned = mapped(objects, direction)
-    rows = [*assigned, *not_assigned(objects, direction)]
+    """Write the images of a direction; where nothing is said, those not assigned together exclude each other."""
+    assert device.ethercat is not None, "it was looked at before"
+    assigned, rules = mapped(objects, direction), device.ethercat.pdos
+    rows, together = [*assigned, *not_assigned(objects, direction)], dict(assigned)
     for index, raws in rows:
         pdo = ET.SubElement(parent, tag)
-        if has_ready_images(device):
+        if is_fixed(objects[index]):
             pdo.set("Fixed", "1")
-        if index in dict(assigned):
+        if rules.get(index, PdoRule()).mandatory:
+            pdo.set("Mandatory", "1")
+        if index in together:
             pdo.set("Sm", str(manager))
+        others = [other for other, _ in rows if other != index and not (index in together and other in together)]
         _text(pdo, "Index", _hex(index))
         _text(pdo, "Name", objects[index].name)
-        for other, _ in rows:
-            if other != index:
-                _text(pdo, "Exclude", _hex(other))
+        for other in rules[index].exclude if index in rules else others:
+            _text(pdo, "Exclude", _hex(other))
         for raw in raws:
             mapped_index, sub, bits = mapping.parse(raw)
             entry = ET.SubElement(pdo, "Entry")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import struct
+import unicodedata
+from pathlib import Path
 
 from drive_env.devices import Device, find_device
-from drive_env.devices.ethercat import EtherCatBehaviour
-from drive_env.devices.image_rows import fixed_images
-from drive_env.ethercat.object_descriptions import ObjectDescription, describe
+from drive_env.devices.ethercat import ClockMode, EtherCatBehaviour
+from drive_env.ethercat.object_descriptions import WRITE, ObjectDescription, describe
 from drive_env.ethercat.sii_interface import CONFIGURATION, checksum
 from drive_env.node import mapping
 from drive_env.node.process_image import ASSIGNMENTS, INPUTS, OUTPUTS
@@ -15,15 +16,14 @@ from drive_env.node.process_image import ASSIGNMENTS, INPUTS, OUTPUTS
 STRINGS, GENERAL, FMMU, SYNC_MANAGERS, INPUT_PDO, OUTPUT_PDO, CLOCK = 10, 30, 40, 41, 50, 51, 60  # categories
 PDI_CONTROL, PDI_CONFIGURATION, SYNC_PULSE = 0x0C05, 0x0000, 0x0064  # SPI slave; pulses of 1 us
 COE, FOE = 0x04, 0x08  # mailbox protocols
-# CoE details: SDO, SDO information, PDO assignment, complete access; PDO configuration.
-COE_DETAILS, HAS_CONFIGURATION = 0x01 | 0x02 | 0x04 | 0x20, 0x08
+COE_ENABLED = 0x01
+# Bits of the CoE details, by the names of ETG.2000.
+COE_DETAILS = {"SdoInfo": 0x02, "PdoAssign": 0x04, "PdoConfig": 0x08, "PdoUpload": 0x10, "CompleteAccess": 0x20}
+MANDATORY, FIXED_CONTENT = 0x0001, 0x0010  # of a PDO
 NOT_ASSIGNED = 0xFF  # sync manager of a PDO that none carries at first
-CONTROLS = (0x26, 0x22, 0x64, 0x20)  # of sync managers 0 to 3
 KINDS = (1, 2, 3, 4)
 FMMU_KINDS = (1, 2, 3)  # outputs, inputs, state of the mailbox
 BEFORE_CATEGORIES = 0x80  # bytes
-# Operation modes: name, activation of the clocks (0: none; 0300h: SYNC0).
-MODES = (("Free run or synchronous with sync manager", 0x0000), ("Distributed clocks, SYNC0", 0x0300))
 
 
 def identity(device: Device) -> tuple[int, int, int]:
@@ -63,9 +63,22 @@ def _numbers(objects: dict[int, ObjectDescription], index: int) -> list[int]:
     return found[1 : found[0] + 1]
 
 
-def has_ready_images(device: Device) -> bool:
-    """Return whether a device's images are ready-made: their mapping cannot be changed."""
-    return bool(fixed_images(device.presets.parent))
+def is_fixed(one: ObjectDescription) -> bool:
+    """Return whether a mapping object is ready-made: its entries cannot be changed."""
+    return not one.entries[0].access & WRITE
+
+
+def coe_attributes(behaviour: EtherCatBehaviour, objects: dict[int, ObjectDescription]) -> tuple[str, ...]:
+    """Return the features of a device's CoE server, as ETG.2000 names them."""
+    mappings = [one for index, one in objects.items() if any(index in indices for indices in ASSIGNMENTS.values())]
+    configures = mappings and not all(map(is_fixed, mappings))
+    return (*behaviour.coe, *(("PdoConfig",) if configures else ()))
+
+
+def type_of(device: Device) -> str:
+    """Return the type by which a device is ordered."""
+    assert device.ethercat is not None, "it is asked for devices with EtherCAT"
+    return device.ethercat.order or Path(device.name).stem.upper()
 
 
 def image_size(objects: dict[int, ObjectDescription], direction: int) -> int:
@@ -74,13 +87,14 @@ def image_size(objects: dict[int, ObjectDescription], direction: int) -> int:
 
 
 class _Strings:
-    """Strings of the EEPROM, counted from 1."""
+    """Strings of the EEPROM, counted from 1; of ASCII, since masters read other letters in several ways, or not."""
 
     def __init__(self) -> None:
         self.all: list[bytes] = []
 
     def number(self, text: str) -> int:
-        encoded = text.encode("latin-1", "replace")[:255]
+        plain = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
+        encoded = "".join(plain).encode("ascii", "replace")[:255]
         if encoded not in self.all:
             if len(self.all) == 255:
                 return 0
@@ -102,11 +116,12 @@ def sii_content(device: Device, serial: int = 0, alias: int = 0) -> bytes:
         raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
     objects = describe(device)
     strings = _Strings()
-    rest = _general(device, strings) + _category(FMMU, bytes(FMMU_KINDS).ljust(4, b"\0"))
+    rest = _general(device, behaviour, objects, strings) + _category(FMMU, bytes(FMMU_KINDS).ljust(4, b"\0"))
     rest += _sync_managers(behaviour, image_size(objects, OUTPUTS), image_size(objects, INPUTS))
     for category, direction, manager in ((INPUT_PDO, INPUTS, 3), (OUTPUT_PDO, OUTPUTS, 2)):
-        rest += _category(category, _pdos(objects, direction, manager, strings))
-    rest += _category(CLOCK, b"".join(_mode(strings.number(name), activation) for name, activation in MODES))
+        rest += _category(category, _pdos(behaviour, objects, direction, manager, strings))
+    if behaviour.clocks:
+        rest += _category(CLOCK, b"".join(_mode(one, strings) for one in behaviour.clocks))
     content = _head(device, behaviour, serial, alias) + _category(STRINGS, strings.content()) + rest + b"\xff\xff"
     if len(content) > behaviour.eeprom:
         raise ValueError(f"the EEPROM of {device.name} has {behaviour.eeprom} bytes; its content takes {len(content)}")
@@ -121,14 +136,15 @@ def configuration(alias: int = 0) -> bytes:
 
 def bootstrap(behaviour: EtherCatBehaviour) -> bytes:
     """Return words 0014h to 0017h: the mailboxes in Bootstrap, 0 without it."""
-    none = (0, 0)
-    return struct.pack("<4H", *(behaviour.bootstrap_receive or none), *(behaviour.bootstrap_send or none))
+    if behaviour.bootstrap_receive is None or behaviour.bootstrap_send is None:
+        return bytes(8)
+    return struct.pack("<4H", *behaviour.bootstrap_receive, *behaviour.bootstrap_send)
 
 
 def _head(device: Device, behaviour: EtherCatBehaviour, serial: int, alias: int) -> bytes:
     mailboxes = struct.pack("<4H", *behaviour.receive, *behaviour.send)
     head = configuration(alias) + struct.pack("<4I", *identity(device), serial) + bytes(8)
-    head += bootstrap(behaviour) + mailboxes + struct.pack("<H", COE | (FOE if behaviour.bootstrap_receive else 0))
+    head += bootstrap(behaviour) + mailboxes + struct.pack("<H", COE | (FOE if behaviour.has_foe else 0))
     return head.ljust(BEFORE_CATEGORIES - 4, b"\0") + struct.pack("<2H", behaviour.eeprom // 128 - 1, 1)
 
 
@@ -137,14 +153,17 @@ def _category(number: int, content: bytes) -> bytes:
     return struct.pack("<2H", number, words) + content.ljust(2 * words, b"\0")
 
 
-def _general(device: Device, strings: _Strings) -> bytes:
+def _general(
+    device: Device, behaviour: EtherCatBehaviour, objects: dict[int, ObjectDescription], strings: _Strings
+) -> bytes:
     name = strings.number(title(device))
-    order = strings.number(device.name.upper())
+    order = strings.number(type_of(device))
     group = strings.number("Drives")
-    details = COE_DETAILS | (0 if has_ready_images(device) else HAS_CONFIGURATION)
+    details = COE_ENABLED | sum(COE_DETAILS.get(name, 0) for name in coe_attributes(behaviour, objects))
     # Group, image, order and name; reserved; CoE, FoE, EoE; SoE, DS402, SysMan; flags; current; group; ports.
-    files = int(device.ethercat is not None and device.ethercat.bootstrap_receive is not None)
-    content = struct.pack("<4B", group, 0, order, name) + bytes((0, details, files, 0, 0, device.num_axes, 0, 0))
+    content = struct.pack("<4B", group, 0, order, name) + bytes(
+        (0, details, behaviour.has_foe, 0, 0, device.num_axes, 0, 0)
+    )
     content += struct.pack("<hBBH", 0, 0, 0, 0x0011)  # two ports, MII both
     return _category(GENERAL, content.ljust(32, b"\0"))
 
@@ -153,17 +172,27 @@ def _sync_managers(behaviour: EtherCatBehaviour, outputs: int, inputs: int) -> b
     places = (behaviour.receive, behaviour.send, (behaviour.outputs, outputs), (behaviour.inputs, inputs))
     rows = [
         struct.pack("<HHBBBB", start, length, control, 0, 1 if length else 0, kind)
-        for (start, length), control, kind in zip(places, CONTROLS, KINDS, strict=True)
+        for (start, length), control, kind in zip(places, behaviour.controls, KINDS, strict=True)
     ]
     return _category(SYNC_MANAGERS, b"".join(rows))
 
 
-def _pdos(objects: dict[int, ObjectDescription], direction: int, manager: int, strings: _Strings) -> bytes:
+def _pdos(
+    behaviour: EtherCatBehaviour,
+    objects: dict[int, ObjectDescription],
+    direction: int,
+    manager: int,
+    strings: _Strings,
+) -> bytes:
     content = b""
     rows = [(manager, *one) for one in mapped(objects, direction)]
     for number, index, raws in [*rows, *((NOT_ASSIGNED, *one) for one in not_assigned(objects, direction))]:
         name = strings.number(objects[index].name)
-        content += struct.pack("<HBBBBH", index, len(raws), number, 0, name, 0)
+        rule = behaviour.pdos.get(index)
+        flags = 0
+        if rule is not None:
+            flags = (MANDATORY if rule.mandatory else 0) | (FIXED_CONTENT if is_fixed(objects[index]) else 0)
+        content += struct.pack("<HBBBBH", index, len(raws), number, 0, name, flags)
         for raw in raws:
             mapped_index, sub, bits = mapping.parse(raw)
             name, kind = (0, 0) if not mapped_index else _named(entry_of(objects, (mapped_index, sub)), strings)
@@ -183,6 +212,7 @@ def entry_of(objects: dict[int, ObjectDescription], key: tuple[int, int]) -> tup
     return name, entry.data_type
 
 
-def _mode(name: int, activation: int) -> bytes:
-    """Return an operation mode of the clocks: no cycle times, which the master chooses."""
-    return struct.pack("<IiihHhBB4s", 0, 0, 0, 0, activation, 0, name, 0, bytes(4))
+def _mode(one: ClockMode, strings: _Strings) -> bytes:
+    """Return an operation mode of the clocks."""
+    times = (one.cycle0, one.shift0, one.shift1, one.factor1, one.activation, one.factor0)
+    return struct.pack("<IiihHhBB4s", *times, strings.number(one.name), strings.number(one.title), bytes(4))

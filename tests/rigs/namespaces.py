@@ -58,12 +58,12 @@ def first_line(process):
 
 
 @contextmanager
-def served(spaces, pace, device="tmcm3313", load="portal"):
+def served(spaces, pace, device="tmcm3313", load="portal", options=()):
     """Serve a drive in its namespace."""
     program = "from drive_env.programs import drive_env; drive_env()"
     serve = ("-c", program, "serve", device, "--load", load, pace)
     process = subprocess.Popen(
-        inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface),
+        inside(spaces.slave, *serve, "--interface", "ethercat", "--channel", spaces.slave_interface, *options),
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
@@ -75,10 +75,12 @@ def served(spaces, pace, device="tmcm3313", load="portal"):
         process.stdout.close()
 
 
-def seen_by(spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal", library="pysoem"):
+def seen_by(
+    spaces, pace, program_of_master, *arguments, device="tmcm3313", load="portal", library="pysoem", options=()
+):
     """Return the report of a master on a served drive."""
     pytest.importorskip(library, reason=f"{library} is not installed: pip install -e '.[test]'")
-    with served(spaces, pace, device, load):
+    with served(spaces, pace, device, load, options):
         master = inside(spaces.master, TESTS / program_of_master, spaces.master_interface, *arguments)
         done = subprocess.run(master, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr

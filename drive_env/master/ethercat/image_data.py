@@ -134,6 +134,7 @@ class EtherCatProcessData:
         self._places: dict[Key, tuple[int, int]] = {}
         self._beside: tuple[Entry, ...] = ()  # what is read by SDO before each frame, in lockstep
         self._ready: set[int] = set()  # slaves that have these images, by their number here
+        self._modes: dict[tuple[int, Key], bytes] = {}  # as written last, of drives whose 6060h cannot be read
         self._clients: list[ObjectClient] = []
         self._slaves: list[SlaveImages] = []
 
@@ -214,6 +215,7 @@ class EtherCatProcessData:
         self.mapping += 1
         with self.turn:
             self._ready -= set(nodes)
+        self._modes = {row: data for row, data in self._modes.items() if row[0] not in nodes}
         for k in nodes:
             self._slaves[k].forget()
 
@@ -258,6 +260,8 @@ class EtherCatProcessData:
 
     def put(self, node: int, key: Key, data: bytes) -> bytes | None:
         """Put an object's value into the output image; return the bytes before, None if the image lacks the object."""
+        if cia402.of_first_axis(key[0]) == cia402.MODE:
+            self._modes[node, key] = data
         if node not in self._ready or key not in self._places:
             return None
         start, size = self._places[key]
@@ -384,12 +388,15 @@ class EtherCatProcessData:
         return any(entry in layout.entries for layout in self._layouts.values())
 
     def _as_it_is(self, node: int, layout: ImageLayout) -> bytearray:
-        """Return an output image of the slave's present values; 0 for those that cannot be read."""
+        """Return an output image of the slave's present values; of those that cannot be read the last mode, else 0."""
         image = bytearray(layout.size)
         for member in layout.members:
-            if member.entry.access != "wo":
+            key, timeout = self._description.key(member.entry, member.axis), self._description.answer_timeout
+            if member.entry.access == "wo":
+                data = self._modes.get((node, key), b"")
+                image[member.start : member.start + member.size] = data[: member.size].ljust(member.size, b"\0")
+            else:
                 label = self._description.label(member.entry, member.axis)
-                key, timeout = self._description.key(member.entry, member.axis), self._description.answer_timeout
                 data = self._clients[node].read(*key, label, timeout)
                 fill = b"\xff" if member.entry.signed and _is_below_0(data) else b"\0"
                 image[member.start : member.start + member.size] = data[: member.size].ljust(member.size, fill)

@@ -12,8 +12,10 @@ from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, O
 from drive_env.dictionary.entries import Entry
 from drive_env.fieldbus.description import Description
 from drive_env.master.packing import Member
+from drive_env.node.mapping import is_gap
 
 OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+MAPPINGS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}
 FIRST_PDO = {OUTPUTS: 0x1600, INPUTS: 0x1A00}  # of a device that names none
 # What a drive is commanded and watched by, wherever there is room for it.
 ESSENTIAL = {
@@ -31,12 +33,14 @@ class ImageLayout(NamedTuple):
         members: Objects of the axes and their places; one of the whole node stands for each axis.
         size: Length [bytes].
         mapped: Mapping entries to be written; None for a ready-made image.
+        more: Further objects that it is assigned, of a ready-made image in several parts.
     """
 
     pdo: int
     members: tuple[Member, ...]
     size: int
     mapped: tuple[int, ...] | None
+    more: tuple[int, ...] = ()
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -72,26 +76,36 @@ class ImagePlanner:
             fields = [(None if one.is_name else one.key, TYPES[one.type][1]) for one in image.fields]
             self._ready_made[OUTPUTS if image.is_output else INPUTS].append(self._of_fields(pdo, fields))
 
-    def parsed(self, direction: int, pdo: int, mapped: Sequence[int]) -> ImageLayout | None:
-        """Return the image that a mapping object of a slave makes; None where it is not the same for every axis.
+        for direction, indices in MAPPINGS.items() if description.device is not None else ():
+            for entry in known:
+                if entry.sub == 0 and entry.index in indices and self._is_ready_made(entry.index):
+                    subs = range(1, int(entry.default) + 1)
+                    raws = [int(known.find((entry.index, sub)).default) for sub in subs]
+                    self._ready_made[direction].append(self._of_raws([entry.index], raws))
 
-        One that cannot be written is ready-made, and taken as it is.
+    def parsed(self, direction: int, pdos: Sequence[int], mapped: Sequence[int]) -> ImageLayout | None:
+        """Return the image that mapping objects of a slave make; None where it is not the same for every axis.
+
+        One that cannot be written is ready-made, and taken as it is; so are several if one of them is.
         """
         for layout in self._ready_made[direction]:
-            if layout.pdo == pdo:
+            if [layout.pdo] == list(pdos):
                 return layout
-        known = self._description.dictionary
-        if known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const"):
-            keys = [((raw >> 16, raw >> 8 & 0xFF) if raw >> 16 else None, raw & 0xFF) for raw in mapped]
-            return self._of_fields(pdo, keys)
+        if any(map(self._is_ready_made, pdos)):
+            return self._of_raws(pdos, mapped)
+        if len(pdos) > 1:
+            return None
+        objects = [raw for raw in mapped if not is_gap(raw)]
         entries = []
-        for raw in mapped:
+        for raw in objects:
             found = self._by_key.get((raw >> 16, raw >> 8 & 0xFF))
             if found is None or found[0].bits != raw & 0xFF:
                 return None
             entries.append(found[0])
-        layout = self.free(pdo, tuple(dict.fromkeys(entries)))
-        return layout if layout.mapped == tuple(mapped) else None
+        layout = self.free(pdos[0], tuple(dict.fromkeys(entries)))
+        if layout.mapped != tuple(objects):
+            return None
+        return layout if len(objects) == len(mapped) else self._of_raws(pdos, mapped)._replace(mapped=tuple(mapped))
 
     def plan(self, direction: int, wanted: Sequence[Entry], current: ImageLayout) -> ImageLayout:
         """Return an image with the wanted entries of every axis; the current one if it has them.
@@ -163,6 +177,16 @@ class ImagePlanner:
                 members += [Member(entry, k, bit // 8, size) for k in (range(known.num_axes) if shared else (axis,))]
             bit += bits
         return ImageLayout(pdo, tuple(members), (bit + 7) // 8, None)
+
+    def _is_ready_made(self, pdo: int) -> bool:
+        """Return whether a mapping object cannot be written."""
+        known = self._description.dictionary
+        return known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const")
+
+    def _of_raws(self, pdos: Sequence[int], mapped: Sequence[int]) -> ImageLayout:
+        """Return the ready-made image of mapping entries, in as many parts as there are mapping objects."""
+        keys = [((raw >> 16, raw >> 8 & 0xFF) if raw >> 16 else None, raw & 0xFF) for raw in mapped]
+        return self._of_fields(pdos[0], keys)._replace(more=tuple(pdos[1:]))
 
     def _room(self, pdo: int) -> int:
         """Return how many entries a mapping object takes."""

@@ -29,23 +29,23 @@ class SlaveImages:
     def found(self, direction: int, planner: ImagePlanner) -> ImageLayout:
         """Return the image that the slave has now; an empty one if it has entries without a name."""
         assigned = self._read_list(direction, 2)
-        pdo = assigned[0] if assigned else FIRST_PDO[direction]
-        mapped = self._read_list(pdo, 4)
-        layout = planner.parsed(direction, pdo, mapped) if len(assigned) == 1 else None
-        return planner.free(pdo, ()) if layout is None else layout
+        mapped = [raw for pdo in assigned for raw in self._read_list(pdo, 4)]
+        layout = planner.parsed(direction, assigned, mapped) if assigned else None
+        return planner.free(assigned[0] if assigned else FIRST_PDO[direction], ()) if layout is None else layout
 
     def change(self, direction: int, layout: ImageLayout) -> None:
         """Give the slave an image: no assignment, no entries, entries, their number, the assignment."""
         assigned = self._read_list(direction, 2)
         mapped = None if layout.mapped is None else self._read_list(layout.pdo, 4)
-        if assigned == [layout.pdo] and (layout.mapped is None or mapped == list(layout.mapped)):
+        wanted = [layout.pdo, *layout.more]
+        if assigned == wanted and (layout.mapped is None or mapped == list(layout.mapped)):
             return
         kept = {} if mapped is None else {layout.pdo: mapped}
         self._before.setdefault(direction, (assigned, kept))
         self._write(direction, 0, 1, 0)
         if layout.mapped is not None and mapped != list(layout.mapped):
             self._write_list(layout.pdo, layout.mapped, 4)
-        self._write_list(direction, [layout.pdo], 2)
+        self._write_list(direction, wanted, 2)
 
     def restore(self) -> None:
         """Put assignments and mappings back as they were found; BusError if not all of it could be."""
