@@ -351,6 +351,7 @@ def context(scaler=65536.0, **other):
         "rated_current": 3.5,
         "velocity_ratio": 2.5,
         "peak_current": 12.0,
+        "profile_bits": 16.0,
     }
     values.update(other)
     return units.Context(**{name: values[name] for name in units.Context._fields})

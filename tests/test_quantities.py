@@ -152,6 +152,8 @@ def test_what_has_a_scale_of_its_own_is_shown_with_it():
     assert show(10_000, entry("velocity unit"), OF_ITS_OWN) == "10000 velocity unit (30 rpm)"
     assert show(20_000, entry("velocity unit/s"), OF_ITS_OWN) == "20000 velocity unit/s (1 rev/s^2)"
     assert show(32_767, entry("1/32767 M-Ipeak"), OF_ITS_OWN) == "32767 1/32767 M-Ipeak (8 A)"
+    assert show(int.from_bytes(b"TGZ-", "little"), entry("chars"), OF_ITS_OWN) == "760891220 chars ('TGZ-')"
+    assert show(0, entry("chars"), OF_ITS_OWN) == "0 chars ('')"
 
 
 @pytest.mark.parametrize(("values", "roles", "expected"), [

@@ -291,6 +291,8 @@ def test_a_swing_of_another_inertia_than_the_axiss_is_refused(factor, taken):
 class Axes:
     """Drives whose axes turn as a test says: `moves(k)` is the speed [counts] and way [inc] of each in cycle k."""
 
+    device = None
+
     def __init__(self, moves, limit=3500, num_axes=1):
         self._moves, self._limit, self._n = moves, limit, num_axes
         self.played, self.log, self.cycles = [], [], 0

@@ -94,6 +94,20 @@ def test_the_dictionary_has_the_makers_table():
     assert seen == 124
 
 
+@pytest.mark.parametrize(
+    ("name", "now"),
+    [
+        (0x23C5, "2505h and 2506h, C-LimN and C-LimP"),
+        ("23E0:0", "2109h, M-Polepairs"),
+        ("Velocity loop P", "V-K"),
+        (0x33C1, "3326h"),
+    ],
+)
+def test_an_object_of_an_earlier_version_is_told_with_what_it_is_now(drives, name, now):
+    with pytest.raises(ObjectAccessError, match=f"earlier versions had it: write {now}"):
+        drives.read(name)
+
+
 # --- the motor --------------------------------------------------------------------------------------------------------
 def test_m_nmax_is_the_speed_of_error_14(drives):
     turn(drives, 1000)

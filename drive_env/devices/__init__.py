@@ -195,6 +195,7 @@ class Device(NamedTuple):
     shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
     kept_bits: Mapping[tuple[int, int], int] = MappingProxyType({})  # of a value that is written; others are ignored
     num_outputs: int = 4
+    moved: Mapping[str, str] = MappingProxyType({})  # name or index of an earlier version -> what it is now
     mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
     # What process data above an object's range are taken as, `HIGHEST` or `MASK`; of others the object stays as it was.
     beyond_range: Mapping[tuple[int, int], str] = MappingProxyType({})
@@ -248,7 +249,7 @@ class Device(NamedTuple):
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
-        return ObjectDictionary(self.eds, node_id, self.roles)
+        return ObjectDictionary(self.eds, node_id, self.roles, self.moved)
 
     def locate(self, index: int) -> tuple[int, int]:
         """Return the axis that an object belongs to, and the index of the same object of axis 0."""
@@ -432,6 +433,7 @@ def _device(
         ethercat=ethercat_of(data.get("ethercat")),
         about=data.get("about", "").strip(),
         parts=parts_of({parse_key(text): row for text, row in data.get("parts", {}).items()}, parse_key),
+        moved=data.get("moved", {}),
         kept_bits={parse_key(text): int(mask) for text, mask in data.get("kept_bits", {}).items()},
         shared_values=frozenset(parse_key(text) for text in data.get("shared_values", [])),
         num_outputs=data.get("outputs", 4),

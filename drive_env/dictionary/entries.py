@@ -195,11 +195,17 @@ class ObjectDictionary:
         path: The EDS.
         node_id: For defaults that depend on it.
         roles: Which object plays which part.
+        moved: Name or index ("23C5") of an object that the device had once -> what it has instead, for messages.
     """
 
     def __init__(
-        self, path: Path | EdsText, node_id: int = 1, roles: Mapping[Role, tuple[int, int]] | None = None
+        self,
+        path: Path | EdsText,
+        node_id: int = 1,
+        roles: Mapping[Role, tuple[int, int]] | None = None,
+        moved: Mapping[str, str] | None = None,
     ) -> None:
+        self._moved = {name.casefold(): to for name, to in (moved or {}).items()}
         self.path = path
         self.roles = dict(roles or {})
         self._entries, self._names = _entries(*_source(path), node_id)
@@ -236,6 +242,8 @@ class ObjectDictionary:
             key = self._names.get(name.strip().casefold()) or _as_key(name)
             if key is not None and key not in self._entries:
                 return self.find(key)
+            if key is None and name.strip().casefold() in self._moved:
+                raise ObjectAccessError(NO_SUCH_OBJECT, f"no object is named {name!r} any more{self._instead(name)}")
             if key is None:
                 near = difflib.get_close_matches(name.casefold(), self._names, 3, 0.5)
                 hint = "; did you mean " + " or ".join(repr(self._entries[self._names[n]].name) for n in near)
@@ -255,7 +263,12 @@ class ObjectDictionary:
             raise ObjectAccessError(
                 NO_SUCH_SUB_INDEX, f"object {index:04X}h has no sub-index {sub}; the highest is {max(subs)}"
             )
-        raise ObjectAccessError(NO_SUCH_OBJECT, f"object {index:04X}h does not exist in {self.path.name}")
+        missing = f"object {index:04X}h does not exist in {self.path.name}"
+        raise ObjectAccessError(NO_SUCH_OBJECT, f"{missing}{self._instead(f'{index:04X}')}")
+
+    def _instead(self, name: str) -> str:
+        to = self._moved.get(name.strip().casefold())
+        return f"; earlier versions had it: write {to}" if to else ""
 
     def only(self, has: Callable[[int, str], bool]) -> ObjectDictionary:
         """Return the dictionary of the objects for whose index and name `has` is true."""

@@ -72,6 +72,7 @@ _INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
 _BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s"}
 _OF_PEAK = {"1/32767 M-Ipeak": 1.0 / 32767.0}
 SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "A", "voltage": "V", "time": "s"}
+CHARACTERS = "chars"  # four of a text, the first one in the lowest byte
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$")
 
 
@@ -219,8 +220,10 @@ def parse_raw(text: str, entry: Entry) -> int:
 
 
 def show(raw: int, entry: Entry, scale: Scale) -> str:
-    """Return an integer with its unit and, where that helps, as a quantity: `1092267 pps (1000 rpm)`."""
+    """Return an integer with its unit and, where that helps, as a quantity or text: `1092267 pps (1000 rpm)`."""
     text = f"{raw} {entry.unit}".rstrip()
+    if entry.unit == CHARACTERS:
+        return f"{text} ({raw.to_bytes((raw.bit_length() + 7) // 8, 'little').decode('latin-1')!r})"
     unit = find_unit(entry.unit, scale)
     if unit is None or SHOWN[unit.dimension] == entry.unit:
         return text

@@ -307,8 +307,9 @@ class Machines:
         """Return the outputs of a module by those of its axes: the first has outputs 0, 2, 4, the second 1, 3, 5."""
         count = self.inside.device.num_axes
         number = np.arange(len(own))
-        bits = np.arange(AXIS_OUTPUTS)[:, None]
-        spread = (((own >> bits & 1) << (AXES * bits)) << number % count).sum(axis=0)
+        spread = np.zeros(len(own), np.int64)
+        for bit in range(AXIS_OUTPUTS):
+            spread |= ((own >> bit & 1) << (AXES * bit)) << number % count
         found = np.zeros(len(own), np.int64)
         for axis in range(count):
             mate = number - number % count + axis
