@@ -334,8 +334,9 @@ LEFT = [
     ("tgz_d", MODE, 2, RANGE),
     ("tgz_d", 0x6086, 2, TOO_HIGH),
     ("tmcm1636", MODE, 2, RANGE),
-    ("tmcm6212", MODE, 10, RANGE),
-    ("tmcm3313", MODE, 11, RANGE),
+    ("tmcm6212", MODE, 10, TOO_HIGH),
+    ("tmcm3313", MODE, 11, TOO_HIGH),
+    ("tmcm3313", MODE, 2, RANGE),
     (INVENTED, MODE, 10, RANGE),
 ]
 
