@@ -21,7 +21,7 @@ ELSEWHERE = {
     "simple_test", "simple_ng", "eepromtool", "firm_update", "ec_sample", "basic_example", "find_adapters",
     "firmware_update", "minimal_example", "read_eeprom", "read_sdo_info", "write_foe", "ecat", "ecat_mailbox", "tshark",
     "setcap", "meshes", "null", "velocity_axis0.csv", "bias_0", "mjpython", "peak_usb", "kvaser_usb", "gs_usb",
-    "dialout",
+    "dialout", "Sm", "Fixed", "Mandatory", "Exclude", "PdoConfig", "InitCmd", "Slots",
 }  # fmt: skip
 IN_BACKTICKS = re.compile(r"`([^`\s]+)`")
 FILE_IN_PACKAGE = re.compile(rf"(?<![\w/.`-])(?:{'|'.join(PACKAGES)}|docs|tests)/[\w/-]+(?:{'|'.join(SUFFIXES)})\b")

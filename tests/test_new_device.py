@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.pump import NODE, PATIENCE, BootUps, Pump, until
-from rigs.small_eds import FOLDER, entry
+from rigs.small_eds import FOLDER, entry, put
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
@@ -329,16 +329,6 @@ def test_texts_and_floats_are_served_as_they_are(folders):
 
 
 # --- what a file tells in another way, or not at all ------------------------------------------------------------------
-def put(text, section, **values):
-    """Return an EDS with values of a section changed."""
-    head, rest = text.split(f"[{section}]\n", 1)
-    body, mark, tail = rest.partition("\n[")
-    for key, value in values.items():
-        body, done = re.subn(rf"(?m)^{key}=.*$", f"{key}={value}", body)
-        body = body if done else f"{key}={value}\n{body}"
-    return f"{head}[{section}]\n{body}{mark}{tail}"
-
-
 def without(text, *indices):
     """Return an EDS without objects."""
     return re.sub(rf"(?m)^\[({'|'.join(indices)})(sub\w+)?\]\n(?:(?!\[).*\n?)*", "", text)

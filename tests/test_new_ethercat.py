@@ -12,7 +12,7 @@ from rigs import TESTS
 from rigs.ethercat_segment import EmulatedSegment
 from rigs.namespaces import needs_namespaces, seen_by
 from rigs.namespaces import spaces as spaces
-from rigs.small_eds import FOLDER
+from rigs.small_eds import FOLDER, put
 from typer.testing import CliRunner
 
 from drive_env import EtherCatDrives, motion
@@ -328,6 +328,49 @@ def test_a_file_that_cannot_be_is_told_and_nothing_is_written(tmp_path, before, 
     assert done.exit_code == 2 and done.exception.__class__ is SystemExit
     assert done.stderr.startswith(f"drive-env: {path}") and said in done.stderr, done.stderr
     assert sorted(tmp_path.iterdir()) == [path]
+
+
+def made_of(tmp_path, text):
+    path = tmp_path / "vendor.xml"
+    path.write_text(text, encoding="utf-8")
+    device = new_device(None, tmp_path / "device", find_motor(MOTOR), esi=path)
+    return find_device(str(device.folder)), {note.what: note.why for note in device.repairs}
+
+
+def test_an_image_of_broken_bytes_is_filled_up(tmp_path):
+    at = HARBOR.index("<Index>#x3100</Index><SubIndex>2</SubIndex><BitLen>16<")
+    device, told = made_of(tmp_path, HARBOR[:at] + HARBOR[at:].replace(">16<", ">13<", 1))
+    assert mapped(device)[1][0x1A01] == [0x60F40020, 0x60FD0020, 13, 3]
+    assert told["[1A01]"] == "has 77 bits, and a gap of 3 up to whole bytes"
+
+
+def test_without_pdo_config_no_mapping_can_be_written(tmp_path):
+    device, _ = made_of(tmp_path, HARBOR.replace(' Fixed="1"', ""))
+    assert device.new_dictionary().find((0x1601, 1)).access == "ro"
+    (tmp_path / "free").mkdir()
+    device, _ = made_of(tmp_path / "free", HARBOR.replace(' Fixed="1"', "").replace('PdoConfig="0"', 'PdoConfig="1"'))
+    assert device.new_dictionary().find((0x1601, 1)).access == "rw"
+
+
+def test_of_several_images_that_would_do_the_first_is_assigned(tmp_path):
+    text = put((FOLDER / "alpina_ax40.eds").read_text(encoding="utf-8"), "1603sub2", DefaultValue="0x607A0020")
+    path = tmp_path / "vendor.eds"
+    path.write_text(text, encoding="utf-8")
+    device = new_device(path, tmp_path / "device", find_motor(MOTOR), on_ethercat=True)
+    assert list(mapped(find_device(str(device.folder)))[0]) == [0x1602]
+
+
+def test_a_folder_that_cannot_be_used_does_not_stay(tmp_path):
+    """Increments of a revolution of 8 bits: no encoder's counts fit in."""
+    path = tmp_path / "vendor.xml"
+    text = (ESIS / "jura_j4.xml").read_text(encoding="utf-8-sig")
+    path.write_text(
+        text.replace("<Name>Increments</Name><Type>UDINT</Type>", "<Name>Increments</Name><Type>USINT</Type>"),
+        encoding="utf-8",
+    )
+    done = CliRunner().invoke(app, ["new", "--esi", str(path), "--out", str(tmp_path / "device")])
+    assert done.exit_code == 2 and "make 0 units of position in a turn" in done.stderr, done.stderr
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_file_of_many_megabytes_and_a_pipe(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from drive_env.dictionary.drive_eds import read_types
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from drive_env.fieldbus.description import CIA_402, Description
@@ -47,6 +49,16 @@ def entry(index="6081", name="Profile velocity", kind="0x7", data_type="0x0007",
     """Return the section of an object."""
     rows = {"ParameterName": name, "ObjectType": kind, "DataType": data_type, "AccessType": access} | more
     return f"[{index}]\n" + "".join(f"{key}={value}\n" for key, value in rows.items() if value is not None) + "\n"
+
+
+def put(text, section, **values):
+    """Return an EDS with values of a section changed."""
+    head, rest = text.split(f"[{section}]\n", 1)
+    body, mark, tail = rest.partition("\n[")
+    for key, value in values.items():
+        body, done = re.subn(rf"(?m)^{key}=.*$", f"{key}={value}", body)
+        body = body if done else f"{key}={value}\n{body}"
+    return f"{head}[{section}]\n{body}{mark}{tail}"
 
 
 EDS = """
