@@ -53,6 +53,8 @@ def test_the_version_is_that_of_the_package(name):
 
 
 @pytest.mark.parametrize(("program", "old", "new"), [
+    *(("drive-env", old, f"drive-env parameters {old}") for old in ("backup", "diff", "restore", "commission")),
+    *(("drive-env", old, f"drive-env frames {old}") for old in ("log", "replay")),
     ("drive-tune", "optimise", "drive-tune auto --by tpe"),
     ("drive-agent", "tune", "drive-tune auto --by agent"),
 ])  # fmt: skip
@@ -80,12 +82,14 @@ def run(program, *arguments, **environment):
 
 @pytest.mark.parametrize(("program", "begun", "commands"), [
     ("drive-env", "sc", {"scan", "scope"}),
+    ("drive-env", "parameters ", {"backup", "diff", "restore", "commission"}),
     ("drive-tune", "r", {"response", "rules", "rank"}),
     ("drive-agent", "ev", {"evaluate"}),
 ])  # fmt: skip
 def test_a_shell_completes_commands(program, begun, commands):
     variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
-    done = run(program, **{variable: "complete_bash", "COMP_WORDS": f"{program} {begun}", "COMP_CWORD": "1"})
+    words = {"COMP_WORDS": f"{program} {begun}", "COMP_CWORD": str(len(begun.split(" ")))}
+    done = run(program, **{variable: "complete_bash"}, **words)
     assert set(done.stdout.split()) >= commands, done.stderr
 
 
