@@ -91,7 +91,8 @@ VALUES: dict[str, str] = {
     "policy": "tracking_two_mass", "environment": "tracking", "device": "tmcm1636", "load": "inertia",
     "drive-env lss bit-rate new": "500000", "file": "state.toml",
     "drive-env parameters backup file": "new.toml", "drive-env frames log file": "new.log",
-    "drive-env export file": "new.eds", "drive-env frames replay file": "frames.log",
+    "drive-env export eds file": "new.eds", "drive-env export dcf file": "new.dcf",
+    "drive-env frames replay file": "frames.log",
     "drive-tune undo file": "before.toml", "other": "state.toml",
     "drive-tune auto agent": "gain_tuning", "drive-tune auto by": "design",
     "dynamics": "soft", "inertia_range": "0.8/4",
@@ -178,7 +179,7 @@ def run(command: Command, arguments: list[str]) -> Any:
 def test_these_commands_may_act_on_a_bus():
     """That the programs are read rightly: a command that is lost from this list is looked at by nobody."""
     assert {str(one) for one in ON_A_BUS} >= {
-        *(f"drive-env {one}" for one in ("scan", "get", "set", "jog", "scope", "export", "serve", "lss node-id")),
+        *(f"drive-env {one}" for one in ("scan", "get", "set", "jog", "scope", "export eds", "serve", "lss node-id")),
         *(f"drive-tune {one}" for one in ("identify", "response", "rules", "auto", "undo")),
         "drive-agent evaluate",
     }

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
-from drive_env.commands.eds import print_eds
-from drive_env.commands.esi import print_esi
 from drive_env.commands.ethercat import ethercat_app
-from drive_env.commands.export import export
+from drive_env.commands.export import export_app
 from drive_env.commands.fault import fault
 from drive_env.commands.frames import frames_app
 from drive_env.commands.get import get, set_object
@@ -40,9 +38,6 @@ PANELS = {
     ),
     "This installation": (
         ("list", list_names),
-        ("eds", print_eds),
-        ("esi", print_esi),
-        ("export", export),
         ("new", new_from_eds),
         ("compile", compile_kernels),
     ),
@@ -50,7 +45,7 @@ PANELS = {
 }
 GROUPS = {
     "Drives on a bus": (("parameters", parameters_app), ("frames", frames_app), ("lss", lss_app)),
-    "This installation": (("motor", motor_app),),
+    "This installation": (("export", export_app), ("motor", motor_app)),
     "Emulated drives": (("ethercat", ethercat_app),),
 }
 for panel, commands in PANELS.items():
@@ -61,6 +56,7 @@ for panel, groups in GROUPS.items():
         app.add_typer(group, name=name, rich_help_panel=panel)
 app.moved({old: f"drive-env parameters {old}" for old in ("backup", "diff", "restore", "commission")})
 app.moved({old: f"drive-env frames {old}" for old in ("log", "replay")})
+app.moved({old: f"drive-env export {old} FILE --device DEVICE" for old in ("eds", "esi")})
 
 
 @app.callback()
