@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -20,11 +21,6 @@ from drive_env.commands.options import (
 )
 from drive_env.commands.program import answer_old_name
 from drive_env.commands.tables import print_text
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from drive_env.dictionary.entries import EdsText
 
 KBIT = 1000  # bit/s
 
@@ -50,22 +46,20 @@ def export() -> None:
     """Files by which other masters and tools know a drive: EDS and DCF of CANopen, ESI of EtherCAT."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class CommissionedOptions(NodeOptions):
+    """Options of a commissioned drive: one on a bus, or an emulated one."""
+
+    axis: AxisOfNode = None
+    eds: Eds = None
+    motor: Annotated[str | None, typer.Option("--motor", help="Motor that an emulated drive is commissioned for.")] = (
+        None
+    )
+
+
 @export_app.command("eds")
 @grouped
-def export_eds(
-    context: typer.Context,
-    file: File,
-    *,
-    bus: NodeOptions,
-    axis: AxisOfNode = None,
-    eds: Eds = None,
-    motor: Annotated[
-        str | None,
-        typer.Option(
-            "--motor", help="Motor that an emulated drive is commissioned for; without it the EDS as the device has it."
-        ),
-    ] = None,
-) -> None:
+def export_eds(context: typer.Context, file: File, *, drive: CommissionedOptions) -> None:
     """Write the EDS of a device; or of a commissioned drive, whose values are the defaults then.
 
     Values are those of the drive on the bus that --interface, --channel, --node or --bitrate names (nothing is written
@@ -74,46 +68,26 @@ def export_eds(
     """
     from drive_env.devices import find_device
     from drive_env.dictionary.entries import eds_text
-    from drive_env.master.commissioned_eds import commissioned_eds
 
     with errors_as_exit_codes():
         _check_name(file, ".eds")
-        if not names_a_bus(context) and (eds, motor, axis) == (None, None, None):
-            _write(file, eds_text(find_device(bus.device).eds), f"EDS of {bus.device}")
-            return
-        source, values, whose = _commissioned(context, bus, axis, eds, motor)
-        text = commissioned_eds(source, values, _name(file, source))
-        _write(file, text, f"{len(values)} parameters of {whose}{_part(axis)}")
+        if names_a_bus(context) or (drive.eds, drive.motor, drive.axis) != (None, None, None):
+            _write_commissioned(context, file, drive, node_id=None)
+        else:
+            _write(file, eds_text(find_device(drive.device).eds), f"EDS of {drive.device}")
 
 
 @export_app.command("dcf")
 @grouped
-def export_dcf(
-    context: typer.Context,
-    file: File,
-    *,
-    bus: NodeOptions,
-    axis: AxisOfNode = None,
-    eds: Eds = None,
-    motor: Annotated[
-        str | None,
-        typer.Option("--motor", help="Motor that an emulated drive is commissioned for.", show_default="the device's"),
-    ] = None,
-) -> None:
+def export_dcf(context: typer.Context, file: File, *, drive: CommissionedOptions) -> None:
     """Write the DCF of a drive: its EDS with the commissioned values, node-ID and bit rate of this node.
 
     It is the drive on the bus that --interface, --channel, --node or --bitrate names (nothing is written to it), else
-    an emulated one. With --axis the values of one axis and of the node are written, and all other axes keep what the
-    EDS says.
+    an emulated one, without --motor with the device's usual motor. --axis is as of `export eds`.
     """
-    from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds
-
     with errors_as_exit_codes():
         _check_name(file, ".dcf")
-        source, values, whose = _commissioned(context, bus, axis, eds, motor)
-        number, kbit = bus.node or 1, CAN_KBIT if bus.bitrate is None else bus.bitrate // KBIT
-        text = commissioned_eds(source, values, _name(file, source), node_id=number, bit_rate=kbit)
-        _write(file, text, f"{len(values)} parameters of {whose}, as node {number}{_part(axis)}")
+        _write_commissioned(context, file, drive, node_id=drive.node or 1)
 
 
 @export_app.command("esi")
@@ -127,36 +101,43 @@ def export_esi(file: File, device: DeviceName) -> None:
         _write(file, esi_text(find_device(device)), f"ESI of {device}")
 
 
-def _commissioned(
-    context: typer.Context, bus: NodeOptions, axis: int | None, eds: Path | None, motor: str | None
-) -> tuple[Path | EdsText, Mapping[tuple[int, int], int], str]:
-    """Return a drive's own EDS, its commissioned values, and its name: of one on a bus, else of an emulated one.
+def _write_commissioned(context: typer.Context, file: Path, drive: CommissionedOptions, node_id: int | None) -> None:
+    """Write the EDS of a commissioned drive, or with a node-ID its DCF.
 
     Raises:
         ValueError: For an EDS without a bus, and an axis that the drive does not have.
     """
     from drive_env.devices import find_device
     from drive_env.drives.chosen_axes import chosen_parts
-    from drive_env.master.commissioned_eds import commissioned_values
+    from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds, commissioned_values
 
+    axis, eds, device = drive.axis, drive.eds, drive.device
     if names_a_bus(context):
-        with bus.connect(eds, safety=False) as drives:
+        with drive.connect(eds, safety=False) as drives:
             if axis is not None:
                 chosen_parts([axis], drives.description.num_axes, drives.description.name)
-            known = drives.description
-            return known.dictionary.path, commissioned_values(drives, axis=axis), known.name
-    if eds is not None:
-        raise ValueError(
-            f"--eds {eds} is of a drive on a bus, and no bus is named; give --interface and --channel, or make "
-            f"a device of it (drive-env new --eds {eds}) and name that as --device"
-        )
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+            values = commissioned_values(drives, axis=axis)
+            source, whose = drives.description.dictionary.path, drives.description.name
+    else:
+        if eds is not None:
+            raise ValueError(
+                f"--eds {eds} is of a drive on a bus, and no bus is named; give --interface and --channel, or make "
+                f"a device of it (drive-env new --eds {eds}) and name that as --device"
+            )
+        from drive_env.emulator.emulated_drives import EmulatedDrives
 
-    device = find_device(bus.device)
-    if axis is not None:
-        chosen_parts([axis], device.num_axes, bus.device)
-    with EmulatedDrives(bus.device, "inertia", motor, num_machines=device.num_axes, num_threads=1) as emulated:
-        return device.eds, commissioned_values(emulated, axis=axis), bus.device
+        known = find_device(device)
+        if axis is not None:
+            chosen_parts([axis], known.num_axes, device)
+        source, whose = known.eds, device
+        with EmulatedDrives(device, "inertia", drive.motor, num_machines=known.num_axes, num_threads=1) as emulated:
+            values = commissioned_values(emulated, axis=axis)
+    name = source.name if str(file) == "-" else file.name
+    kbit = CAN_KBIT if drive.bitrate is None else drive.bitrate // KBIT
+    text = commissioned_eds(source, values, name, node_id=node_id, bit_rate=kbit)
+    node = "" if node_id is None else f", as node {node_id}"
+    part = "" if axis is None else f", axis {axis} alone"
+    _write(file, text, f"{len(values)} parameters of {whose}{node}{part}")
 
 
 def _check_name(file: Path, ending: str) -> None:
@@ -168,21 +149,12 @@ def _check_name(file: Path, ending: str) -> None:
     check_free(file)
 
 
-def _name(file: Path, source: Path | EdsText) -> str:
-    """Return the name that an EDS gives itself: of its file, of the drive's own EDS where it is printed."""
-    return source.name if str(file) == "-" else file.name
-
-
-def _part(axis: int | None) -> str:
-    return "" if axis is None else f", axis {axis} alone"
-
-
 def _write(file: Path, text: str, said: str) -> None:
     """Write a file and say of what it is, or print it."""
     from drive_env.whole_file import write_whole
 
     if str(file) == "-":
         print_text(text)
-        return
-    write_whole(file, text)
-    print(f"{file}: {said}")
+    else:
+        write_whole(file, text)
+        print(f"{file}: {said}")
