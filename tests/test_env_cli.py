@@ -23,7 +23,7 @@ from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.commands import scan
-from drive_env.commands.cli import PANELS, app
+from drive_env.commands.cli import GROUPS, PANELS, app
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.limits import Limits
 from drive_env.fieldbus.errors import BusError, NoAnswerError
@@ -684,12 +684,14 @@ def test_a_broken_log_is_told(run, tmp_path, ending):
 
 
 # --- help ---------------------------------------------------------------------------------------------------------
-COMMANDS = [name for commands in PANELS.values() for name, _ in commands]
+COMMANDS = [[name] for commands in PANELS.values() for name, _ in commands]
+COMMANDS += [[name, *more] for groups in GROUPS.values() for name, group in groups
+             for more in ([], *([row.name or row.callback.__name__] for row in group.registered_commands))]  # fmt: skip
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_every_command_explains_itself(command):
-    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, [*command, "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == DONE
     assert "--help" in result.stdout
 
