@@ -1,6 +1,6 @@
 """python-canopen as master: find the node, read and write objects, map a PDO, turn the motor by the CiA 402 automaton.
 
-drive-env eds tmcm1636 > tmcm1636.eds
+drive-env export eds tmcm1636.eds
 drive-env serve tmcm1636 --load inertia &
 python examples/python_canopen.py --eds tmcm1636.eds
 

@@ -1,4 +1,4 @@
-"""What `drive-env restore` writes: a whole file, of this drive, without commands; and what it says is proven."""
+"""`drive-env parameters restore` writes a whole file, of this drive, without commands; what it says is proven."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def writes(drive):
 @pytest.fixture
 def file(drive, tmp_path):
     path = tmp_path / "drive.toml"
-    code, _, error = run("backup", path)
+    code, _, error = run("parameters", "backup", path)
     assert code == DONE, error
     drive.set(PROFILE_VELOCITY, 1000)
     drive.buses.clear()
@@ -77,7 +77,7 @@ def test_a_backup_says_of_which_drive_it_is_when_and_ends_with_its_check_sum(fil
 
 
 def test_a_file_of_this_drive_is_restored_and_proven_by_another_connection(drive, file):
-    code, out, error = run("restore", file, "--yes")
+    code, out, error = run("parameters", "restore", file, "--yes")
     assert code == DONE, error
     assert re.search(
         r"^1 written, \d+ verified by a second reading; not stored: lost at the next reset", out, re.MULTILINE
@@ -90,12 +90,13 @@ def test_a_file_of_this_drive_is_restored_and_proven_by_another_connection(drive
 
 def test_a_writer_is_not_believed(drive, file, monkeypatch):
     monkeypatch.setattr(parameters, "write_all_or_none", lambda drives, wanted, axis: [])
-    code, out, error = run("restore", file, "--yes")
+    code, out, error = run("parameters", "restore", file, "--yes")
     assert (code, "verified" in out) == (REFUSED, False), error
     assert error == (
         f"drive-env: node 1 does not have the values that were written, by a second reading: 6081h:00 Profile "
         f"velocity is "
-        f"1000, not {SPEED}; is another master writing to it? Look with `drive-env diff`, then restore again\n"
+        f"1000, not {SPEED}; is another master writing to it? Look with "
+        "`drive-env parameters diff`, then restore again\n"
     )
 
 
@@ -120,18 +121,18 @@ def test_a_writer_is_not_believed(drive, file, monkeypatch):
 )
 def test_a_file_that_is_not_as_it_was_written_is_refused_by_name(drive, file, spoil, words, unchecked):
     file.write_bytes(spoil(file.read_text(encoding="utf-8")).encode())
-    code, _, error = run("restore", file, "--yes")
+    code, _, error = run("parameters", "restore", file, "--yes")
     if words:
         assert (code, error.startswith(f"drive-env: {file} {words}"), error.count("\n")) == (USER_ERROR, True, 1)
         assert (drive.get(PROFILE_VELOCITY), writes(drive)) == (1000, [])
     else:
         assert (code, drive.get(PROFILE_VELOCITY)) == (DONE, SPEED)
-    assert run("restore", file, "--yes", "--unchecked")[0] == unchecked
+    assert run("parameters", "restore", file, "--yes", "--unchecked")[0] == unchecked
 
 
 def test_a_difference_is_shown_also_of_a_file_that_was_changed_and_it_is_said(drive, file):
     file.write_text(file.read_text(encoding="utf-8").replace(f"= {SPEED} ", "= 50 "), encoding="utf-8")
-    code, out, error = run("diff", file, "--json")
+    code, out, error = run("parameters", "diff", file, "--json")
     assert [row["wanted"] for row in json.loads(out)] == [50]
     assert (code, error.startswith(f"drive-env: note: {file} was changed since it was written")) == (REFUSED, True)
 
@@ -146,13 +147,13 @@ def test_a_difference_is_shown_also_of_a_file_that_was_changed_and_it_is_said(dr
 )
 def test_another_drive_is_refused_unless_it_is_said(drive, file, key, value, words):
     drive.values[key] = value
-    code, _, error = run("restore", file, "--yes")
+    code, _, error = run("parameters", "restore", file, "--yes")
     assert (code, writes(drive)) == (USER_ERROR, [])
     assert error == (
         f"drive-env: {file} is of another drive: it was read from {words}. Nothing was written; if it is meant for "
         "this drive all the same, say --other-drive\n"
     )
-    assert run("restore", file, "--yes", "--other-drive")[0] == DONE
+    assert run("parameters", "restore", file, "--yes", "--other-drive")[0] == DONE
     assert drive.get(PROFILE_VELOCITY) == SPEED
 
 
@@ -162,22 +163,22 @@ def test_another_product_is_refused_also_where_the_description_takes_any(drive, 
     eds = tmp_path / "any.eds"
     eds.write_text(find_device("tmcm1636").eds.read_text(encoding="cp1252").replace("DefaultValue=1636", ""), "cp1252")
     drive.values[0x1018, 2] = (6212, 4)
-    code, _, error = run("restore", file, "--yes", "--eds", eds)
+    code, _, error = run("parameters", "restore", file, "--yes", "--eds", eds)
     assert (code, writes(drive)) == (USER_ERROR, [])
     assert "product code 664h, and here is 1844h" in error
 
 
 def test_a_drive_without_a_serial_number_is_told_by_its_node(drive, tmp_path):
     del drive.values[0x1018, 4]
-    assert run("backup", tmp_path / "one.toml")[0] == DONE
+    assert run("parameters", "backup", tmp_path / "one.toml")[0] == DONE
     drive.node = 2
-    code, _, error = run("restore", tmp_path / "one.toml", "--node", 2, "--yes")
+    code, _, error = run("parameters", "restore", tmp_path / "one.toml", "--node", 2, "--yes")
     assert (code, "was read from node 1, and here is 2" in error) == (USER_ERROR, True)
     drive.values[0x1018, 4] = (4711, 4)
     (tmp_path / "one.toml").unlink()
-    assert run("backup", tmp_path / "one.toml", "--node", 2)[0] == DONE
+    assert run("parameters", "backup", tmp_path / "one.toml", "--node", 2)[0] == DONE
     drive.node = 1
-    code, _, error = run("restore", tmp_path / "one.toml", "--yes")
+    code, _, error = run("parameters", "restore", tmp_path / "one.toml", "--yes")
     assert code == DONE, "it has another node-ID, and its serial number says that it is the same drive: " + error
 
 
@@ -198,7 +199,7 @@ def test_a_drive_without_a_serial_number_is_told_by_its_node(drive, tmp_path):
 def test_commands_and_services_of_a_file_are_refused_before_anything_is_written(drive, tmp_path, line, words):
     file = tmp_path / "orders.toml"
     file.write_text(f'[parameters]\n"6081:00" = 5\n{line}\n"6083:00" = 9\n', encoding="utf-8")
-    code, _, error = run("restore", file, "--yes", "--unchecked", "--other-drive")
+    code, _, error = run("parameters", "restore", file, "--yes", "--unchecked", "--other-drive")
     assert (code, drive.buses) == (USER_ERROR, [])
     assert (
         error
@@ -237,16 +238,16 @@ def test_a_dry_run_says_what_would_be_written_and_that_nothing_was(drive, file, 
     monkeypatch.chdir(file.parent)
     for index, size in ((0x2050, 1), (0x2055, 1)):
         drive.values[index, 0] = (0, size)
-    code, out, error = run(*arguments, "--dry-run", "--store")
+    code, out, error = run("parameters", *arguments, "--dry-run", "--store")
     assert code == DONE, error
     said = out.splitlines()[-1]
     assert re.fullmatch(r"\d+ parameters would be written to node 1, and stored \(dry run: nothing was written\)", said)
     assert "verified" not in out
     assert (writes(drive), drive.get(PROFILE_VELOCITY)) == ([], 1000)
-    told = json.loads(run(*arguments, "--dry-run", "--json")[1])
+    told = json.loads(run("parameters", *arguments, "--dry-run", "--json")[1])
     assert (len(told["would change"]), told["written"]) == (int(said.split()[0]), 0)
     drive.set(0x6041, 0x0627)
-    code, _, error = run(*arguments, "--dry-run")
+    code, _, error = run("parameters", *arguments, "--dry-run")
     assert (code, "the axis is enabled" in error) == (REFUSED, True)
 
 
@@ -254,5 +255,5 @@ def test_a_dry_run_says_what_would_be_written_and_that_nothing_was(drive, file, 
 def test_an_axis_that_may_turn_is_not_restored(drive, file, status):
     """Operation enabled; quick stop active; fault reaction active."""
     drive.set(0x6041, status)
-    code, _, error = run("restore", file, "--yes")
+    code, _, error = run("parameters", "restore", file, "--yes")
     assert (code, "the axis is enabled" in error, writes(drive)) == (REFUSED, True, [])

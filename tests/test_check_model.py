@@ -78,7 +78,7 @@ def test_a_fit_as_json(log):
 
 
 def test_the_settings_of_the_real_drive_count(tmp_path):
-    """As `drive-env backup` writes them: gains of its own."""
+    """As `drive-env parameters backup` writes them: gains of its own."""
     real = machines(seed=77)
     real.write((0x2043, 1), 250)
     real.write((0x2042, 1), 900)

@@ -182,7 +182,7 @@ def test_errors_call_an_axis_by_its_own_number():
         assert {message.axis for message in chosen.emergencies()} == {0}
 
 
-# --- drive-env export -------------------------------------------------------------------------------------------------
+# --- drive-env export eds ---------------------------------------------------------------------------------------------
 def test_export_of_one_axis_has_its_values_and_the_nodes_in_process_and_on_a_bus():
     from drive_env.master.commissioned_eds import commissioned_values
 

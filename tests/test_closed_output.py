@@ -76,11 +76,13 @@ def test_a_full_disk_is_told(unbuffered):
 
 @pytest.mark.every(4)
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
-@pytest.mark.parametrize("arguments", [("esi", "tmcm3313"), ("eds", "tmcm1636_fw109")])
+@pytest.mark.parametrize(("kind", "device"), [("esi", "tmcm3313"), ("eds", "tmcm1636_fw109")])
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_of_a_file_that_is_printed_a_full_disk_is_told_by_name_and_remedy(arguments, unbuffered):
+def test_of_a_file_that_is_printed_a_full_disk_is_told_by_name_and_remedy(kind, device, unbuffered):
     with Path("/dev/full").open("w") as full:
-        found = run(("drive_env", *arguments), unbuffered, stdout=full, stderr=subprocess.PIPE)
+        found = run(
+            ("drive_env", "export", kind, "-", "--device", device), unbuffered, stdout=full, stderr=subprocess.PIPE
+        )
     assert found.returncode == 2
     assert found.stderr.splitlines()[0] == (
         "drive-env: standard output: No space left on device; print to where there is room"

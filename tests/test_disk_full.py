@@ -194,7 +194,7 @@ def test_a_search_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, 
 def test_a_backup_that_finds_no_room_leaves_no_file_that_looks_like_one(tmp_path):
     full(tmp_path / "drive.toml")
     with node() as (_, bus):
-        done = CliRunner().invoke(drive_env, ["backup", str(tmp_path / "drive.toml"), *bus[:4]])
+        done = CliRunner().invoke(drive_env, ["parameters", "backup", str(tmp_path / "drive.toml"), *bus[:4]])
     assert (done.exit_code, done.stderr) == (2, f"drive-env: {tmp_path / 'drive.toml'}: {SAID}\n")
     assert list(tmp_path.iterdir()) == []
 

@@ -23,7 +23,7 @@ from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.commands import scan
-from drive_env.commands.cli import PANELS, app
+from drive_env.commands.cli import GROUPS, PANELS, app
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.limits import Limits
 from drive_env.fieldbus.errors import BusError, NoAnswerError
@@ -194,11 +194,11 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["scope", "--period", "0.0015"], USER_ERROR, "not a whole number of milliseconds"),
         (["scope", "--duration", "0.0004"], USER_ERROR, "--duration 0.0004 s is not a whole number of milliseconds"),
         (["scope", "--out", "nowhere/file"], USER_ERROR, "there is no folder nowhere"),
-        (["diff", "missing.toml"], USER_ERROR, "there is no file missing.toml; write one with"),
-        (["commission", "nonsense"], USER_ERROR, "no motor is named 'nonsense'; there are am3033_e"),
-        (["log", "frames.xyz"], USER_ERROR, "'.xyz' is not one of .log, .blf"),
-        (["replay", "missing.log"], USER_ERROR, "there is no file missing.log"),
-        (["log", "frames.log", "--duration", "nan"], USER_ERROR, "--duration nan s must be above 0 s"),
+        (["parameters", "diff", "missing.toml"], USER_ERROR, "there is no file missing.toml; write one with"),
+        (["parameters", "commission", "nonsense"], USER_ERROR, "no motor is named 'nonsense'; there are am3033_e"),
+        (["frames", "log", "frames.xyz"], USER_ERROR, "'.xyz' is not one of .log, .blf"),
+        (["frames", "replay", "missing.log"], USER_ERROR, "there is no file missing.log"),
+        (["frames", "log", "frames.log", "--duration", "nan"], USER_ERROR, "--duration nan s must be above 0 s"),
         (["monitor", "--period", "0"], USER_ERROR, "must be above 0 s"),
         (["monitor", "--duration", "nan"], USER_ERROR, "--duration nan s must be above 0 s"),
     ],
@@ -246,8 +246,8 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
 @pytest.mark.parametrize(
     ("arguments", "name", "remedy"),
     [
-        (["backup", "was.toml"], "was.toml", "choose another file"),
-        (["log", "was.asc", "--duration", "0.1"], "was.asc", "choose another file"),
+        (["parameters", "backup", "was.toml"], "was.toml", "choose another file"),
+        (["frames", "log", "was.asc", "--duration", "0.1"], "was.asc", "choose another file"),
         (["scope", "--duration", "0.01", "--out", "was"], "was.csv", "choose another --out"),
         (["scope", "--duration", "0.01", "--out", "was"], "was.png", "choose another --out"),
         (["render", "--load", "inertia", "--out", "was.gif"], "was.gif", "choose another --out"),
@@ -277,37 +277,37 @@ def test_a_picture_is_no_log_to_compare_with(run, tmp_path):
 # --- parameters ---------------------------------------------------------------------------------------------------
 def test_backup_diff_restore(run, shared, tmp_path):
     file = tmp_path / "drive.toml"
-    code, out, _ = run("backup", file)
+    code, out, _ = run("parameters", "backup", file)
     assert code == DONE
     assert re.fullmatch(r"\d+ parameters of node 1 written to .*\n", out)
     text = file.read_text()
     assert '"6081:00" = 2184533  # Profile velocity [pps]' in text
     assert '"6040:00"' not in text  # a command
-    assert run("diff", file)[0] == DONE
+    assert run("parameters", "diff", file)[0] == DONE
     run("set", "6081", "1000")
     run("set", "2042:1", "500")
-    code, out, _ = run("diff", file, "--json")
+    code, out, _ = run("parameters", "diff", file, "--json")
     assert code == REFUSED
     assert {row["object"]: (row["found"], row["wanted"]) for row in json.loads(out)} == {
         "2042h:01 Velocity Mode Settings.P_Parameter": (500, 445),
         "6081h:00 Profile velocity": (1000, 2184533),
     }
-    code, out, _ = run("restore", file, "--yes")
+    code, out, _ = run("parameters", "restore", file, "--yes")
     assert code == DONE
     assert "2 written, " in out
     assert shared[1][0].read(0x6081) == [2_184_533]
-    assert run("diff", file)[0] == DONE
+    assert run("parameters", "diff", file)[0] == DONE
 
 
 def test_diff_of_two_files(run, tmp_path):
     one, two = tmp_path / "one.toml", tmp_path / "two.toml"
     one.write_text('[parameters]\n"6081:00" = 5\n"6083:00" = 7\n')
     two.write_text('[parameters]\n"6081:00" = 6\n"6083:00" = 7\n')
-    code, out, _ = run("diff", one, two)
+    code, out, _ = run("parameters", "diff", one, two)
     assert code == REFUSED
     assert "6081h:00 Profile velocity" in out
     assert "6083h" not in out
-    assert run("diff", one, one)[0] == DONE
+    assert run("parameters", "diff", one, one)[0] == DONE
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def test_diff_of_two_files(run, tmp_path):
 def test_a_file_that_is_no_parameters_is_told(run, tmp_path, text, message):
     file = tmp_path / "wrong.toml"
     file.write_text(text)
-    code, _, error = run("restore", file, "--yes")
+    code, _, error = run("parameters", "restore", file, "--yes")
     assert (code, message in error) == (USER_ERROR, True)
 
 
@@ -332,7 +332,7 @@ def test_restore_is_all_or_nothing(run, shared, tmp_path):
     """605Ah knows 1, 2, 5 and 6 only: what was written before it is taken back."""
     file = tmp_path / "bad.toml"
     file.write_text('[parameters]\n"6081:00" = 77\n"605A:00" = 3\n"6083:00" = 99\n')
-    code, _, error = run("restore", file, "--unchecked", "--yes")
+    code, _, error = run("parameters", "restore", file, "--unchecked", "--yes")
     assert code == REFUSED
     assert "node 1 refused the write of 3 to 605Ah:00" in error
     assert "everything was taken back, the drive is as it was" in error
@@ -341,18 +341,18 @@ def test_restore_is_all_or_nothing(run, shared, tmp_path):
 
 def test_restore_remaps_pdos_in_the_order_that_a_drive_wants(run, tmp_path):
     before, file = tmp_path / "before.toml", tmp_path / "pdos.toml"
-    run("backup", before)
+    run("parameters", "backup", before)
     file.write_text(
         '[parameters]\n"1A00:00" = 2\n"1A00:01" = 0x60640020\n"1A00:02" = 0x60410010\n"1800:01" = 0x40000191\n'
         '"1800:02" = 1\n"1A03:00" = 0\n"1803:01" = 0xC0000481\n"1600:00" = 2\n"1600:02" = 0x60FF0020\n'
     )
-    code, _, error = run("restore", file, "--unchecked", "--yes")
+    code, _, error = run("parameters", "restore", file, "--unchecked", "--yes")
     assert code == DONE, error
     assert run("get", "--raw", "1400:1")[1].endswith(f"= {0x40000201}\n")  # not in the file, and on again
-    assert run("diff", file)[0] == DONE
-    code, _, error = run("restore", before, "--yes")
+    assert run("parameters", "diff", file)[0] == DONE
+    code, _, error = run("parameters", "restore", before, "--yes")
     assert code == DONE, error
-    assert run("diff", before)[0] == DONE
+    assert run("parameters", "diff", before)[0] == DONE
 
 
 def test_an_enabled_axis_is_not_restored(run, shared, tmp_path):
@@ -361,7 +361,7 @@ def test_an_enabled_axis_is_not_restored(run, shared, tmp_path):
     for word in (6, 7, 15):
         shared[1][0].write("Controlword", word)
     try:
-        code, _, error = run("restore", file, "--unchecked", "--yes")
+        code, _, error = run("parameters", "restore", file, "--unchecked", "--yes")
         assert (code, "the axis is enabled" in error) == (REFUSED, True)
     finally:
         run("set", "6040", 0)
@@ -370,7 +370,7 @@ def test_an_enabled_axis_is_not_restored(run, shared, tmp_path):
 def test_nobody_to_ask_changes_nothing(run, shared, tmp_path):
     file = tmp_path / "one.toml"
     file.write_text('[parameters]\n"6081:00" = 77\n')
-    code, _, error = run("restore", file, "--unchecked")
+    code, _, error = run("parameters", "restore", file, "--unchecked")
     assert code == USER_ERROR
     assert re.fullmatch(
         r"drive-env: Write \d+ parameters to node 1\? There is no terminal to ask; confirm with "
@@ -381,8 +381,8 @@ def test_nobody_to_ask_changes_nothing(run, shared, tmp_path):
 
 
 def test_commission_makes_a_bare_drive_turn(run, shared):
-    assert "qbl4208" in run("commission", "?")[1].split()
-    code, out, _ = run("commission", "qbl4208", "-n", 2, "--yes")
+    assert "qbl4208" in run("parameters", "commission", "?")[1].split()
+    code, out, _ = run("parameters", "commission", "qbl4208", "-n", 2, "--yes")
     assert code == DONE
     assert "2050h:00 Motor Type" in out
     run("set", "2005", "3", "-n", 2)  # no limit switches
@@ -614,7 +614,7 @@ def test_scope_writes_nothing_where_nothing_came(run, tmp_path, monkeypatch):
 def test_a_log_of_a_bus_that_is_lost_keeps_what_came(run, tmp_path, ending):
     """The emulator, or the adapter, ends while its frames are logged."""
     listening = socket.create_server(("127.0.0.1", 0))
-    file = tmp_path / f"dead.{ending}"
+    port, file = listening.getsockname()[1], tmp_path / f"dead.{ending}"
 
     def serve_three_frames():
         connection, _ = listening.accept()
@@ -623,7 +623,7 @@ def test_a_log_of_a_bus_that_is_lost_keeps_what_came(run, tmp_path, ending):
 
     server = threading.Thread(target=serve_three_frames)
     server.start()
-    code, out, error = run("log", file, "-i", "slcan", "-c", f"socket://127.0.0.1:{listening.getsockname()[1]}")
+    code, out, error = run("frames", "log", file, "-i", "slcan", "-c", f"socket://127.0.0.1:{port}")
     server.join()
     listening.close()
     assert (code, out, error.count("\n")) == (REFUSED, "", 1)
@@ -647,7 +647,7 @@ def test_a_channel_whose_name_ends_in_a_large_number_is_logged(tmp_path, monkeyp
 
     monkeypatch.setattr("drive_env.master.can.port.open_bus", lambda *_, **__: Bus())
     file = tmp_path / f"session.{ending}"
-    done = CliRunner().invoke(app, ["log", str(file), "--duration", "0.1"])
+    done = CliRunner().invoke(app, ["frames", "log", str(file), "--duration", "0.1"])
     assert done.exit_code == 0, done.exception
     with can.LogReader(str(file)) as reader:
         assert [(one.arbitration_id, bytes(one.data)) for one in reader] == [(0x181, b"\1\2")]
@@ -659,15 +659,15 @@ def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, endi
     file = tmp_path / f"session.{ending}"
     timer = threading.Timer(0.3, lambda: run("set", "6081", "3333"))
     timer.start()
-    code, out, _ = run("log", file, "--duration", 3)
+    code, out, _ = run("frames", "log", file, "--duration", 3)
     timer.join()
     assert code == DONE
     assert re.match(r"\d+ frames written", out)
     run("set", "6081", "2184533")
-    shown = run("replay", file, "--dry-run")[1]
+    shown = run("frames", "replay", file, "--dry-run")[1]
     assert "601   [8]  23 81 60 00 05 0D 00 00" in shown
     assert "581" not in shown  # the drive's answers are its own
-    code, _, error = run("replay", file, "--speed", 10)
+    code, _, error = run("frames", "replay", file, "--speed", 10)
     assert code == DONE, error
     run("get", "6041")  # the drive has answered the last request
     assert shared[1][0].read(0x6081) == [3333]
@@ -678,18 +678,20 @@ def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, endi
 def test_a_broken_log_is_told(run, tmp_path, ending):
     path = tmp_path / f"broken.{ending}"
     path.write_text("rubbish\n", encoding="utf-8")
-    code, _, error = run("replay", path)
+    code, _, error = run("frames", "replay", path)
     assert code == USER_ERROR, error
     assert f"broken.{ending} cannot be read as .{ending}: " in error
 
 
 # --- help ---------------------------------------------------------------------------------------------------------
-COMMANDS = [name for commands in PANELS.values() for name, _ in commands]
+COMMANDS = [[name] for commands in PANELS.values() for name, _ in commands]
+COMMANDS += [[name, *more] for groups in GROUPS.values() for name, group in groups
+             for more in ([], *([row.name or row.callback.__name__] for row in group.registered_commands))]  # fmt: skip
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_every_command_explains_itself(command):
-    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, [*command, "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == DONE
     assert "--help" in result.stdout
 

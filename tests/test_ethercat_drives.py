@@ -395,12 +395,12 @@ def run(*words):
 @pytest.mark.parametrize(("words", "says"), [
     (("scan", "--first", "3"), "--first is for CAN; all slaves of a segment are found"),
     (("scan", "--bitrate", "500000"), "--bitrate is for CAN"),
-    (("log", "frames.asc"), "carries no CAN frames"),
+    (("frames", "log", "frames.asc"), "carries no CAN frames"),
     (("get", "6041", "--device", "tmcm3313", "--position", "4"), "there is no position 4: 1 slave answers"),
     (("get", "6041", "--device", "tmcm3313", "--axis", "9"), "a tmcm3313 has 3 axes"),
     (("set", "6041", "5", "--device", "tmcm3313"), "can only be read"),
     (("scope", "6083", "--duration", "0.01", "--device", "tmcm3313"), "cannot be recorded"),
-    (("backup", "drive.toml", "--device", "tgz_d"), "it is a tmcm3313"),
+    (("parameters", "backup", "drive.toml", "--device", "tgz_d"), "it is a tmcm3313"),
     (("monitor", "zz", "--device", "tmcm3313"), "no object is named"),
 ])  # fmt: skip
 def test_wrong_options_are_told_in_a_line(over_udp, tmp_path, monkeypatch, words, says):
@@ -417,9 +417,9 @@ def test_commands_over_udp(over_udp, tmp_path):
     run("set", "6081", "5000", *device)
     assert run("get", "6081", "--raw", *device).splitlines()[2].endswith("= 5000")
     file = tmp_path / "drive.toml"
-    assert "of node 0" in run("backup", file, *device)
+    assert "of node 0" in run("parameters", "backup", file, *device)
     run("set", "6081", "6000", *device)
-    run("restore", file, "--yes", *device)
+    run("parameters", "restore", file, "--yes", *device)
     assert run("get", "6081", "--raw", *device).splitlines()[0].endswith("= 5000")
 
 
@@ -508,11 +508,11 @@ def test_a_dry_run_writes_no_object_sends_no_image_and_goes_to_pre_op_at_most(tm
         with EtherCatServer(segment.world, way):
             device = ["--device", "tmcm3313", "--interface", "ethercat-udp", "--channel", str(way.port)]
             run("set", "6081", "5000", "--yes", *device)
-            run("backup", file, *device)
+            run("parameters", "backup", file, *device)
             run("set", "6081", "6000", "--yes", *device)
             sent = frames_of(segment)
             run("set", "6081", "7000", "--dry-run", *device)
-            run("restore", file, "--dry-run", *device)
+            run("parameters", "restore", file, "--dry-run", *device)
             run("jog", "30 rpm", "--for", "0.2", "--axis", "1", "--dry-run", *device)
             assert any(len(one.data) == 256 for one in sent), "it has read"
             assert not [one for one in sent if writes_an_object(one)]

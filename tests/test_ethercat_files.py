@@ -90,10 +90,10 @@ def test_the_esi_has_every_object_once_and_says_what_the_eeprom_says():
 
 
 def test_the_command_prints_it():
-    done = CliRunner().invoke(app, ["esi", "tmcm3313"])
+    done = CliRunner().invoke(app, ["export", "esi", "-", "--device", "tmcm3313"])
     assert done.exit_code == 0
     assert done.output == esi_text(DEVICE)
-    done = CliRunner().invoke(app, ["esi", "tmcm1636"])
+    done = CliRunner().invoke(app, ["export", "esi", "-", "--device", "tmcm1636"])
     assert done.exit_code == 2
     assert "tmcm1636 has no EtherCAT; its data (device.toml) have no table [ethercat]" in done.output
 

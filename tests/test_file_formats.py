@@ -24,7 +24,7 @@ from agents.shipped import find_agent
 from drive_env.bus.config import Bus, Machine
 from drive_env.bus.faults import Faults
 from drive_env.commands.cli import app as drive_env_app
-from drive_env.commands.log import FORMATS, WRITTEN
+from drive_env.commands.frames import FORMATS, WRITTEN
 from drive_env.devices import device_names, find_device
 from drive_env.master.identity import Identity
 from drive_env.motors import MOTORS, NUMBERS, find_motor
@@ -164,7 +164,7 @@ def test_backup(tmp_path, monkeypatch):
     monkeypatch.setattr("drive_env.master.can_drives.open_bus", lambda *_, **__: ScriptedBus(drive))
     monkeypatch.setattr("drive_env.master.can.port.open_bus", lambda *_, **__: ScriptedBus(drive))
     file = tmp_path / "drive.toml"
-    result = CliRunner().invoke(drive_env_app, ["backup", str(file), "--channel", "any", "--interface", "virtual"])
+    result = CliRunner().invoke(drive_env_app, ["parameters", "backup", str(file), "-c", "any", "-i", "virtual"])
     assert result.exit_code == 0, result.output
     written = tomllib.loads(file.read_text(encoding="utf-8"))
     assert fields("backup") == list(written)

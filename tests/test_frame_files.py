@@ -102,7 +102,7 @@ def test_a_channel_has_no_blanks(tmp_path):
 
 def test_replay_names_the_formats_that_it_reads(tmp_path):
     (tmp_path / "a.pcap").write_bytes(b"")
-    done = CliRunner().invoke(app, ["replay", str(tmp_path / "a.pcap")])
+    done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / "a.pcap")])
     assert done.exit_code == 2 and "'.pcap' is not one of .log, .blf, .asc" in done.stderr
 
 
@@ -126,7 +126,7 @@ def test_what_no_master_has_sent_is_refused_before_the_first_frame(tmp_path, mon
     """A frame that was cut was sent as another one; those that no bus takes ended a replay with the motor on."""
     monkeypatch.setattr(recorded_frames, "call_limited", lambda _, function, *arguments, **__: function(*arguments))
     (tmp_path / "a.log").write_bytes(content)
-    done = CliRunner().invoke(app, ["replay", str(tmp_path / "a.log"), "--dry-run"])
+    done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / "a.log"), "--dry-run"])
     assert (done.exit_code, done.stdout) == (2, "") and told in done.stderr
     assert len(done.stderr.splitlines()) == 1 and len(done.stderr) < 500
 
@@ -138,7 +138,7 @@ def test_a_log_in_the_background_of_a_script_ends_by_a_signal(tmp_path, number):
     program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from drive_env import programs; "
     file = tmp_path / "frames.pcap"
     process = subprocess.Popen(
-        [sys.executable, "-c", program + "programs.drive_env()", "log", file, "-i", "virtual", "-c", "nobody's"],
+        [sys.executable, "-c", program + "programs.drive_env()", "frames", "log", file, "-i", "virtual", "-c", "none"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

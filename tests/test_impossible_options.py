@@ -37,9 +37,9 @@ COMMANDS = [
     ("drive-tune", ("auto", "--by", "tpe", "--searches", "1000000000"), "--searches must be .* and 10000 at most"),
     ("drive-env", ("scan", "--timeout", "1e300"), "--timeout 1e.300 s must be above 0 s, and"),
     ("drive-env", ("get", "6041", "--timeout", "1e300", "--interface", "virtual"), "1e.300 s is impossible"),
-    ("drive-env", ("log", "a.log", "--duration", "1e300"), "--duration 1e.300 s must be above 0 s, and"),
-    ("drive-env", ("replay", "r.log", "--speed", "inf"), "--speed inf must be above 0"),
-    ("drive-env", ("replay", "r.log", "--speed", "nan"), "--speed nan must be above 0"),
+    ("drive-env", ("frames", "log", "a.log", "--duration", "1e300"), "--duration 1e.300 s must be above 0 s, and"),
+    ("drive-env", ("frames", "replay", "r.log", "--speed", "inf"), "--speed inf must be above 0"),
+    ("drive-env", ("frames", "replay", "r.log", "--speed", "nan"), "--speed nan must be above 0"),
 ]  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def test_a_replay_waits_for_no_stamp_that_never_comes(stamp, ending, tmp_path, m
         head = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
         file.write_text(f"{head}1.0,0x601,0,0,0,8,QEFgAAAAAAA=\n{stamp},0x601,0,0,0,8,QEFgAAAAAAA=\n")
     for more in (("--dry-run",), ()):
-        found = CliRunner().invoke(env_app, ["replay", str(file), "--interface", "virtual", "--channel", "x", *more])
+        found = CliRunner().invoke(env_app, ["frames", "replay", str(file), "-i", "virtual", "-c", "x", *more])
         assert found.exit_code == 2, (found.output, found.exception)
         assert isinstance(found.exception, SystemExit) and "Traceback" not in found.output
         assert found.output.strip().count("\n") == 0
@@ -107,7 +107,7 @@ def test_a_replay_waits_for_no_stamp_that_never_comes(stamp, ending, tmp_path, m
 def test_a_replay_goes_at_the_pace_of_its_stamps(tmp_path):
     file = tmp_path / "frames.log"
     file.write_text("(1e6) can0 601#4041600000000000\n(1000000.01) can0 601#4041600000000000\n")
-    found = CliRunner().invoke(env_app, ["replay", str(file), "--interface", "virtual", "--channel", "x"])
+    found = CliRunner().invoke(env_app, ["frames", "replay", str(file), "--interface", "virtual", "--channel", "x"])
     assert found.exit_code == 0 and "2 frames sent" in found.output
 
 

@@ -161,6 +161,6 @@ def test_a_commissioning_that_is_interrupted_says_what_it_wrote(served_node, mon
         return connect(*arguments, **others)
 
     monkeypatch.setattr(BusOptions, "connect", once)
-    done = CliRunner().invoke(app, ["commission", machine.motor.name, "--yes", "--json", *bus])
+    done = CliRunner().invoke(app, ["parameters", "commission", machine.motor.name, "--yes", "--json", *bus])
     assert (done.exit_code, int(machine.read(VELOCITY)[0])) == (130, before)
     assert f"6081h:00 Profile velocity: 655361 -> {before}" in done.stderr

@@ -90,13 +90,15 @@ VALUES: dict[str, str] = {
     "objects": "6041", "name": "6081", "value": "1", "speed": "60 rpm", "motor": "qbl4208", "new": "5",
     "policy": "tracking_two_mass", "environment": "tracking", "device": "tmcm1636", "load": "inertia",
     "drive-env lss bit-rate new": "500000", "file": "state.toml",
-    "drive-env backup file": "new.toml", "drive-env export file": "new.eds", "drive-env log file": "new.log",
-    "drive-env replay file": "frames.log", "drive-tune undo file": "before.toml", "other": "state.toml",
+    "drive-env parameters backup file": "new.toml", "drive-env frames log file": "new.log",
+    "drive-env export eds file": "new.eds", "drive-env export dcf file": "new.dcf",
+    "drive-env frames replay file": "frames.log",
+    "drive-tune undo file": "before.toml", "other": "state.toml",
     "drive-tune auto agent": "gain_tuning", "drive-tune auto by": "design",
     "dynamics": "soft", "inertia_range": "0.8/4",
     "replay": "move.csv", "out": "new", "drive-env scope out": "new.csv", "drive-env jog out": "new.csv",
     "eds": "own.eds", "config": "config.toml", "journal": "new.journal", "store": "new",
-    "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env replay speed": "2", "max_current": "1 A",
+    "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env frames replay speed": "2", "max_current": "1 A",
     "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc",
     "sampler": "tpe", "objectives": "cost", "gains": "velocity_p", "axes": "apart", "travel": "-1:1",
     "cluster": "tcp://127.0.0.1:1", "against": "emulator", "sensor": "module:function", "listen": "127.0.0.1",
@@ -107,7 +109,7 @@ INSTEAD = {"by": "duration"}  # an option that stands in another's place
 # Options beside which a command has nothing to do with drives: it does that, on no machine.
 WITHOUT_DRIVES = {
     ("drive-agent evaluate", "--card"): "environment: ServoDrive/Tracking-v0",  # prints how an agent was trained
-    ("drive-env replay", "--dry-run"): "1 frames shown",  # prints what is in a file
+    ("drive-env frames replay", "--dry-run"): "1 frames shown",  # prints what is in a file
 }
 
 
@@ -177,7 +179,7 @@ def run(command: Command, arguments: list[str]) -> Any:
 def test_these_commands_may_act_on_a_bus():
     """That the programs are read rightly: a command that is lost from this list is looked at by nobody."""
     assert {str(one) for one in ON_A_BUS} >= {
-        *(f"drive-env {one}" for one in ("scan", "get", "set", "jog", "scope", "export", "serve", "lss node-id")),
+        *(f"drive-env {one}" for one in ("scan", "get", "set", "jog", "scope", "export eds", "serve", "lss node-id")),
         *(f"drive-tune {one}" for one in ("identify", "response", "rules", "auto", "undo")),
         "drive-agent evaluate",
     }

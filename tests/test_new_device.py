@@ -733,10 +733,11 @@ def test_what_cannot_be_is_told_and_leaves_nothing(tmp_path, text, options, says
 # --- export -----------------------------------------------------------------------------------------------------------
 def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(folders, tmp_path):
     folder = folders["alpina_ax40"].folder
-    done = run("export", tmp_path / "a.eds", "--dcf", "--device", folder, "--motor", MOTOR, "--node", 9)
+    of_motor = ("--device", folder, "--motor", MOTOR)
+    done = run("export", "dcf", tmp_path / "a.dcf", *of_motor, "--node", 9)
     assert done.exit_code == 2 or done.exit_code == 1  # --node means a bus, and there is none
-    done = run("export", tmp_path / "a.eds", "--dcf", "--device", folder, "--motor", MOTOR)
-    assert done.exit_code == 0, done.output
+    eds_done, dcf_done = (run("export", kind, tmp_path / f"a.{kind}", *of_motor) for kind in ("eds", "dcf"))
+    assert eds_done.exit_code == dcf_done.exit_code == 0, eds_done.output + dcf_done.output
     preset = find_device(str(folder)).preset(find_motor(MOTOR))
     eds, dcf = (canopen.import_od(str(tmp_path / name), node) for name, node in (("a.eds", 7), ("a.dcf", None)))
     for name, value in preset.items():
@@ -746,12 +747,16 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
     assert eds[0x1400][1].default == 0x207  # what follows the node-ID goes on following it
     assert (dcf.node_id, dcf.bitrate, dcf[0x1400][1].value) == (1, 1_000_000, 0x201)
     assert "LastEDS=alpina_ax40.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")  # which it was made of
-    assert f"parameters of {folder}\n" in done.stdout and f"parameters of {folder}, as node 1\n" in done.stdout
-    done = run("export", tmp_path / "b.eds", "--eds", FOLDER / "alpina_ax40.eds")
+    assert eds_done.stdout.endswith(f"parameters of {folder}\n")
+    assert dcf_done.stdout.endswith(f"parameters of {folder}, as node 1\n")
+    printed = run("export", "eds", "-", "--device", folder).stdout  # as the device has it
+    assert printed == find_device(str(folder)).eds.read_text(encoding="utf-8")
+    assert run("export", "eds", "-", *of_motor).stdout != printed
+    done = run("export", "eds", tmp_path / "b.eds", "--eds", FOLDER / "alpina_ax40.eds")
     assert done.exit_code == 2 and "is of a drive on a bus, and no bus is named" in done.stderr
-    again = run("export", tmp_path / "a.eds", "--device", folder)
+    again = run("export", "eds", tmp_path / "a.eds", "--device", folder)
     assert again.exit_code == 2 and "files are not overwritten" in again.stderr
-    assert run("export", tmp_path / "a.txt", "--device", folder).exit_code == 2
+    assert run("export", "eds", tmp_path / "a.txt", "--device", folder).exit_code == 2
 
 
 def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path, monkeypatch):
@@ -768,7 +773,7 @@ def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path, monkeypatch):
         again = {"bus": bus, "nodes": (NODE,), "pace": "lockstep", "safety": False}
         opened = lambda *_, **__: CanDrives(eds=source, **again)  # noqa: E731
         monkeypatch.setattr("drive_env.commands.options.BusOptions.connect", opened)
-        done = run("export", tmp_path / "named.eds", "--eds", source, "--node", NODE)
+        done = run("export", "eds", tmp_path / "named.eds", "--eds", source, "--node", NODE)
         assert done.stdout.endswith(f"{len(values)} parameters of {source.stem}\n"), done.output
     finally:
         bus.shutdown()

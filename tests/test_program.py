@@ -53,6 +53,9 @@ def test_the_version_is_that_of_the_package(name):
 
 
 @pytest.mark.parametrize(("program", "old", "new"), [
+    *(("drive-env", old, f"drive-env parameters {old}") for old in ("backup", "diff", "restore", "commission")),
+    *(("drive-env", old, f"drive-env frames {old}") for old in ("log", "replay")),
+    *(("drive-env", old, f"drive-env export {old} FILE --device DEVICE") for old in ("eds", "esi")),
     ("drive-tune", "optimise", "drive-tune auto --by tpe"),
     ("drive-agent", "tune", "drive-tune auto --by agent"),
 ])  # fmt: skip
@@ -60,6 +63,16 @@ def test_the_version_is_that_of_the_package(name):
 def test_an_old_name_answers_with_the_new_one_and_does_nothing(program, old, new, more):
     result = CliRunner().invoke(APPS[program], [old, *more])
     assert (result.exit_code, result.output) == (2, f"{program}: `{program} {old}` is `{new}` now\n")
+
+
+@pytest.mark.parametrize(
+    "more", [["a.eds"], ["--dcf", "--device", "tmcm1636", "a.EDS"], ["a.dcf", "--help"]], ids=" ".join
+)
+def test_a_file_to_export_alone_is_answered_with_the_commands_and_not_written(more, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(APPS["drive-env"], ["export", *more])
+    assert (result.exit_code, list(tmp_path.iterdir())) == (2, [])
+    assert result.stderr == "drive-env: `drive-env export FILE` is `drive-env export eds|dcf FILE` now\n"
 
 
 @pytest.mark.parametrize("name", APPS)
@@ -80,12 +93,14 @@ def run(program, *arguments, **environment):
 
 @pytest.mark.parametrize(("program", "begun", "commands"), [
     ("drive-env", "sc", {"scan", "scope"}),
+    ("drive-env", "parameters ", {"backup", "diff", "restore", "commission"}),
     ("drive-tune", "r", {"response", "rules", "rank"}),
     ("drive-agent", "ev", {"evaluate"}),
 ])  # fmt: skip
 def test_a_shell_completes_commands(program, begun, commands):
     variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
-    done = run(program, **{variable: "complete_bash", "COMP_WORDS": f"{program} {begun}", "COMP_CWORD": "1"})
+    words = {"COMP_WORDS": f"{program} {begun}", "COMP_CWORD": str(len(begun.split(" ")))}
+    done = run(program, **{variable: "complete_bash"}, **words)
     assert set(done.stdout.split()) >= commands, done.stderr
 
 

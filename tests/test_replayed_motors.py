@@ -1,4 +1,4 @@
-"""`drive-env replay`: however it ends, no motor that its frames enabled is left alone; what is not proven is said."""
+"""`drive-env frames replay`: no motor that its frames enabled is left alone at its end; what is not proven is said."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def bus(monkeypatch):
 
 
 def replay(*arguments, timeout=0.05):
-    result = CliRunner().invoke(app, ["replay", *map(str, arguments), "--timeout", str(timeout)])
+    result = CliRunner().invoke(app, ["frames", "replay", *map(str, arguments), "--timeout", str(timeout)])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.stdout, result.stderr
 
@@ -385,8 +385,8 @@ def test_a_motor_that_runs_by_replayed_frames_is_at_rest_and_off_after_a_signal(
     log = recorded(tmp_path / "move.log", frames, every=0.05, pause=120.0)
     with node(lockstep=False) as (machine, bus):
         process = subprocess.Popen(
-            [sys.executable, "-c", "from drive_env.programs import drive_env; drive_env()", "replay", log, *bus,
-             "--timeout", "5"],
+            [sys.executable, "-c", "from drive_env.programs import drive_env; drive_env()", "frames", "replay", log,
+             *bus, "--timeout", "5"],
             cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:

@@ -178,7 +178,7 @@ def test_a_servo_drive_offers_no_stepper_and_a_stepper_drive_nothing_else():
     assert set(servo) | set(stepper) | set(mains) == set(MOTORS)
     assert set(mains) == {"am3033_e", "am3041_e"} and not set(mains) & set(servo)
     assert set(stepper) == set(STEPPERS)
-    offered = CliRunner().invoke(app, ["commission", "?"]).output.split()
+    offered = CliRunner().invoke(app, ["parameters", "commission", "?"]).output.split()
     assert offered == list(servo)
     listed = CliRunner().invoke(app, ["list", "motors"]).output
     assert "two-phase stepper, NEMA 17" in listed

@@ -30,7 +30,9 @@ def bus(monkeypatch):
         monkeypatch.setenv(f"DRIVE_ENV_{name}", value)
 
     def run(command, *words):
-        return CliRunner().invoke(drive_env.commands.cli.app, [command, "--device", "tmcm6212", *map(str, words)])
+        return CliRunner().invoke(
+            drive_env.commands.cli.app, [*command.split(), "--device", "tmcm6212", *map(str, words)]
+        )
 
     with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))):
         yield run, drives
@@ -104,10 +106,10 @@ def test_it_is_found_backed_up_and_watched(bus, tmp_path):
     run, _ = bus
     found = CliRunner().invoke(drive_env.commands.cli.app, ["scan", "--last", "1", "--timeout", "20"])
     assert found.stdout.startswith("node 1  tmcm6212  TMCM-6212"), found.output
-    assert run("backup", tmp_path / "all.toml").exit_code == 0
+    assert run("parameters backup", tmp_path / "all.toml").exit_code == 0
     changed = run("set", "6081", "1000", "--axis", 2)
     assert changed.exit_code == 0, changed.output
-    found = run("diff", tmp_path / "all.toml", "--axis", 0)
+    found = run("parameters diff", tmp_path / "all.toml", "--axis", 0)
     assert found.exit_code == 1 and "7081h:00" in found.stdout, found.output
     found = run("scope", "6064", "--duration", "0.05", "--out", tmp_path / "seen")
     assert found.exit_code == 0, found.output

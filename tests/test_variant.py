@@ -177,9 +177,9 @@ def test_a_preset_is_the_devices_in_other_units(motor):
 
 def test_the_command_line_prints_the_eds_of_a_device():
     for device in (BASE, VARIANT):
-        found = CliRunner().invoke(app, ["eds", device.name])
+        found = CliRunner().invoke(app, ["export", "eds", "-", "--device", device.name])
         assert (found.exit_code, found.stdout) == (0, device.eds.read_text(encoding="utf-8"))
-    found = CliRunner().invoke(app, ["eds", "tmcm1637"])
+    found = CliRunner().invoke(app, ["export", "eds", "-", "--device", "tmcm1637"])
     assert (found.exit_code, found.stdout) == (2, "")
     assert "no device is named 'tmcm1637'; there are tgz_d, tgz_s, tmcm1636, tmcm1636_fw109" in found.stderr
 

@@ -30,7 +30,7 @@ def check_model(
     ] = None,
     load: Annotated[str, typer.Option(help="Load: a name, or the path of an MJCF file.")] = "two_mass",
     settings: Annotated[
-        Path | None, typer.Option(help="Parameters of the real drive, as `backup` writes them (TOML).")
+        Path | None, typer.Option(help="Parameters of the real drive, as `parameters backup` writes them (TOML).")
     ] = None,
     fit: Annotated[
         list[str] | None,

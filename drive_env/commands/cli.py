@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
-from drive_env.commands.eds import print_eds
-from drive_env.commands.esi import print_esi
 from drive_env.commands.ethercat import ethercat_app
-from drive_env.commands.export import export
+from drive_env.commands.export import export_app
 from drive_env.commands.fault import fault
+from drive_env.commands.frames import frames_app
 from drive_env.commands.get import get, set_object
 from drive_env.commands.jog import jog
-from drive_env.commands.log import log, replay
 from drive_env.commands.lss import lss_app
 from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
 from drive_env.commands.new import new_from_eds
-from drive_env.commands.parameters import backup, commission, diff, restore
+from drive_env.commands.parameters import parameters_app
 from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 from drive_env.commands.render import render
 from drive_env.commands.scan import scan
@@ -38,29 +36,27 @@ PANELS = {
         ("scope", scope),
         ("jog", jog),
     ),
-    "Parameters": (
-        ("backup", backup),
-        ("diff", diff),
-        ("restore", restore),
-        ("commission", commission),
-        ("export", export),
-    ),
     "This installation": (
         ("list", list_names),
-        ("eds", print_eds),
-        ("esi", print_esi),
         ("new", new_from_eds),
         ("compile", compile_kernels),
     ),
-    "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }
-app.add_typer(lss_app, name="lss", rich_help_panel="Drives on a bus")
-app.add_typer(ethercat_app, name="ethercat", rich_help_panel="Emulated drives")
-app.add_typer(motor_app, name="motor", rich_help_panel="This installation")
+GROUPS = {
+    "Drives on a bus": (("parameters", parameters_app), ("frames", frames_app), ("lss", lss_app)),
+    "This installation": (("export", export_app), ("motor", motor_app)),
+    "Emulated drives": (("ethercat", ethercat_app),),
+}
 for panel, commands in PANELS.items():
     for name, function in commands:
         app.command(name, cls=SignedValues, rich_help_panel=panel)(function)
+for panel, groups in GROUPS.items():
+    for name, group in groups:
+        app.add_typer(group, name=name, rich_help_panel=panel)
+app.moved({old: f"drive-env parameters {old}" for old in ("backup", "diff", "restore", "commission")})
+app.moved({old: f"drive-env frames {old}" for old in ("log", "replay")})
+app.moved({old: f"drive-env export {old} FILE --device DEVICE" for old in ("eds", "esi")})
 
 
 @app.callback()

@@ -1,14 +1,17 @@
-"""`drive-env export`: EDS and DCF of a drive as it is commissioned."""
+"""`drive-env export`: files by which other programs know a drive, EDS and DCF of CANopen and ESI of EtherCAT."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from drive_env.commands.options import (
     AxisOfNode,
+    DeviceName,
     Eds,
     NodeOptions,
     check_free,
@@ -16,66 +19,142 @@ from drive_env.commands.options import (
     grouped,
     names_a_bus,
 )
+from drive_env.commands.program import answer_old_name
+from drive_env.commands.tables import print_text
 
 KBIT = 1000  # bit/s
 
+File = Annotated[Path, typer.Argument(help="New file; - prints it.", show_default=False)]
 
+
+class ExportGroup(TyperGroup):
+    """The commands; it answers `drive-env export FILE` with the new names, for one version."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line."""
+        has_file = any(one.lower().endswith((".eds", ".dcf")) for one in args)
+        if has_file and not self.commands.keys() & set(args) and not ctx.resilient_parsing:
+            answer_old_name("drive-env", "export FILE", "drive-env export eds|dcf FILE")
+        return super().parse_args(ctx, args)
+
+
+export_app = typer.Typer(cls=ExportGroup, no_args_is_help=True, rich_markup_mode="markdown")
+
+
+@export_app.callback()
+def export() -> None:
+    """Files by which other masters and tools know a drive: EDS and DCF of CANopen, ESI of EtherCAT."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommissionedOptions(NodeOptions):
+    """Options of a commissioned drive: one on a bus, or an emulated one."""
+
+    axis: AxisOfNode = None
+    eds: Eds = None
+    motor: Annotated[str | None, typer.Option("--motor", help="Motor that an emulated drive is commissioned for.")] = (
+        None
+    )
+
+
+@export_app.command("eds")
 @grouped
-def export(
-    context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="New file, .eds or .dcf.", show_default=False)],
-    dcf: Annotated[bool, typer.Option("--dcf", help="Write the DCF beside the EDS, too.")] = False,
-    *,
-    bus: NodeOptions,
-    axis: AxisOfNode = None,
-    eds: Eds = None,
-    motor: Annotated[
-        str | None,
-        typer.Option("--motor", help="Of an emulated drive: what it is commissioned for.", show_default="the device's"),
-    ] = None,
-) -> None:
-    """Write the EDS or DCF of a drive with its commissioned values: of one on a bus, else of an emulated one.
+def export_eds(context: typer.Context, file: File, *, drive: CommissionedOptions) -> None:
+    """Write the EDS of a device; or of a commissioned drive, whose values are the defaults then.
 
-    An EDS has them as defaults, a DCF as the values of this node; other masters (python-canopen, CANopen tools) read
-    them. With --axis the values of one axis and of the node are written, and all other axes keep what the EDS says.
-    With --interface, --channel, --node or --bitrate they are read from that drive; nothing is written to it.
+    Values are those of the drive on the bus that --interface, --channel, --node or --bitrate names (nothing is written
+    to it), or of an emulated drive with --motor or --axis. With --axis the values of one axis and of the node are
+    written, and all other axes keep what the EDS says.
+    """
+    from drive_env.devices import find_device
+    from drive_env.dictionary.entries import eds_text
+
+    with errors_as_exit_codes():
+        _check_name(file, ".eds")
+        if names_a_bus(context) or (drive.eds, drive.motor, drive.axis) != (None, None, None):
+            _write_commissioned(context, file, drive, node_id=None)
+        else:
+            _write(file, eds_text(find_device(drive.device).eds), f"EDS of {drive.device}")
+
+
+@export_app.command("dcf")
+@grouped
+def export_dcf(context: typer.Context, file: File, *, drive: CommissionedOptions) -> None:
+    """Write the DCF of a drive: its EDS with the commissioned values, node-ID and bit rate of this node.
+
+    It is the drive on the bus that --interface, --channel, --node or --bitrate names (nothing is written to it), else
+    an emulated one, without --motor with the device's usual motor. --axis is as of `export eds`.
+    """
+    with errors_as_exit_codes():
+        _check_name(file, ".dcf")
+        _write_commissioned(context, file, drive, node_id=drive.node or 1)
+
+
+@export_app.command("esi")
+def export_esi(file: File, device: DeviceName) -> None:
+    """Write the ESI of a device, an XML file for EtherCAT configurators."""
+    from drive_env.devices import find_device
+    from drive_env.ethercat.esi import esi_text
+
+    with errors_as_exit_codes():
+        _check_name(file, ".xml")
+        _write(file, esi_text(find_device(device)), f"ESI of {device}")
+
+
+def _write_commissioned(context: typer.Context, file: Path, drive: CommissionedOptions, node_id: int | None) -> None:
+    """Write the EDS of a commissioned drive, or with a node-ID its DCF.
+
+    Raises:
+        ValueError: For an EDS without a bus, and an axis that the drive does not have.
     """
     from drive_env.devices import find_device
     from drive_env.drives.chosen_axes import chosen_parts
     from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds, commissioned_values
+
+    axis, eds, device = drive.axis, drive.eds, drive.device
+    if names_a_bus(context):
+        with drive.connect(eds, safety=False) as drives:
+            if axis is not None:
+                chosen_parts([axis], drives.description.num_axes, drives.description.name)
+            values = commissioned_values(drives, axis=axis)
+            source, whose = drives.description.dictionary.path, drives.description.name
+    else:
+        if eds is not None:
+            raise ValueError(
+                f"--eds {eds} is of a drive on a bus, and no bus is named; give --interface and --channel, or make "
+                f"a device of it (drive-env new --eds {eds}) and name that as --device"
+            )
+        from drive_env.emulator.emulated_drives import EmulatedDrives
+
+        known = find_device(device)
+        if axis is not None:
+            chosen_parts([axis], known.num_axes, device)
+        source, whose = known.eds, device
+        with EmulatedDrives(device, "inertia", drive.motor, num_machines=known.num_axes, num_threads=1) as emulated:
+            values = commissioned_values(emulated, axis=axis)
+    name = source.name if str(file) == "-" else file.name
+    kbit = CAN_KBIT if drive.bitrate is None else drive.bitrate // KBIT
+    text = commissioned_eds(source, values, name, node_id=node_id, bit_rate=kbit)
+    node = "" if node_id is None else f", as node {node_id}"
+    part = "" if axis is None else f", axis {axis} alone"
+    _write(file, text, f"{len(values)} parameters of {whose}{node}{part}")
+
+
+def _check_name(file: Path, ending: str) -> None:
+    """Raise ValueError for a file of another kind, or one that exists already; - is the standard output."""
+    if str(file) == "-":
+        return
+    if file.suffix.lower() != ending:
+        raise ValueError(f"{file} must end with {ending}, or be - for the standard output")
+    check_free(file)
+
+
+def _write(file: Path, text: str, said: str) -> None:
+    """Write a file and say of what it is, or print it."""
     from drive_env.whole_file import write_whole
 
-    with errors_as_exit_codes():
-        if file.suffix.lower() not in (".eds", ".dcf"):
-            raise ValueError(f"{file} must end with .eds or .dcf, which says what is written")
-        files = [file, file.with_suffix(".dcf")] if dcf and file.suffix.lower() == ".eds" else [file]
-        for one in files:
-            check_free(one)
-        if names_a_bus(context):
-            with bus.connect(eds, safety=False) as drives:
-                if axis is not None:
-                    chosen_parts([axis], drives.description.num_axes, drives.description.name)
-                values = commissioned_values(drives, axis=axis)
-                source, whose = drives.description.dictionary.path, drives.description.name
-        else:
-            if eds is not None:
-                raise ValueError(
-                    f"--eds {eds} is of a drive on a bus, and no bus is named; give --interface and --channel, or make "
-                    f"a device of it (drive-env new --eds {eds}) and name that as --device"
-                )
-            from drive_env.emulator.emulated_drives import EmulatedDrives
-
-            device, known = bus.device, find_device(bus.device)
-            if axis is not None:
-                chosen_parts([axis], known.num_axes, device)
-            source, whose = known.eds, device
-            with EmulatedDrives(device, "inertia", motor, num_machines=known.num_axes, num_threads=1) as emulated:
-                values = commissioned_values(emulated, axis=axis)
-        part = "" if axis is None else f", axis {axis} alone"
-        number = bus.node or 1
-        for one in files:
-            is_dcf = one.suffix.lower() == ".dcf"
-            kbit = CAN_KBIT if bus.bitrate is None else bus.bitrate // KBIT
-            text = commissioned_eds(source, values, one.name, node_id=number if is_dcf else None, bit_rate=kbit)
-            write_whole(one, text)
-            print(f"{one}: {len(values)} parameters of {whose if not is_dcf else f'{whose}, as node {number}'}{part}")
+    if str(file) == "-":
+        print_text(text)
+    else:
+        write_whole(file, text)
+        print(f"{file}: {said}")

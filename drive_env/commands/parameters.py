@@ -1,4 +1,4 @@
-"""`drive-env backup`, `diff`, `restore` and `commission`: the parameters of a drive as a file."""
+"""`drive-env parameters`: the parameters of a drive as a file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
 
-File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
+File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `parameters backup` writes them.")]
 Store = Annotated[
     bool,
     typer.Option("--store", help="Store them in the drive (1010h:01, 'save'), so that they survive a power cycle."),
@@ -45,7 +45,15 @@ Unchecked = Annotated[
     bool, typer.Option("--unchecked", help="Accept a file that was changed, or that has no check sum; read it first.")
 ]
 
+parameters_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
+
+@parameters_app.callback()
+def parameters() -> None:
+    """The parameters of a drive in a file: read, compare, write back; a motor's preset for a drive from the factory."""
+
+
+@parameters_app.command()
 @grouped
 def backup(
     file: Annotated[Path, typer.Argument(help="New file (TOML); - prints it.")],
@@ -76,6 +84,7 @@ def backup(
             print(f"{len(values)} parameters of node {bus.number} written to {file}")
 
 
+@parameters_app.command()
 @grouped
 def diff(
     context: typer.Context,
@@ -116,6 +125,7 @@ def diff(
             raise typer.Exit(REFUSED)
 
 
+@parameters_app.command()
 @grouped
 def restore(
     file: File,
@@ -157,6 +167,7 @@ def restore(
         _exchange(bus, eds, wanted, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
 
 
+@parameters_app.command()
 @grouped
 def commission(
     motor: Annotated[str, typer.Argument(help="Motor whose preset is written; ? lists them.")],
@@ -243,8 +254,8 @@ def _exchange(
     if left:
         fail(
             f"node {node} does not have the values that were written, by a second reading: "
-            f"{parameters.list_differences(left)}; is another master writing to it? Look with `drive-env diff`, "
-            "then restore again",
+            f"{parameters.list_differences(left)}; is another master writing to it? Look with "
+            "`drive-env parameters diff`, then restore again",
             REFUSED,
         )
     if json:

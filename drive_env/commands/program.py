@@ -7,7 +7,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -58,6 +58,12 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print results and errors o
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print more about what is done.")]
 
 
+def answer_old_name(program: str, old: str, new: str) -> NoReturn:
+    """End a command that was called by its old name, and tell the new one."""
+    print(f"{program}: `{program} {old}` is `{new}` now", file=sys.stderr)
+    raise typer.Exit(USER_ERROR)
+
+
 class Program(typer.Typer):
     """The application of a program: its commands are put into it, and `run` runs the one that is asked for.
 
@@ -85,9 +91,8 @@ class Program(typer.Typer):
         settings = {"ignore_unknown_options": True, "allow_extra_args": True}
         for old, new in names.items():
 
-            def answer(said: str = f"`{self.info.name} {old}` is `{new}` now") -> None:
-                print(f"{self.info.name}: {said}", file=sys.stderr)
-                raise typer.Exit(USER_ERROR)
+            def answer(old: str = old, new: str = new) -> None:
+                answer_old_name(str(self.info.name), old, new)
 
             answer.__signature__ = inspect.Signature()  # type: ignore[attr-defined]  # what typer reads
             self.command(old, hidden=True, add_help_option=False, context_settings=settings)(answer)

@@ -1,4 +1,4 @@
-"""The watchdog for the death of `drive-env replay` itself: heartbeat consumers of the drives, set while it runs."""
+"""The watchdog for the death of `drive-env frames replay`: heartbeat consumers of the drives, set while it runs."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def serve(
             _serve_ethercat(server, bus, real_time, interface, channel, duration, pcap, stats, theirs)
             return
         if pcap is not None:
-            _fail(f"--pcap {pcap} is for --interface ethercat; on CAN drive-env log writes frames")
+            _fail(f"--pcap {pcap} is for --interface ethercat; on CAN drive-env frames log writes frames")
         if token == AUTO:
             token = secrets.token_urlsafe(TOKEN_BYTES)
         made = _server(bus, real_time, port, listen, token, interface, channel)

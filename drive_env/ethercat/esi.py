@@ -41,7 +41,7 @@ MANAGERS = ("MBoxOut", "MBoxIn", "Outputs", "Inputs")
 
 
 def esi_text(device: Device) -> str:
-    """Return the ESI of a device, as `drive-env esi` prints it; ValueError for one without EtherCAT."""
+    """Return the ESI of a device, as `drive-env export esi` writes it; ValueError for one without EtherCAT."""
     if device.ethercat is None:
         raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
     device = described(device)

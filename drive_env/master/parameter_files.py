@@ -56,7 +56,7 @@ def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int,
     """Read the parameters of a file; ValueError for other files."""
     rows = _read_toml(path).get("parameters")
     if not isinstance(rows, dict) or not rows:
-        raise ValueError(f"{path} has no table [parameters]; `drive-env backup` writes one")
+        raise ValueError(f"{path} has no table [parameters]; `drive-env parameters backup` writes one")
     values = {}
     for text, value in rows.items():
         index, _, sub = text.partition(":")
@@ -74,7 +74,7 @@ def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int,
 def _read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; ValueError if it is not TOML."""
     if not path.is_file():
-        raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
+        raise ValueError(f"there is no file {path}; write one with `drive-env parameters backup {path}`")
     try:
         return read_toml(path)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -168,7 +168,7 @@ def differences(known: Description, wanted: Mapping[Key, int], axis: int) -> Cal
 
 
 def backup(known: Description, axis: int) -> Callable[[Drives], str]:
-    """Return the job that makes a backup file of an axis, as `drive-env backup` does."""
+    """Return the job that makes a backup file of an axis, as `drive-env parameters backup` does."""
 
     def job(drives: Drives) -> str:
         axes = SingleAxes(drives, known)
@@ -186,7 +186,7 @@ def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
 def restore(
     known: Description, content: bytes, name: str, axis: int, *, unchecked: bool, other_drive: bool
 ) -> Callable[[Drives], list[Difference]]:
-    """Return the job that writes a backup, all or none, as `drive-env restore` does; it returns the changes.
+    """Return the job that writes a backup, all or none, as `drive-env parameters restore` does; it returns the changes.
 
     Args:
         known: The device.

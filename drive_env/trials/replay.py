@@ -182,7 +182,7 @@ def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None 
     Args:
         drives: Emulated drives whose machines have as many axes as the log.
         log: The recorded move.
-        settings: Objects of the real drive (gains, limits): name -> integer; `drive-env backup` has them.
+        settings: Objects of the real drive (gains, limits): name -> integer; `drive-env parameters backup` has them.
 
     Raises:
         ValueError: If the log holds no command, or was taken from another number of axes.

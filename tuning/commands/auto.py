@@ -207,7 +207,7 @@ def _not_kept(target: Target) -> str:
 
     if not target.bus or can_store(target):
         return ""
-    return "; the drive has no 1010h: it has the settings until it is switched off (`drive-env backup` keeps them)"
+    return "; the drive has no 1010h, and loses the settings with its power (`drive-env parameters backup` keeps them)"
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool, search: Mapping[str, Any] | None = None) -> None:

@@ -52,8 +52,8 @@ class OtherMasters:
         if self.heard:
             raise OtherMastersError(
                 f"another master commands the bus: {self.heard} came that is not ours; PDOs and SYNCs of two masters "
-                "disturb each other, and samples would be wrong: end the other one, or use `drive-env log`, which only "
-                "listens"
+                "disturb each other, and samples would be wrong: end the other one, or use "
+                "`drive-env frames log`, which only listens"
             )
 
     def _hear(self, what: str, data: bytes) -> None:

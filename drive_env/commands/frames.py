@@ -1,4 +1,4 @@
-"""`drive-env log` and `drive-env replay`: the frames of a bus in a file, and back."""
+"""`drive-env frames`: the frames of a bus in a file, and back."""
 
 from __future__ import annotations
 
@@ -36,7 +36,15 @@ SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user ha
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
 WRITTEN = (*FORMATS, ".pcap")
 
+frames_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
+
+@frames_app.callback()
+def frames() -> None:
+    """The frames of a bus in a file, and back."""
+
+
+@frames_app.command()
 def log(
     file: Annotated[
         Path,
@@ -98,8 +106,9 @@ def log(
         _say(f"{count} frames written to {file}", {"frames": count, "file": str(file)}, json)
 
 
+@frames_app.command()
 def replay(
-    file: Annotated[Path, typer.Argument(help="File that `log`, candump or another tool wrote.")],
+    file: Annotated[Path, typer.Argument(help="File that `frames log`, candump or another tool wrote.")],
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
