@@ -86,9 +86,16 @@ def make_environments(
         name, own = environment_of(name), without_machines(name, own)
     if name in SUITE:
         whole = _whole_configuration(name)  # an agent's file has all of it
-        own = {key: value for key, value in own.items() if key not in whole or plain({key: value})[key] != whole[key]}
+        own = {key: value for key, value in own.items() if not _is_of_task(plain({key: value})[key], whole.get(key))}
         return make_vector(num_envs, name=name, **own, **options)
     return make_vector(num_envs, name=name, config=own, **options)
+
+
+def _is_of_task(value: Any, whole: Any) -> bool:
+    """Return whether an option is the task's; of weights those may lack that are newer than an agent's file, and 0."""
+    if isinstance(value, Mapping) and isinstance(whole, Mapping):
+        return value == {key: one for key, one in whole.items() if key in value or one}
+    return bool(value == whole)
 
 
 def without_machines(environment: str, configuration: Mapping[str, Any]) -> dict[str, Any]:

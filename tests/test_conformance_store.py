@@ -48,7 +48,7 @@ def power_cycled(wire):
 
 def reset(wire, facts, sub):
     """Reset the node, which has the factory's number, 1, once group `sub` is restored with what it keeps of the bus."""
-    forgets = facts.manual.address is not None and "communication" in facts.manual.groups[sub]
+    forgets = bool(facts.manual.address or facts.manual.bus) and "communication" in facts.manual.groups[sub]
     wire.play(f"rx 000  81 05\ntx 70{1 if forgets else 5}  00")
 
 

@@ -191,6 +191,7 @@ def test_position_regulator_is_a_gain_of_q4_12(eight):
 
 def test_current_regulators_are_the_chips_advanced_form_and_end_in_the_voltage_circle(eight):
     eight.write(TORQUE_P, LANE_P)
+    eight.advance(0.001)  # the gain of d follows in a period
     eight.write(TORQUE_I, LANE_I)
     generator = np.random.default_rng(1)
     size = 10.0 ** generator.uniform(-2, 1.5, (400, 8))

@@ -28,9 +28,10 @@ NOMINAL = {
     "chopper_resistance": 47.0, "chopper_voltage": 760.0, "chopper_hysteresis": 20.0, "chopper_enable": 1.0,
     "brake_power": 500.0, "brake_thermal_time": 30.0, "link_shared": 1.0,
     "R_s": MOTOR.R_s, "psi_m": MOTOR.psi_m, "L_d": MOTOR.L_d, "L_q": MOTOR.L_q, "n_p": MOTOR.n_p,
-    "pole_pairs": MOTOR.n_p, "encoder_counts": MOTOR.encoder_counts, "encoder_steps": MOTOR.encoder_counts,
+    "pole_pairs": MOTOR.n_p, "encoder_counts": MOTOR.encoder_counts, "feedback_resolution": MOTOR.encoder_counts,
     "J_rotor": 4e-4, "duty_limit": 3.0**-0.5, "adc_step": 1e-4, "adc_step_lsb": 0.05, "dead_time_current": 0.2,
-    "current_p": 0.02, "current_i": 0.05, "i_max": PEAK, "peak_current": PEAK, "stage_on": 1.0, "drive_function": 1.0,
+    "current_p": 0.02, "current_integration": 50e-6 / 0.05, "i_max": PEAK, "peak_current": PEAK,
+    "limit_negative": 1.0, "limit_positive": 1.0, "stage_on": 1.0, "drive_function": 1.0,
     "angle_source": ENCODER, "torque_share": 1.0, "loop_level": 0.0,
 }  # fmt: skip
 

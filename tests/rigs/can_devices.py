@@ -97,6 +97,7 @@ class Manual(NamedTuple):
         hot_told: The emergencies of it: code, error register, additional bytes ("axis": the motor's number).
         further_axis: Bit of 1001h of axes other than the first.
         refused: 1001h while process data are not taken.
+        empty_history: What 1003h:01 and on answer while there is no error.
         lost: Emergencies of a lost heartbeat: code, and additional bytes; one of each axis where they name it.
         stopped: The same of a node that is stopped (NMT) while an axis is enabled.
         before_mode: What must be written for a mode: index, step to the next axis, raw value by mode, bytes.
@@ -130,6 +131,7 @@ class Manual(NamedTuple):
     commands: frozenset[int] = frozenset()
     stores_mapped: bool = False
     refused: int = 0x21
+    empty_history: bytes | int = 0x0800_0024  # CiA 301: no data
 
 
 STOPS = {0: "STOPPED", 1: "OPERATIONAL", 2: "STOPPED"}  # manual of the TMCM-1636, table 41
@@ -210,6 +212,8 @@ MANUALS = (
         speed=300_000,
         before_mode=(0x2303, 0x100, {1: 7, 3: 6, 4: 1, 6: 7, 7: 3, 8: 3, 9: 2, 10: 1}, 4),  # D-Mode
         groups={1: ("communication", "profile", "motor 0", "motor 1", "module")},
+        bus=frozenset((0x200D,)),  # C-ID, the node-ID
+        empty_history=b"\0\0\0\0",
         shared=frozenset((0x60FE, 0x68FE, 0x60FD, 0x68FD)),
         refuses=frozenset((0x1C12, 0x1C13, 0x1C32, 0x1C33)),  # CoE
         commands=frozenset(
