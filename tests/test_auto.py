@@ -34,7 +34,7 @@ from tuning.auto import trying as auto_trying
 from tuning.auto.certify import SETTLING, certificate
 from tuning.auto.checks import unsafe_gains
 from tuning.auto.loop_margins import MS_ERROR
-from tuning.auto.one_button import BUDGET, auto
+from tuning.auto.one_button import BUDGET, Method, auto
 from tuning.auto.proving import ProvingGround
 from tuning.compare.oracle import digest, read_oracles
 from tuning.compare.suite import load_suite
@@ -76,7 +76,7 @@ def five(tmp_path_factory):
         target = replace(target, low=low, high=high)
         before = gains(drives), settings(drives)
         file = tmp_path_factory.mktemp("auto") / "before.toml"
-        result = auto(target, file, budget=FIVE_BUDGET)
+        result = auto(target, file, method=Method(budget=FIVE_BUDGET))
         yield target, result, before, (gains(drives), settings(drives)), file
 
 
@@ -372,7 +372,7 @@ def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick
 def test_a_response_that_the_time_does_not_allow_is_said(monkeypatch, tmp_path):
     designs(monkeypatch.setattr, SLOWER)
     with emulated(load="inertia", num_threads=1) as target:
-        result = auto(target, tmp_path / "before.toml", experiments=standing_in, budget=2.5)
+        result = auto(target, tmp_path / "before.toml", experiments=standing_in, method=Method(budget=2.5))
     (axis,) = result.axes
     assert axis.accepted, axis.reason
     assert any("margins not measured: the drive time of the run was used up" in one for one in axis.reservations)

@@ -14,7 +14,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.true_plant import true_plant
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
-from tuning.auto.one_button import BUDGET, auto
+from tuning.auto.one_button import BUDGET, Method, auto
 from tuning.auto.proving import RESTLESS
 from tuning.target import emulated
 
@@ -37,7 +37,7 @@ def true_scores(target, gains):
 def test_gains_of_a_belt_do_not_depend_on_the_noise_of_measurements(tmp_path):
     """Torque P was 8,882 or 2,413. Velocity I and position P may still be traded for each other at the same cost."""
     with emulated(load="belt", num_machines=COPIES, num_threads=1) as target:
-        result = auto(target, tmp_path / "before.toml", budget=WAITING)
+        result = auto(target, tmp_path / "before.toml", method=Method(budget=WAITING))
         found = np.array([axis.after for axis in result.axes], np.int64)
         scores = true_scores(target, found)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
@@ -53,7 +53,7 @@ def test_a_belt_with_23_times_the_rotors_inertia_is_accepted_whatever_the_noise(
     heavy = {"load.mass": 2.67}
     with emulated(load="belt", num_machines=COPIES, parameters=heavy, num_threads=1) as target:
         ratio = true_plant(target.drives).inertia / target.motor.inertia - 1.0
-        result = auto(target, tmp_path / "before.toml", budget=WAITING)
+        result = auto(target, tmp_path / "before.toml", method=Method(budget=WAITING))
     assert ratio == pytest.approx(23.0, abs=0.5)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     assert not any("following error" in note for axis in result.axes for note in axis.notes)

@@ -29,7 +29,7 @@ from tuning.auto.correction import CORRECTIONS
 from tuning.auto.identified import calm_gains
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.moves import keep_what_is_better
-from tuning.auto.one_button import auto, tell_of_lateness
+from tuning.auto.one_button import Method, auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown, without_noise
 from tuning.auto.trying import faster
 from tuning.estimate import Estimate, refused
@@ -235,7 +235,7 @@ def test_the_axes_of_a_machine_are_tuned_together_and_each_says_why_it_did_not_m
         if unsafe:
             before[1, Gains._fields.index("position_p")] = 0
             write_gains(target.drives, before)
-        result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=3.0)
+        result = auto(target, tmp_path / "before.toml", experiments=gantry_known, method=Method(budget=3.0))
         np.testing.assert_array_equal(gains(target.drives), [axis.after for axis in result.axes])
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     assert all(axis.after != axis.before for axis in result.axes)
@@ -313,7 +313,7 @@ def test_a_machine_that_one_joint_stops_gets_other_gains_for_all_joints(monkeypa
         proof = proving(target, fitted(target)).run(wanted, np.ones(6, bool))
         assert all(reason.startswith("stopped in the") for reason in proof.reason)
         designs(monkeypatch.setattr, wanted)
-        result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
+        result = auto(target, tmp_path / "before.toml", experiments=gantry_known, method=Method(budget=4.0))
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     failed = [any(note.startswith(FAILED) for note in axis.notes) for axis in result.axes]
     assert failed == [True] * 6

@@ -13,7 +13,7 @@ from drive_env.loops.margins import margins
 from drive_env.loops.true_plant import true_plant
 from tuning.auto.certify import certificate
 from tuning.auto.model_bounds import at_least_by_model, why_unbounded
-from tuning.auto.one_button import auto
+from tuning.auto.one_button import Method, auto
 from tuning.certificate.report import to_html
 from tuning.commands.auto import _margins
 from tuning.identify.quick_identification import identify_briefly
@@ -108,7 +108,7 @@ def test_a_model_that_is_none_gives_no_bound_and_says_why():
 @pytest.mark.parametrize("load", ["two_mass", "belt", "winder"])
 def test_an_axis_whose_drive_time_runs_out_has_bounds_and_is_amber(load, tmp_path):
     with emulated(load=load, num_threads=1) as target:
-        result = auto(target, tmp_path / "before.toml", budget=SPENT)
+        result = auto(target, tmp_path / "before.toml", method=Method(budget=SPENT))
         (axis,) = result.axes
         paper = certificate(target, result, seed=0)
         true = truth(target, 0, axis.after)
@@ -134,7 +134,9 @@ def test_an_axis_whose_drive_time_runs_out_has_bounds_and_is_amber(load, tmp_pat
 @pytest.mark.slow
 def test_an_axis_without_a_model_that_fits_is_amber_and_says_so(tmp_path):
     with emulated(load="geared_joint", num_threads=1) as target:
-        result = auto(target, tmp_path / "before.toml", budget=SPENT + 1.4)  # its first gains fail in the reversal
+        result = auto(
+            target, tmp_path / "before.toml", method=Method(budget=SPENT + 1.4)
+        )  # its first gains fail in the reversal
         paper = certificate(target, result, seed=0)
     (axis,) = result.axes
     assert axis.verdict == "accepted with reservations" and not axis.at_least

@@ -18,7 +18,7 @@ from drive_env.devices import find_device
 from drive_env.emulator.parameters import WIRING
 from drive_env.motors import MOTORS
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.one_button import auto
+from tuning.auto.one_button import Method, auto
 from tuning.compare.suite import load_suite, open_group
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
@@ -279,7 +279,7 @@ def test_a_brushed_motor_s_encoder_is_told_by_a_push_of_milliseconds(direction):
 # --- auto -------------------------------------------------------------------------------------------------------------
 def tuned(tmp_path, rows, **options):
     with emulated(load="inertia", num_machines=len(rows), parameters=wired(rows), num_threads=2, **options) as target:
-        result = auto(target, tmp_path / "before.toml", budget=12.0)
+        result = auto(target, tmp_path / "before.toml", method=Method(budget=12.0))
         assert result.accepted.all(), [axis.reason for axis in result.axes]
         return settings(target.drives), [[note for note in axis.notes if "is 0 now" in note or "is 1 now" in note]
                                          for axis in result.axes], turn(target.drives, ENCODER)  # fmt: skip
@@ -313,7 +313,7 @@ def test_auto_finds_a_reversed_encoder_on_a_bus_inside_the_envelope(tmp_path, mo
             drives, drives.device, MOTOR, np.array([24.0]), -way, way, MOTOR.rated_speed, MOTOR.rated_current,
             bus={"channel": "here", "nodes": [1]},
         )  # fmt: skip
-        result = auto(target, tmp_path / "before.toml", budget=12.0)
+        result = auto(target, tmp_path / "before.toml", method=Method(budget=12.0))
         assert result.accepted.all(), result.axes[0].reason
         assert drives.read(ENCODER_DIRECTION)[0] == 1
 
