@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from agents.policies.guard import PolicyStoppedError
 from agents.policies.policy import PolicyError, load_policy
 from agents.shipped import shipped
+from agents.tuner import tune_target as tune_target_module
 from agents.tuner.open_tuner import open_tuner
 from agents.tuner.tune_target import surrogate, tune_target
 from agents.tuner.tuning_run import run as run_agent
@@ -69,7 +70,7 @@ class Broken:
 @pytest.mark.slow
 def test_it_tunes_an_emulated_drive_and_certifies_it(tmp_path):
     code, out, error = command("--trials", 2, "--out", tmp_path / "run")
-    assert (code, error) == (0, "")
+    assert (code, error.strip()) == (0, "")
     lines = out.splitlines()
     table = lines[lines.index("trial  velocity P  velocity I  position P        J") + 1 :][:3]
     assert [row.split()[0] for row in table] == ["rule", "1", "2"]
@@ -125,7 +126,7 @@ def test_it_tunes_both_axes_of_an_amplifier_on_mains():
     """
     with emulated("tgz_d", "inertia", num_machines=2) as target:
         tuned = tune_target(target, load_policy(shipped("gain_tuning")), trials=3)
-        assert all(trial.gains.shape == (2, 5) for trial in tuned.trials)
+        assert all(trial.gains.shape == (2, target.device.gains.count) for trial in tuned.trials)
         for axis in range(2):
             answer = tuned.trials[tuned.answers[axis]]
             assert not answer.aborted[axis]
@@ -172,7 +173,9 @@ def test_a_policy_that_gives_no_number_leaves_the_drive_as_it_was_and_disabled(t
 
 
 @pytest.mark.slow
-def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_as_it_was(tmp_path):
+def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_as_it_was(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune_target_module, "PATIENT", tune_target_module.PATIENT._replace(stall=1.0))
+
     class Hanging(Broken):
         def act(self, observation):
             self._good -= 1

@@ -172,6 +172,8 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     own = read_current_limit(drives)
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
     write_current_limit(drives, current, axes)
+    # A limit may count more coarsely than torques do: what is asked for stays within it.
+    current = np.where(axes, np.minimum(current, read_current_limit(drives)), current)
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)
