@@ -15,7 +15,7 @@ import numpy as np
 
 from drive_env import CanDrives, EtherCatDrives, Limits, SafetyError, motion
 
-CYCLES, WAY = 1000, 3000  # increments in a second
+CYCLES, WAY = 1000, 48_000  # increments in a second
 SLOW = 2.0  # rad/s; the move is faster
 LIVE = 0x6F
 PATIENT = {"timeout": 10.0}
