@@ -12,7 +12,7 @@ from rigs.coe_rig import CoeRig
 from rigs.fault_injection import ANSWER, ObservedWorld, WorldBus
 from rigs.tgz_images import select
 
-from drive_env import CanDrives, EmulatedDrives, SafetyError, cia402, motion
+from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.ethercat.application import AlState
 from drive_env.firmware.record import get_lanes
 
@@ -311,6 +311,33 @@ def test_a_program_with_limits_enables_by_neither(drives, name, raw):
             with pytest.raises(SafetyError, match=r"enables a motor beside the controlword.*Enable by 6040h"):
                 master.write(name, raw)
             master.write(name, 0)
+    finally:
+        bus.shutdown()
+
+
+@pytest.mark.parametrize("name", ["M-Inull", "M-Ipeak"])
+def test_a_limit_of_current_is_not_raised_by_what_its_counts_are(drives, name):
+    """Limits of a TGZ are parts of the motor's currents: with greater ones the drive would give more ampere."""
+    drives.machine.reset()
+    bus = WorldBus(ObservedWorld(drives, lockstep=True))
+    try:
+        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER, safety=Limits(current=8000)) as master:
+            motion.enable(master, mode="pv")
+            master.advance(0.002)
+            lent = field(drives, "i_high")[0]
+            assert lent == pytest.approx(8000 / 32767 * field(drives, "peak_current")[0], rel=2e-3)
+            motion.disable(master)
+            with pytest.raises(SafetyError, match="changes the scale of currents"):
+                master.write(name, 60_000)
+            motion.enable(master, mode="pv")
+            master.advance(0.002)
+            assert field(drives, "i_high")[0] == lent
+        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER) as master:
+            motion.enable(master, mode="pv")
+            with pytest.raises(SafetyError, match="changes the scale of currents"):
+                master.write(name, 60_000)
+            motion.disable(master)
+            master.write(name, 60_000)  # a motor is commissioned so
     finally:
         bus.shutdown()
 

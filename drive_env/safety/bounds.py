@@ -236,6 +236,12 @@ def current_limits(drives: WatchedDrives) -> tuple[Key, ...]:
     return tuple(key for key in found if key is not None)
 
 
+def current_scales(drives: WatchedDrives) -> tuple[Key, ...]:
+    """Return the objects that say what a count of a current is: none, or the motor's peak and nominal current."""
+    found = (drives.description.role(role) for role in (Role.PEAK_CURRENT, Role.NOMINAL_CURRENT))
+    return tuple(key for key in found if key is not None)
+
+
 def counts_per_limit(drives: WatchedDrives) -> Floats:
     """Return how many counts of 6077h one of the current limit is: 1, unless it counts parts of the nominal current."""
     key, ampere = drives.description.role(Role.NOMINAL_CURRENT), _ampere(drives)

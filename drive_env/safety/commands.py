@@ -21,6 +21,7 @@ from drive_env.safety.bounds import (
     SLACK_TURNS,
     counts_per_limit,
     current_limits,
+    current_scales,
     increments_per_count,
     read_own,
 )
@@ -94,6 +95,7 @@ class Commands:
         self._current_limits = current_limits(drives)
         self._is_stepped = drives.description.role(Role.MICROSTEPS) is not None
         self._scale_objects = scale_objects(drives.description)
+        self._current_scales = current_scales(drives)
         self._axes = axes
         self._limits = limits
         self._modes = modes
@@ -283,8 +285,14 @@ class Commands:
             self._check_magnitude(entry, raw, where, played or {})
 
     def _check_meaning(self, entry: Entry, where: Mask, *, is_played: bool = False) -> None:
-        """Raise SafetyError for a write that would change the meaning of positions at the wrong time."""
+        """Raise SafetyError for a write that would change the meaning of positions or currents at the wrong time."""
         key = (entry.index, entry.sub)
+        holds = is_played or np.any(where & self._axes.may_turn) or self._limits.user.current is not None
+        if key in self._current_scales and holds:
+            raise SafetyError(
+                f"{entry.label} changes the scale of currents, and the axis is enabled or Limits(current=...) hold; "
+                "nothing was sent. Disable it, and write it without that limit"
+            )
         moves_scale = key in self._scale_objects
         if moves_scale and is_played:
             raise SafetyError(f"{entry.label} changes the scale of positions, and is not played; write it")

@@ -40,6 +40,7 @@ from drive_env.safety.bounds import (
     POSITION_LOW,
     QUICK_STOP_DECELERATION,
     current_limits,
+    current_scales,
     motion_gains,
 )
 from drive_env.safety.commands import Commands
@@ -205,7 +206,8 @@ class Envelope:
     def _is_limit(self, key: Key) -> bool:
         """Return whether limits, or the way of a stop, depend on an object."""
         gains = motion_gains(self._drives.device).values()
-        return key in _BOUNDS or key in current_limits(self._drives) or key in gains
+        of_current = current_limits(self._drives) + current_scales(self._drives)
+        return key in _BOUNDS or key in of_current or key in gains
 
     def _note_mode(self, key: Key, where: Mask) -> None:
         """Note that an axis may ignore commands for a moment, until both of its modes have changed."""
