@@ -141,6 +141,35 @@ def test_errors_are_cleared_by_an_edge_and_an_old_enable_bit_enables_nothing(gan
     assert native.status[0] & 0x11 == 0x11
 
 
+FRAMES = [(0, 0.0)] * 3 + [(2, min(max(k / 40.0 - 0.3, 0.0), 1.0)) for k in range(60)] + [(0, 1.0)] * 12
+FAULTS = {  # of one frame: what arrives, in its order
+    "lost": lambda at: [*range(at), *range(at + 1, len(FRAMES))],
+    "doubled": lambda at: [*range(at + 1), *range(at, len(FRAMES))],
+    "late": lambda at: [*range(at), at + 1, at, *range(at + 2, len(FRAMES))],
+    "the last one": lambda at: [*range(at + 1)],  # the master dies
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_whatever_happens_to_a_frame_of_the_native_image_the_axes_end_at_rest_and_off(gantry, fault):
+    fastest = 0.0
+    for at in range(0, len(FRAMES) - 1, 6):
+        gantry.machine.reset()
+        native = Native(gantry)
+        start = list(native.positions)
+        for number in FAULTS[fault](at):
+            control, share = FRAMES[number]
+            native.control, native.positions = [control] * 2, [one + round(share * TURN / 8) for one in start]
+            native.exchange()
+            fastest = max(fastest, float(np.abs(gantry.machine.rotor_speed).max()))
+        world = native.rig.world
+        world.lockstep = False
+        world.run_until(world.time + 2.0)  # and no frame more
+        assert field(gantry, "stage_on").tolist() == [0.0, 0.0], at
+        assert np.abs(gantry.machine.rotor_speed).max() < 0.05, at
+    assert fastest > 5.0, "it moved"
+
+
 def test_the_native_images_current_limit_inputs_and_outputs(gantry):
     native = Native(gantry)
     gantry.machine.analog_inputs = [[32767, 0], [100, 0]]
