@@ -13,6 +13,7 @@ from agents.policies.baselines import feed_forward
 from agents.policies.guard import GuardLimits
 from agents.policies.policy import policy_of
 from agents.shipped import TUNER, shipped, shipped_names
+from agents.tasks import _is_of_task
 from drive_env.envs.suite import TASKS
 from drive_env.envs.tracking import TrackingConfig
 from drive_env.loops.dynamics import find_dynamics
@@ -68,3 +69,9 @@ def test_a_shipped_controller_acts_the_same_over_can_in_lockstep(name):
     for one, two in zip(both.inside.episodes, both.bus.episodes, strict=True):
         assert len(one.actions) >= 100 and np.any(one.actions != 0.0)
         assert np.array_equal(one.actions, two.actions) and np.array_equal(one.observations, two.observations)
+
+
+def test_weights_of_a_frozen_task_may_lack_newer_terms_that_weigh_nothing():
+    assert _is_of_task({"follow": 1.0}, {"follow": 1.0, "pace": 0.0})
+    assert not _is_of_task({"follow": 1.0}, {"follow": 1.0, "pace": 0.5})
+    assert not _is_of_task({"follow": 2.0}, {"follow": 1.0, "pace": 0.0})

@@ -12,6 +12,7 @@ from drive_env.devices import find_device
 from drive_env.devices.gains import as_chip, bandwidth_gains, gains_in_si, rule_gains, si_scales
 from drive_env.firmware.record import get_lanes
 from drive_env.motors import find_motor
+from tuning.auto.twin import gain_bounds
 
 DEVICE = find_device("tgz_d")
 VOLTS = 560.0
@@ -143,3 +144,26 @@ def test_more_of_a_gain_is_less_of_its_integration_time():
     assert known.strength(livelier, columns) / known.strength(gains, columns) == pytest.approx(2.0, rel=1e-3)
     slow, fast = (rule_gains(DEVICE, motor, J)[0] for J in (1e-3, 1e-4))
     assert slow[3] == fast[3] and slow[2] == pytest.approx(10 * fast[2], rel=1e-3)  # by lags, and by inertia
+
+
+def test_a_change_from_speed_to_position_knows_what_is_fed_forward():
+    """The position loop takes over at the speed that there is, whatever share of it is fed forward."""
+    for share in (0, 1000):
+        with new_drives() as drives:
+            write(drives, P_SFF=share)
+            drives.write(cia402.FOLLOWING_WINDOW, 0)
+            motion.enable(drives, mode="pv")
+            drives.write(cia402.TARGET_VELOCITY, "600 rpm")
+            drives.advance(0.5)
+            drives.write(0x2303, 7)
+            drives.write(cia402.MODE, 1)
+            drives.advance(0.001)
+            assert field(drives, "omega_ref") == pytest.approx(600.0 * RPM, rel=0.1), share
+
+
+def test_bounds_and_the_way_without_feed_forward():
+    least, most = gain_bounds(DEVICE)
+    assert least.tolist() == [1, 1, 1, 1, 1, 0]
+    assert most[3] == 655_360 and most[5] == 1000  # us: the longest integration time
+    gains = np.array([[3571, 3077, 6400, 40_000, 31_416, 850]])
+    assert DEVICE.gains.without_feed_forward(gains).tolist() == [[3571, 3077, 6400, 40_000, 31_416, 0]]
