@@ -54,7 +54,7 @@ class Startup(NamedTuple):
         return struct.pack("<" + self.outputs * AXES, *values)
 
     def unpack(self, data):
-        """Return what the inputs show of each axis."""
+        """Return the fields of the input image, axis by axis."""
         values = struct.unpack("<" + self.inputs * AXES, data)
         width = len(self.shown)
         return [dict(zip(self.shown, values[k : k + width], strict=True)) for k in range(0, len(values), width)]

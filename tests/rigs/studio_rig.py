@@ -218,7 +218,7 @@ class Tab:
         return [row for row in self.driver.get_log("browser") if row["level"] == "SEVERE"]
 
     def foreign(self):
-        """Return what the page has loaded from elsewhere than this studio."""
+        """Return the addresses outside this studio from which the page has loaded something."""
         script = "return performance.getEntriesByType('resource').map((one) => one.name)"
         ours = self.served.page(""), "data:", "blob:"
         return [one for one in self.driver.execute_script(script) if not one.startswith(ours)]
