@@ -11,7 +11,7 @@ from drive_env.master.can.dry_run import DryPort, DrySdoClient, show_frame
 
 @pytest.mark.parametrize(("frame", "text"), [
     ((0x80, b""), "080   [0]"), ((0x601, bytes([0x40, 0x41, 0x60, 0])), "601   [4]  40 41 60 00"),
-    ((0x701, b"", True), "701   [0]  remote request"), ((0x5, b"\xab"), "005   [1]  AB"),
+    ((0x701, b"", 4), "701   [4]  remote request"), ((0x5, b"\xab"), "005   [1]  AB"),
 ])  # fmt: skip
 def test_a_frame_as_candump_shows_it(frame, text):
     assert show_frame(*frame) == text
@@ -23,7 +23,7 @@ def test_a_port_writes_frames_down_and_waits_for_nothing():
     port.subscribe(0x581, None)
     port.send(0x80)
     port.send(0x701, remote=True, length=1)
-    assert lines == ["080   [0]", "701   [0]  remote request"]
+    assert lines == ["080   [0]", "701   [1]  remote request"]
     assert port.receive(10.0) is False and port.wait(lambda: False, 10.0) is True
     port.close()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import signal
 import struct
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from drive_env.commands import recorded_frames
 from drive_env.commands.cli import app
 from drive_env.commands.frame_files import FrameFile
+from drive_env.master.can import port
 
 FRAMES = {
     "data": can.Message(timestamp=1.5, arbitration_id=0x181, data=b"\x37\x02", is_extended_id=False),
@@ -117,18 +119,139 @@ GOOD = b"(1.0) can0 601#2B40600000000000\n"
         (GOOD + b"(1.5) can0 " + b"z" * 1_000_000 + b"#00\n", "..., near frame 2; is it complete?"),
         (GOOD + b"(1.5) can0 601#R" + b"9" * 5_000 + b"\n", "value has 5000 digits, near frame 2; is it complete?"),
         (GOOD + b"(1.5) can0 201#" + b"00" * 9 + b"\n", "frame 2 of a master has the identifier 201h and 9 bytes; "),
-        (GOOD + b"(1.5) can0 601##1" + b"00" * 64 + b"\n", "identifier 601h and 64 bytes; classic CAN has up to"),
         (GOOD + b"(1.5) can0 FFF#R\n", "identifier FFFh and 0 bytes; classic CAN has up to 7FFh and 8"),
     ],
-    ids=["cut", "zeros", "endless word", "endless number", "9 bytes", "FD", "identifier"],
+    ids=["cut", "zeros", "endless word", "endless number", "9 bytes", "identifier"],
 )
-def test_what_no_master_has_sent_is_refused_before_the_first_frame(tmp_path, monkeypatch, content, told):
+def test_what_no_master_has_sent_is_refused_before_the_first_frame(tmp_path, in_process, content, told):
     """A frame that was cut was sent as another one; those that no bus takes ended a replay with the motor on."""
-    monkeypatch.setattr(recorded_frames, "call_limited", lambda _, function, *arguments, **__: function(*arguments))
     (tmp_path / "a.log").write_bytes(content)
     done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / "a.log"), "--dry-run"])
     assert (done.exit_code, done.stdout) == (2, "") and told in done.stderr
     assert len(done.stderr.splitlines()) == 1 and len(done.stderr) < 500
+
+
+# A log's name and content, and the frames that it holds: time, identifier, data or how many bytes are asked for.
+BUSMASTER = """***BUSMASTER Ver 3.2.2***
+***PROTOCOL CAN***
+***{base}***
+***SYSTEM MODE***
+***<Time><Tx/Rx><Channel><CAN ID><Type><DLC><DataBytes>***
+"""
+SDO = (0x601, "2b40600000000000")
+FOREIGN = {
+    "asc without a line of internal events": (
+        "a.asc",
+        "date Wed Dec 7 12:23:39 pm 2011\nbase dec timestamps absolute\n\n"
+        "0.5 1 1537 Rx d 8 43 64 96 0 0 0 0 0\n0.75 1 1793 Rx r 4\n",
+        [(0.5, *SDO), (0.75, 0x701, 4)],
+    ),
+    "asc with that line": (
+        "a.asc",
+        "date Wed Dec 7 12:23:39 pm 2011\nbase hex timestamps absolute\ninternal events logged\n// version 9.0.0\n"
+        "Begin Triggerblock Wed Dec 7 12:23:39 pm 2011\n   0.000000 Start of measurement\n"
+        "   0.5 1 601 Tx d 8 2B 40 60 00 00 00 00 00\nEnd TriggerBlock\n",
+        [(0.5, *SDO)],
+    ),
+    "candump -ta": (
+        "a.log",
+        " (1.500000)  can0  601   [8]  2B 40 60 00 00 00 00 00   '+@`.....'\n"
+        " (1.750000)  can0  701   [4]  remote request\n (2.0)  can0  12345678   [1]  00\n"
+        " (2.1)  can0  20000088   [8]  00 00 00 00 00 00 00 00   ERRORFRAME\n (2.2)  can0  080   [0]\n",
+        [(1.5, *SDO), (1.75, 0x701, 4), (2.2, 0x080, "")],
+    ),
+    "candump -x": ("a.log", " (1.5)  can0  TX - -  601   [8]  2B 40 60 00 00 00 00 00\n", [(1.5, *SDO)]),
+    "BUSMASTER": (
+        "a.log",
+        BUSMASTER.format(base="HEX") + "23:59:59:9990 Rx 1 0x601 s 8 2B 40 60 00 00 00 00 00\n"
+        "00:00:00:0010 Tx 1 0x701 sr 1 00\n00:00:00:0020 Tx 1 0x12345678 x 1 00\n",
+        [(86_399.999, *SDO), (86_400.001, 0x701, 1)],
+    ),
+    "BUSMASTER with decimal numbers": (
+        "a.LOG", BUSMASTER.format(base="DEC") + "0:0:1:5000 Rx 1 1537 s 8 43 64 96 0 0 0 0 0\n", [(1.5, *SDO)]
+    ),
+    "SavvyCAN": (
+        "a.csv",
+        "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+        "1500000,00000601,false,Tx,0,8,2B,40,60,00,00,00,00,00,\n1750000,00000080,false,Rx,0,0,\n",
+        [(1.5, *SDO), (1.75, 0x080, "")],
+    ),
+    "candump -L, packed": ("a.b.log.gz", "(1.5) can0 601#2B40600000000000\n(1.75) can0 701#R4\n", [
+        (1.5, *SDO), (1.75, 0x701, 4)
+    ]),
+}  # fmt: skip
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Logs are read here instead of in a process with limits, which takes a second to start."""
+    monkeypatch.setattr(recorded_frames, "call_limited", lambda _, function, *arguments, **__: function(*arguments))
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_logs_of_other_tools_are_read(tmp_path, in_process, name):
+    ending, content, frames = FOREIGN[name]
+    path = tmp_path / ending
+    (gzip.open if ending.endswith(".gz") else open)(path, "wb").write(content.encode())
+    read, left_out = recorded_frames.read_frames(path, everything=True)
+    assert left_out == 0
+    assert [
+        (pytest.approx(frame.timestamp, abs=1e-9), frame.arbitration_id, frame.dlc if frame.is_remote_frame else
+         frame.data.hex()) for frame in read
+    ] == frames  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "content", "told"), [
+    ("a.log", "  can0  601   [1]  00\n", "candump's screen has no time stamps in seconds; record with candump -L"),
+    ("a.log", " (2026-01-01 10:00:00.0)  can0  601   [1]  00\n", "has no time stamps in seconds; record"),
+    ("a.log", " (0.002)  can0  601   [1]  00\n (0.001)  can0  601   [1]  00\n", "go back, as those of candump -td do"),
+    ("a.log", " (1.5)  can0  601   [8]  2B 40 60\n", "a frame of 8 bytes has 3"),
+    ("a.log", BUSMASTER.format(base="HEX") + "***RELATIVE MODE***\n", "log in system or absolute mode"),
+    ("a.log", BUSMASTER.format(base="HEX") + "Rx\n", "'Rx' is no line of BUSMASTER (near frame 1)"),
+    ("a.asc", "base hex  timestamps relative\n0.5 1 601 Rx d 0\n", "save it with absolute ones"),
+    ("a.asc", "base hex  timestamps absolute\n0.5 1 601 Rx d 8 2B", "its last line has no end"),
+    ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN\n1,601,false,Tx,0,2,2B\n", "a frame of 2 bytes has 1"),
+    ("a.log.gz", "no gzip\n", "cannot be read as .gz: Not a gzipped file"),
+    ("a.db.gz", "\n", "unpack it with gzip -d"),
+    ("a.txt", "\n", "'.txt' is not one of .log, .blf"),
+])  # fmt: skip
+def test_what_cannot_be_sent_in_its_time_is_refused(tmp_path, in_process, name, content, told):
+    (tmp_path / name).write_text(content)
+    done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / name), "--all", "--dry-run"])
+    assert (done.exit_code, done.stdout) == (2, "") and told in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+def test_frames_of_can_fd_are_named_and_left_out(tmp_path, in_process):
+    (tmp_path / "a.log").write_bytes(GOOD + b"(1.5) can0 601##1" + b"00" * 64 + b"\n(1.5) can0 602##100\n" + GOOD)
+    done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / "a.log"), "--dry-run"])
+    assert done.exit_code == 0 and done.stdout.splitlines()[-1] == "2 frames shown"
+    assert done.stderr == "drive-env: 2 frames of CAN FD are left out: drives have classic CAN\n"
+
+
+@pytest.mark.parametrize(("ending", "left_out"), [
+    (".trc", "drive-env: .trc has no remote frames and no CAN FD: 2 frames are left out\n"),
+    (".csv", "drive-env: .csv has no CAN FD: 1 frames are left out\n"), (".log", ""),
+])  # fmt: skip
+def test_a_log_names_what_its_format_has_no_room_for(tmp_path, monkeypatch, ending, left_out):
+    """python-can's .trc drops remote frames, and its .csv makes classic frames of those of CAN FD."""
+
+    waiting = [FRAMES["data"], FRAMES["remote"], FRAMES["FD"]]
+
+    class Bus:
+        def recv(self, _):
+            if not waiting:
+                signal.raise_signal(signal.SIGINT)
+            return waiting.pop(0) if waiting else None
+
+        def shutdown(self):
+            pass
+
+    monkeypatch.setattr(port, "open_bus", lambda *_, **__: Bus())
+    done = CliRunner().invoke(app, ["frames", "log", str(tmp_path / f"a{ending}")])
+    kept = 3 - int("".join(filter(str.isdigit, left_out)) or 0)
+    assert (done.exit_code, done.stderr) == (0, left_out) and done.stdout.startswith(f"{kept} frames written to")
+    with can.LogReader(str(tmp_path / f"a{ending}")) as reader:
+        assert len(list(reader)) == kept
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are otherwise there")

@@ -35,6 +35,7 @@ HIGHEST_ID, LONGEST_DATA = 0x7FF, 8  # of the frames that are sent
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
 WRITTEN = (*FORMATS, ".pcap")
+NOT_HELD = {".trc": "remote frames and no CAN FD", ".csv": "CAN FD", ".db": "CAN FD"}  # of python-can's writers
 
 frames_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
@@ -66,49 +67,60 @@ def log(
         from can.util import channel2int
 
         from drive_env.commands.frame_files import FRAME_FILES, FrameFile
+        from drive_env.held_signals import held_signals
         from drive_env.master.can.port import open_bus
 
-        _check_format(file, WRITTEN)
+        ending = file.suffix.lower()
+        _check_format(file, ending, WRITTEN)
         check_time("--duration", duration)
         if not file.parent.is_dir():
             raise ValueError(f"there is no folder {file.parent}; choose another file")
         check_free(file)
         bus = open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {}))
-        count = 0
+        count = left_out = 0
         lost: Exception | None = None
         taken = _take_interrupts()
         end = time.monotonic() + (float("inf") if duration is None else duration)
         try:
-            with FrameFile(file) if file.suffix.lower() in FRAME_FILES else can.Logger(str(file)) as writer:
-                try:
-                    while (left := end - time.monotonic()) > 0.0:
-                        try:
-                            message = bus.recv(min(left, 0.1))
-                        except (can.CanError, OSError, ValueError) as error:  # ValueError: of a closed socket
-                            lost = error
-                            break
-                        if message is not None:
-                            # BLF has two bytes for a channel, which python-can fills with the last digits of its name.
-                            if (channel2int(message.channel) or 0) >= MOST_CHANNELS:
-                                message.channel = None
-                            writer(message)
-                            count += 1
-                except KeyboardInterrupt:
-                    pass  # the usual end: the file is complete
+            with held_signals() as noted, FrameFile(file) if ending in FRAME_FILES else can.Logger(str(file)) as writer:
+                while not noted and (left := end - time.monotonic()) > 0.0:
+                    try:
+                        message = bus.recv(min(left, 0.1))
+                    except (can.CanError, OSError, ValueError) as error:  # ValueError: of a closed socket
+                        lost = error
+                        break
+                    if message is None:
+                        continue
+                    if not _is_held(message, ending):
+                        left_out += 1
+                        continue
+                    # BLF has two bytes for a channel, which python-can fills with the last digits of its name.
+                    if (channel2int(message.channel) or 0) >= MOST_CHANNELS:
+                        message.channel = None
+                    writer(message)
+                    count += 1
         finally:
             if taken is not None:
                 signal.signal(signal.SIGINT, taken)
             bus.shutdown()
+        result = {"frames": count, "file": str(file), "left_out": left_out}
         if lost is not None:
             if json:
-                print_json({"frames": count, "file": str(file), "lost": str(lost)})
+                print_json({**result, "lost": str(lost)})
             fail(f"the bus was lost: {lost}; the {count} frames received before are in {file}", REFUSED)
-        _say(f"{count} frames written to {file}", {"frames": count, "file": str(file)}, json)
+        if left_out:
+            print(f"drive-env: {ending} has no {NOT_HELD[ending]}: {left_out} frames are left out", file=sys.stderr)
+        _say(f"{count} frames written to {file}", result, json)
 
 
 @frames_app.command()
 def replay(
-    file: Annotated[Path, typer.Argument(help="File that `frames log`, candump or another tool wrote.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="File that `frames log`, candump, BUSMASTER, SavvyCAN or another tool wrote; also packed, as .gz."
+        ),
+    ],
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
@@ -128,22 +140,24 @@ def replay(
     shows the frames.
     """
     with errors_as_exit_codes():
-        from drive_env.commands.recorded_frames import read_frames
+        from drive_env.commands.recorded_frames import ending_of, read_frames
         from drive_env.commands.replayed_motors import ANSWER_TIMEOUT
         from drive_env.fieldbus.description import check_timeout
         from drive_env.master.can.dry_run import show_frame
         from drive_env.master.can.port import Port, open_bus
 
-        _check_format(file, FORMATS)
+        _check_format(file, ending_of(file), FORMATS)
         if not file.is_file():
             raise ValueError(f"there is no file {file}")
         if not 0.0 < speed < math.inf:
             raise ValueError(f"--speed {speed:g} must be above 0")
-        frames = read_frames(file, everything=everything)
+        frames, left_out = read_frames(file, everything=everything)
+        if left_out:
+            print(f"drive-env: {left_out} frames of CAN FD are left out: drives have classic CAN", file=sys.stderr)
         _check_frames(file, frames, speed)
         if dry_run:
             for frame in frames:
-                print(show_frame(frame.arbitration_id, bytes(frame.data), frame.is_remote_frame))
+                print(show_frame(frame.arbitration_id, frame.data, frame.dlc if frame.is_remote_frame else None))
             _say(f"{len(frames)} frames shown", {"frames": len(frames)}, json)
             return
         patience = ANSWER_TIMEOUT if timeout is None else check_timeout(timeout)
@@ -230,9 +244,14 @@ def _take_interrupts() -> Any:
     return signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _check_format(file: Path, formats: tuple[str, ...]) -> None:
-    if file.suffix.lower() not in formats:
-        raise ValueError(f"{file}: the ending gives the format, and {file.suffix!r} is not one of {', '.join(formats)}")
+def _check_format(file: Path, ending: str, formats: tuple[str, ...]) -> None:
+    if ending not in formats:
+        raise ValueError(f"{file}: the ending gives the format, and {ending!r} is not one of {', '.join(formats)}")
+
+
+def _is_held(message: Any, ending: str) -> bool:
+    """Return whether a format has room for a frame; python-can would drop it, or write it as another one."""
+    return ending not in NOT_HELD or not (message.is_fd or (message.is_remote_frame and ending == ".trc"))
 
 
 def _say(text: str, value: dict[str, Any], json: bool) -> None:

@@ -1,12 +1,15 @@
-"""Frames of a log that anybody may have recorded, read by python-can in a process with limits.
+"""Frames of a log that anybody may have recorded, read in a process with limits.
 
-A .blf is packed, and a .db holds whatever its writer put there: neither says how much comes of it.
+A .blf and a .gz are packed, and a .db holds whatever its writer put there: none says how much comes of it.
 """
 
 from __future__ import annotations
 
+import gzip
+import io
 import marshal
-import os
+from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,50 +31,70 @@ class RecordedFrame(NamedTuple):
     is_remote_frame: bool
 
 
-def read_frames(file: Path, *, everything: bool) -> list[RecordedFrame]:
-    """Return the frames of a master in a log, or all of them, in their order.
+def read_frames(file: Path, *, everything: bool) -> tuple[list[RecordedFrame], int]:
+    """Return the frames of a master in a log, or all of them, in their order, and how many of CAN FD were left out.
 
     Raises:
         ValueError: If it cannot be read, ends within a line, or exceeds a limit.
         OSError: If the file does not exist.
     """
     check_size(file, MOST_RECORDING)
-    _check_end(file)
-    rows = marshal.loads(call_limited(f"the log {file}", _frames_as_bytes, file, everything, memory=MEMORY, time=TIME))
-    return [RecordedFrame(*row) for row in rows]
+    packed = call_limited(f"the log {file}", _frames_as_bytes, file, everything, memory=MEMORY, time=TIME)
+    rows, left_out = marshal.loads(packed)
+    return [RecordedFrame(*row) for row in rows], left_out
+
+
+def ending_of(file: Path) -> str:
+    """Return the ending that gives a log's format: of a log that is packed, the one before `.gz`."""
+    return Path(file.stem if file.suffix.lower() == ".gz" else file.name).suffix.lower()
 
 
 def _frames_as_bytes(file: Path, everything: bool) -> bytes:
-    import can
+    from drive_env.commands.text_logs import LogError
 
-    rows, count = [], 0
+    rows, left_out, count = [], 0, 0
     try:
-        with can.LogReader(str(file)) as reader:
-            for count, frame in enumerate(reader, 1):  # noqa: B007
+        with closing(_frames(file)) as frames:
+            for count, frame in enumerate(frames, 1):  # noqa: B007
                 if _is_taken(frame, everything):
-                    rows.append(_row(frame))
+                    if frame.is_fd:
+                        left_out += 1
+                    else:
+                        rows.append(_row(frame))
     except MemoryError:
         raise
+    except LogError as error:
+        raise ValueError(f"{file}: {error} (near frame {count + 1})") from None
+    except gzip.BadGzipFile as error:
+        raise ValueError(f"{file} cannot be read as .gz: {error}") from None
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from None
     except Exception as error:  # each format's reader raises what the broken place leads to
         why = str(error).partition(";")[0]
         why = why if len(why) <= LONGEST_REASON else f"{why[:LONGEST_REASON]}..."
         raise ValueError(
-            f"{file} cannot be read as {file.suffix}: {why}, near frame {count + 1}; is it complete?"
+            f"{file} cannot be read as {ending_of(file)}: {why}, near frame {count + 1}; is it complete?"
         ) from error
-    return marshal.dumps(rows)
+    return marshal.dumps((rows, left_out))
 
 
-def _check_end(file: Path) -> None:
-    """Raise ValueError for a candump that ends within a line: the rest of a frame that was cut is another frame."""
-    if file.suffix.lower() != ".log" or file.stat().st_size == 0:
+def _frames(file: Path) -> Generator[Any, None, None]:
+    import can
+
+    from drive_env.commands.text_logs import LogError, frames_of_text, whole_lines
+
+    ending, is_packed = ending_of(file), file.suffix.lower() == ".gz"
+    if ending == ".db":
+        if is_packed:
+            raise LogError("a database cannot be read while it is packed; unpack it with gzip -d")
+        yield from can.SqliteReader(file)
         return
-    with file.open("rb") as content:
-        content.seek(-1, os.SEEK_END)
-        if content.read() not in b"\r\n":
-            raise ValueError(
-                f"{file}: its last line has no end, and may be cut off; take it out, or end it with a line feed"
+    with gzip.open(file, "rb") if is_packed else file.open("rb") as content:
+        if ending == ".blf":
+            yield from can.BLFReader(content)
+        else:
+            yield from frames_of_text(
+                ending, whole_lines(io.TextIOWrapper(content, encoding="utf-8-sig", errors="replace"))
             )
 
 

@@ -27,9 +27,11 @@ _STATES = {
 }
 
 
-def show_frame(can_id: int, data: bytes, remote: bool = False) -> str:
-    """Return a frame as candump shows it."""
-    return f"{can_id:03X}   [{len(data)}]  {'remote request' if remote else data.hex(' ').upper()}".rstrip()
+def show_frame(can_id: int, data: bytes, asked: int | None = None) -> str:
+    """Return a frame as candump shows it; of a remote frame, how many bytes it asks for, else None."""
+    if asked is not None:
+        return f"{can_id:03X}   [{asked}]  remote request"
+    return f"{can_id:03X}   [{len(data)}]  {data.hex(' ').upper()}".rstrip()
 
 
 class DryPort(Port):
@@ -47,7 +49,7 @@ class DryPort(Port):
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False, length: int = 0) -> None:
         """Write a frame down."""
-        self._out(show_frame(can_id, data, remote))
+        self._out(show_frame(can_id, data, length if remote else None))
 
     def receive(self, timeout: float = 0.0, done: Callable[[], bool] | None = None) -> bool:
         """Receive nothing, at once."""
