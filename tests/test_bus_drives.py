@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -451,6 +452,17 @@ def test_rows_are_played_for_all_axes_or_each(two):
         drives.record(0x6064, 0.002, play={0x60FF: [1, 2, 3]})
     with pytest.raises(ObjectAccessError):
         drives.record(0x6064, 0.001, play={0x6040: [0x10000]})
+
+
+def test_set_points_to_drives_of_which_none_is_enabled_are_told_once(two):
+    drives, _ = two
+    drives.record(0x6064, 0.0, play={0x60FF: np.zeros(0, int)})
+    drives.record(0x6064, 0.001, play={0x60FF: [1], 0x6040: [6]})  # who plays controlwords may enable
+    with pytest.warns(UserWarning, match=r"^60FFh is played, but no axis is enabled \(6041h = 0000h\): nothing moves"):
+        drives.record(0x6064, 0.001, play={0x60FF: [1]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        drives.record(0x6064, 0.001, play={0x60FF: [1]})
 
 
 def test_the_envelope_sees_what_is_played_and_what_comes_back(watched):

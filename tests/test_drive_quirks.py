@@ -301,7 +301,7 @@ def test_a_move_that_does_not_arrive_is_no_move_that_has(tmp_path):
         motion.enable(drives, mode="pp")
         motion.move_to(drives, TURN)
         drives.write((0x607D, 2), 2 * TURN)
-        with pytest.raises(TimeoutError, match=r"axis 0 did not reach target reached after 1"):
+        with pytest.raises(TimeoutError, match=r"axis 0 did not reach its target in 1"):
             motion.move_to(drives, 5 * TURN, timeout=1.0)
 
 

@@ -14,6 +14,7 @@ from drive_env import EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.commands import jog as jog_command
 
 TURN = 65536
 
@@ -65,6 +66,19 @@ def test_an_axis_that_does_not_move_is_told(jog):
     assert "the axis hardly moved, and the drive reports no cause. The speed was 327680 pps (300 rpm)" in found.stderr
     assert "Else check for a closed brake, a blocked load" in found.stderr
     assert "Limits(" not in found.output and is_off(drives)
+
+
+@pytest.mark.slow
+def test_a_speed_above_the_envelope_s_limit_names_no_argument_of_python(jog):
+    run, drives = jog
+    found = run("20000 rpm")
+    assert found.exit_code == 1 and is_off(drives)
+    assert "beyond the limit" in found.stderr and "Choose less: this drive has no limit of its own" in found.stderr
+    assert "Limits(" not in found.output
+
+
+def test_an_emergency_that_tells_of_no_error_any_more_is_none():
+    assert [message["code"] for message in filter(jog_command._is_error, [{"code": 0}, {"code": 0x2310}])] == [0x2310]
 
 
 @pytest.mark.slow

@@ -433,6 +433,17 @@ def test_a_resolution_that_no_position_could_be_held_by_is_told_and_not_taken(tm
         assert abs(drives.read(0x6064)[0] - 4096) < 82
 
 
+@pytest.mark.filterwarnings("error")
+def test_every_object_is_read_before_commissioning(tmp_path):
+    """Without a scale in the file, what is in increments was divided by 0 increments of a revolution."""
+    made, _ = made_of(tmp_path, BASE)
+    with emulated(str(made.folder), commissioned=False) as drives:
+        assert drives.read(Role.POSITION_SCALE)[0] == find_motor(MOTOR).encoder_counts
+        for entry in drives.inside.objects.entries:
+            if "r" in entry.access:
+                drives.read((entry.index, entry.sub))
+
+
 @pytest.mark.parametrize("factory", [(4096, 0), (0, 1), (0, 0), (0, 5), (4294967295, 0)])
 @pytest.mark.filterwarnings("error")
 def test_a_resolution_with_a_0_is_that_of_the_motor_s_encoder(tmp_path, factory):

@@ -110,7 +110,7 @@ def jog(
             print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
         else:
             print(f"{one.name} moved by {quantities.show(moved, known.find(cia402.POSITION_ACTUAL), scale)}")
-            for message in emergencies:
+            for message in filter(_is_error, emergencies):
                 print(f"emergency {_told(message)}")
             if files is not None:
                 print("nothing was recorded" if trace is None else f"recorded in {files[0]} and {files[1]}")
@@ -228,7 +228,8 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
     except BusError:
         raise
     except SafetyError as error:
-        reasons.append(str(error).replace("Limits(current=...)", "--max-current").partition(", or set Limits(")[0])
+        text = str(error).replace("Limits(current=...)", "--max-current").partition(", or set Limits(")[0]
+        reasons.append(text.replace("Choose less, or raise Limits(velocity=...): ", "Choose less: "))
     except (RuntimeError, TimeoutError) as error:  # motion's, whose remedies are Python's
         reasons.append(str(error).partition(";")[0])
 
@@ -246,7 +247,7 @@ def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> st
 def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]], meant: str) -> str:
     """Return why a movement failed; "" if it did not. `meant` is the speed that was asked for, in words."""
     share = moved / asked
-    told = [_told(message) for message in emergencies if message["code"]]
+    told = [_told(message) for message in filter(_is_error, emergencies)]
     if told and (reasons or share < ENOUGH):
         return (
             "the movement was stopped: emergency "
@@ -260,6 +261,11 @@ def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dic
             "brake, a blocked load, a low current limit (--max-current) or a small profile acceleration (6083h)"
         )
     return ""
+
+
+def _is_error(message: dict[str, Any]) -> bool:
+    """Return whether an emergency tells an error; 0000h tells that there is none any more (CiA 301)."""
+    return bool(message["code"])
 
 
 def _told(message: dict[str, Any]) -> str:

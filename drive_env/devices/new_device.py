@@ -388,6 +388,7 @@ class _Draft:
         self._fill_in.append(Note(own, why))
 
     def _write_own(self, index: int, title: str, rows: Sequence[OwnObject]) -> None:
+        told = self._units.increments
         self._sections[object_section(index)] = {"ParameterName": title, "ObjectType": "0x9"}
         self._sections[object_section(index, 0)] = {
             "ParameterName": "Highest sub-index", "DataType": f"0x{TYPES['u8']:04X}", "AccessType": "const",
@@ -397,7 +398,7 @@ class _Draft:
             unit = self._unit(row.unit)
             section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw"}
             shown = {} if unit == "raw" else {"Unit": _shown(unit)}
-            default = self._units.increments if row.field == "position_scaler" else 0
+            default = (told or round(self._motor.encoder_counts)) if row.field == "position_scaler" else 0
             self._sections[object_section(index, sub)] = section | {"DefaultValue": str(default)} | shown
 
     def _correct_defaults(self) -> None:

@@ -46,6 +46,7 @@ def wait_for(
     where: Mask | None = None,
     *,
     or_else: tuple[int, int] | None = None,
+    waited: float = 0.0,
 ) -> None:
     """Let time pass until the statusword of every axis matches.
 
@@ -56,12 +57,12 @@ def wait_for(
         what: What is waited for, for the message.
         where: Axes that count; all by default.
         or_else: Another mask and value that end the wait of an axis.
+        waited: How much of the timeout is over already [s].
 
     Raises:
         TimeoutError: If an axis does not get there, with its statusword; RuntimeError if one is in fault.
     """
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    waited = 0.0
     while True:
         status = drives.read(cia402.STATUSWORD)
         late = axes & ~cia402.matches(status, pattern)
@@ -455,12 +456,12 @@ def move_to(
     while axes.any() and waited < timeout:
         step = min(REST, timeout - waited)
         try:
-            wait_for(drives, cia402.TARGET_REACHED, step, "target reached", axes)
+            wait_for(drives, cia402.TARGET_REACHED, step, "its target", axes)
             return
         except TimeoutError:
             waited += step
         axes = axes & ~_stands_at(drives, goal, axes)
-    wait_for(drives, cia402.TARGET_REACHED, 0.0, f"target reached after {waited:g} s", axes)
+    wait_for(drives, cia402.TARGET_REACHED, timeout, "its target", axes, waited=waited)
 
 
 def _stands_at(drives: BasicDrives, goal: Integers, axes: Mask) -> Mask:

@@ -22,6 +22,7 @@ from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.drives.arguments import checked_mask, object_names
 from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.enabled_check import EnabledCheck
 from drive_env.drives.interface import Drives, machine_of
 from drive_env.drives.trace import Trace
 from drive_env.emulator.group import call_of, channels
@@ -144,6 +145,7 @@ class EmulatedDrives(Saved):
         self.inside.apply_what_was_drawn(float(volts[0]))
         warn_of_misfits([group.load for group in groups], self.motor, self.device)
         self._prepared: dict[tuple[ObjectName | None, ...], PreparedRecord] = {}  # of calls of record
+        self._check_enabled = EnabledCheck()
         nothing = np.empty((0, 0, self.num_axes))
         self._nothing = call_of(nothing, NOTHING, nothing, NOTHING, 1)
         self.faults = MachineFaults(self.inside)
@@ -222,6 +224,7 @@ class EmulatedDrives(Saved):
         if every < 1:
             raise ValueError(f"period must be at least {self.device.cycle:g} s, not {period:g} s")
         objects, play = object_names(objects), play or {}
+        self._check_enabled(self, play, cycles)
         names = (*objects, None, *play)
         prepared = self._prepared.get(names)
         if prepared is not None and prepared.scale_changes == self.inside.objects.scale_changes:

@@ -29,6 +29,7 @@ from drive_env.dictionary.quantities import Scale, follows_scale, integers, is_q
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.enabled_check import EnabledCheck
 from drive_env.drives.limits import Limits
 from drive_env.drives.trace import Trace
 from drive_env.fieldbus.description import Description
@@ -80,6 +81,7 @@ class BusDrives:
         self._cycle_runner = CycleRunner(
             description, self.num_axes, link, pace, self.start, self._catch_up, self.read_entry
         )
+        self._check_enabled = EnabledCheck()
         self._started = False
         self._closed = False
         self.safety: Envelope | None = None
@@ -201,6 +203,7 @@ class BusDrives:
         if every < 1:
             raise ValueError(f"period must be at least {self._description.cycle:g} s, not {period:g} s")
         given = play or {}
+        self._check_enabled(self, given, cycles)
         call = self._cycle_runner.call(object_names(objects), tuple(given))
         played = self._cycle_runner.rows(call, tuple(given.values()), cycles)
         found = self._cycle_runner.record(call, played, cycles, self.safety)

@@ -1,0 +1,36 @@
+"""A warning for set-points that go to drives of which none is enabled: nothing would move, and nothing say why."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+from drive_env import cia402
+from drive_env.drives.interface import BasicDrives
+
+SET_POINTS = (cia402.TARGET_POSITION, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE)
+
+
+class EnabledCheck:
+    """Looks at what is played until an axis has been enabled, or a warning given."""
+
+    def __init__(self) -> None:
+        self._is_done = False
+
+    def __call__(self, drives: BasicDrives, play: Mapping[Any, Any] | None, cycles: int) -> None:
+        """Warn if set-points are played for some cycles, without a controlword, while no axis is enabled."""
+        if self._is_done or not play or not cycles:
+            return
+        indices = {name[0] if isinstance(name, tuple) else name for name in play}
+        played = [index for index in SET_POINTS if index in indices]
+        if not played or cia402.CONTROLWORD in indices:
+            return
+        status = drives.read(cia402.STATUSWORD)
+        self._is_done = True
+        if not cia402.matches(status, cia402.OPERATION_ENABLED).any():
+            warnings.warn(
+                f"{played[0]:04X}h is played, but no axis is enabled (6041h = {int(status[0]):04X}h): nothing moves; "
+                "call motion.enable(drives, mode=...) first",
+                stacklevel=3,
+            )
