@@ -77,7 +77,8 @@ class LiveDictionary:
             if role in device.roles
         }
         self.scale_keys += tuple(self._single_scales.values())
-        self._scale_fields = tuple(SCALES & {SCALE_FIELD, *self._scales, *self._single_scales})
+        # Fields besides that of positions on which factors of this device's units depend.
+        self.other_scales = tuple(name for name in (*self._scales, *self._single_scales) if name != SCALE_FIELD)
         self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
@@ -381,7 +382,7 @@ class LiveDictionary:
 
     def context(self) -> units.Context:
         """Return the values that the factors of units depend on now, one per axis."""
-        of_axes: dict[str, Any] = {name: self._scale_field(name) for name in self._scale_fields}
+        of_axes: dict[str, Any] = {name: self._scale_field(name) for name in (SCALE_FIELD, *self.other_scales)}
         return units.Context(
             **of_axes,
             current_lsb=self.device.current_full_scale / 32768.0,

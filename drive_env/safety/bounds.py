@@ -148,15 +148,18 @@ def unit_of(description: Description, key: Key) -> str:
 def speed_in(key: Key, speed: Integers, bounds: Bounds, drives: WatchedDrives, rotor: RotorAngle) -> Integers:
     """Return a limit of speed [counts of the object that shows it] in counts of another object.
 
-    As it is where both have one unit, there is no limit, or their ratio is not known: what the drive shows is held
-    against the limit all the same.
+    As it is where both have one unit. Where their ratio is not known, what positions may show at most counts, and what
+    the drive shows is held against the limit all the same.
     """
     shown, own = velocity_object(drives.description), unit_of(drives.description, key)
     if (shown != VL_VELOCITY and key[0] not in VL_SPEEDS) or own == unit_of(drives.description, shown):
         return speed
-    ratio = bounds.count / increments_per_count(own, rotor)
+    count = increments_per_count(own, rotor)
+    ratio = bounds.count / count
     known = np.isfinite(ratio) & (speed < NO_LIMIT)
-    return np.where(known, np.floor(speed * np.where(known, ratio, 1.0) + 1e-6), speed).astype(np.int64)
+    by_position = np.nan_to_num(bounds.speed / count, nan=np.inf)
+    limit = np.where(known, np.floor(speed * np.where(known, ratio, 1.0) + 1e-6), float(NO_LIMIT))
+    return np.minimum(np.minimum(limit, np.floor(by_position)), float(NO_LIMIT)).astype(np.int64)
 
 
 def _speed_unit(drives: WatchedDrives) -> str:

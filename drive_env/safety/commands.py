@@ -26,6 +26,7 @@ from drive_env.safety.bounds import (
     read_own,
     read_vl_rate,
     speed_in,
+    unit_of,
     vl_rate,
 )
 from drive_env.safety.errors import SafetyError
@@ -178,7 +179,7 @@ class Commands:
 
     def _speed_count(self) -> Floats:
         """Return the increments a second of a count of 60FFh; 0 where its unit tells none."""
-        return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
+        return np.nan_to_num(increments_per_count(unit_of(self._drives.description, TARGET_VELOCITY), self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
         """Forget a set-point, all by default, after a node reset or where the last write may not have arrived."""
@@ -462,7 +463,7 @@ class Commands:
         if not where.any():
             return
         raw = np.atleast_2d(raw).min(axis=0)
-        ramp: Floats = raw * np.nan_to_num(count)
+        ramp: Floats = np.asarray(raw * np.nan_to_num(count), float)
         self._check_stops_turning(entry, raw, ramp, where)
         axes = where & self._axes.may_turn
         if np.any(slow := axes & (ramp < self._unramped_ramp())):

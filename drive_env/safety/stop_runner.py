@@ -179,7 +179,7 @@ class StopRunner:
             if not self._drives.description.has(key):
                 continue
             count = increments_per_count(unit_of(self._drives.description, key), self._axes.rotor)
-            own: Floats = read_own(self._drives, key, 0) * np.nan_to_num(count)
+            own: Floats = np.asarray(read_own(self._drives, key, 0) * np.nan_to_num(count), float)
             if key in VL_DECELERATION:
                 own = read_vl_rate(self._drives, VL_DECELERATION, self._axes.rotor)
             counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode without a ramp of its own has 6084h
