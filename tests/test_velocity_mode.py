@@ -196,7 +196,8 @@ def test_without_604ah_a_quick_stop_has_the_ramp_of_the_other_modes(folders):
 
 def test_a_silent_master_is_answered_by_the_ramp_of_a_quick_stop(inverter):
     """1016h: node 7, 50 ms; in operation enabled the drive goes into fault, by 604Ah."""
-    wire = Wire(inverter, NODE)
+    wire = Wire(inverter, NODE)  # restarts the drive
+    inverter.write((0x604A, 1), 4000)
     assert wire.download(0x1016, 1, 0x0007_0032, 4) == 0
     assert wire.download(0x1029, 1, 2, 1) == 0  # to stopped
     turning(inverter, 300)
