@@ -27,6 +27,14 @@ ERROR_CODE = 0x603F
 CONTROLWORD = 0x6040
 STATUSWORD = 0x6041
 VL_TARGET_VELOCITY = 0x6042
+VL_VELOCITY_DEMAND = 0x6043
+VL_VELOCITY_ACTUAL = 0x6044
+VL_VELOCITY_LIMITS = 0x6046
+VL_ACCELERATION = 0x6048
+VL_DECELERATION = 0x6049
+VL_QUICK_STOP = 0x604A
+VL_SET_POINT_FACTOR = 0x604B
+VL_DIMENSION_FACTOR = 0x604C
 QUICK_STOP_OPTION = 0x605A
 SHUTDOWN_OPTION = 0x605B
 DISABLE_OPERATION_OPTION = 0x605C
@@ -97,12 +105,12 @@ SINGLE_DEVICE_TYPE = 0x67FF
 # What commands or leads an axis, or its outputs: no parameters.
 COMMANDED = (
     CONTROLWORD, MODE, TARGET_TORQUE, TARGET_POSITION, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
-    INTERPOLATION_DATA, DIGITAL_OUTPUTS, TARGET_VELOCITY,
+    INTERPOLATION_DATA, DIGITAL_OUTPUTS, TARGET_VELOCITY, VL_TARGET_VELOCITY,
 )  # fmt: skip
 OUTPUTS_MASK = (DIGITAL_OUTPUTS, 2)  # which outputs follow: a setting beside the command
 # --- modes of operation (6060h) --------------------------------------------------------------------------------------
 PP, VL, PV, TQ, HM, IP, CSP, CSV, CST = 1, 2, 3, 4, 6, 7, 8, 9, 10
-MODES = {"pp": PP, "pv": PV, "tq": TQ, "hm": HM, "ip": IP, "csp": CSP, "csv": CSV, "cst": CST}
+MODES = {"pp": PP, "vl": VL, "pv": PV, "tq": TQ, "hm": HM, "ip": IP, "csp": CSP, "csv": CSV, "cst": CST}
 
 
 # --- states and the statusword ---------------------------------------------------------------------------------------
@@ -183,6 +191,8 @@ DISABLE_VOLTAGE, QUICK_STOP, SHUTDOWN, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02,
 ENABLING = (SHUTDOWN, SWITCH_ON, ENABLE_OPERATION)  # one after the other, from switch on disabled
 FAULT_RESET = 0x80  # acts as it rises
 NEW_SET_POINT, CHANGE_AT_ONCE, RELATIVE = 0x10, 0x20, 0x40  # in pp
+ENABLE_RAMP, UNLOCK_RAMP, REFERENCE_RAMP = 0x10, 0x20, 0x40  # in vl
+FOLLOW_RAMP = ENABLE_OPERATION | ENABLE_RAMP | UNLOCK_RAMP | REFERENCE_RAMP
 CHANGE_ON_SET_POINT = 0x200  # in pp, of drives with a set-point buffer
 HALT = 0x100
 COMMANDS = {

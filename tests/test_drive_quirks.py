@@ -34,8 +34,12 @@ QUIRKS = {
         "set_point_buffer": 1,
         "pv_slows_down_by_6084h": True,
         "pv_starts_and_stops": True,
+        "homing_here_sets_zero": True,
     },
 }
+
+
+HERE = {"homing_here_sets_zero": True}
 
 
 def one(drives, name):
@@ -305,6 +309,16 @@ def test_a_move_that_does_not_arrive_is_no_move_that_has(tmp_path):
             motion.move_to(drives, 5 * TURN, timeout=1.0)
 
 
+@pytest.mark.parametrize(("quirks", "position"), [(HERE, 0), ({"homing_here_sets_zero": False}, -1000)])
+def test_method_35_leaves_607ch_out_on_drives_that_set_zero_here(tmp_path, quirks, position):
+    with build(tmp_path, **quirks) as drives:
+        motion.select_mode(drives, "hm")
+        drives.write(0x607C, 1000)
+        drives.write(0x6098, 35)
+        drives.write(0x6040, 0x10)
+        assert one(drives, 0x6062) == position
+
+
 # --- the data ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("quirks", "message"),
@@ -326,11 +340,11 @@ def test_a_quirk_that_cannot_be_is_told(tmp_path, quirks, message):
 @pytest.mark.parametrize(
     ("device", "quirks"),
     [
-        ("tmcm1636", {}),
-        ("tmcm1636_fw109", {}),
-        ("tgz_d", {}),
-        ("tmcm6212", {"pv_starts_and_stops": True}),  # its manual, section 1.5
-        ("tmcm3313", {"pv_slows_down_by_6084h": True}),  # its manual, section 7.1.14
+        ("tmcm1636", HERE),  # its manual, 607Ch and section 8.1.5
+        ("tmcm1636_fw109", HERE),
+        ("tgz_d", HERE),  # its manual, homing method: "set zero to the actual position"
+        ("tmcm6212", HERE | {"pv_starts_and_stops": True}),  # its manual, section 1.5
+        ("tmcm3313", HERE | {"pv_slows_down_by_6084h": True}),  # its manual, sections 8.1.10 and 7.1.14
     ],
 )
 def test_the_devices_that_ship_have_those_of_their_manuals_alone(device, quirks):

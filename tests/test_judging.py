@@ -39,7 +39,7 @@ class Bench:
             outside=np.zeros(axes, np.int64), mode=each(mode, np.int64), mode_written=np.zeros(axes),
             demand=np.zeros(axes, np.int64), demand_seen=np.full(axes, -np.inf), led=np.full(axes, np.nan),
             aim=dict.fromkeys(range(axes), 0), moves=np.ones(axes, bool), asked_speed=np.zeros(axes),
-            asked_current=np.zeros(axes), position=np.zeros(axes, np.int64), clock=1.0,
+            velocity_object=VELOCITY, asked_current=np.zeros(axes), position=np.zeros(axes, np.int64), clock=1.0,
         )  # fmt: skip
         self.axes.now, self.axes.newest_speed = lambda: self.axes.clock, lambda: self.axes.velocity
         self.user = user or Limits()

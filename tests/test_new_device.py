@@ -268,6 +268,25 @@ def test_methods_of_the_standard_home_it_at_real_switches(folders, method, home)
         assert carriage == pytest.approx(home, abs=1e-3)
 
 
+@pytest.mark.parametrize("method", [33, 34, 35, 37])
+@pytest.mark.parametrize("offset", [1000, -250])
+def test_zero_is_at_home_plus_607ch_in_methods_without_a_switch_too(folders, method, offset):
+    """CiA 402-2: home has the position -607Ch. An index is at each whole turn since power-on; 35 and 37 are here."""
+    with emulated(str(folders["everest_ed1"].folder), ideal=True) as drives:
+        turn, counts = int(drives.read(Role.POSITION_SCALE)[0]), float(np.min(per_increment(drives, 0x60FF)))
+        motion.enable(drives, "pp")
+        motion.move_to(drives, turn // 3)
+        for name, value in ((0x6098, method), (0x607C, offset), ((0x6099, 2), round(0.5 * turn * counts))):
+            drives.write(name, value)
+        before = drives.inside.records["theta_m"][0][0] / (2 * math.pi)
+        motion.home(drives)
+        drives.advance(0.2)
+        turns = drives.inside.records["theta_m"][0][0] / (2 * math.pi)
+        assert turns == pytest.approx({33: 0.0, 34: 1.0}.get(method, before), abs=0.01)
+        assert drives.read(0x6062)[0] == -offset
+        assert drives.read(0x6064)[0] == pytest.approx(-offset, abs=turn / 100)
+
+
 def test_an_object_that_is_lacking_is_no_role_and_is_not_made(folders):
     device = find_device(str(folders["cascade_cm2"].folder))
     assert Role.OUTPUTS not in device.roles and Role.BRAKE_CHOPPER not in device.roles

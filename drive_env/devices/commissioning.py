@@ -24,7 +24,7 @@ import numpy as np
 from drive_env import cia402
 from drive_env.devices.standard_objects import HOMING_HERE
 from drive_env.dictionary.codec import code_of, encode_one
-from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.position_scale import position_scale, set_point_ratio, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context
 
@@ -185,6 +185,12 @@ def standard_preset(device: Device, motor: Motor) -> dict[str, int]:
     dictionary = device.new_dictionary()
     found = _scale(device, dictionary, motor)
     context = Context(_increments(device, dictionary, found), device.current_full_scale / 32768.0, device.rated_current)
+    ratios = {"velocity_ratio": velocity_ratio(device.roles), "set_point_ratio": set_point_ratio(device.roles)}
+    of_roles: dict[str, Any] = {
+        name: scale.increments([np.array(float(dictionary.find(key).default)) for key in scale.keys])
+        for name, scale in ratios.items() if scale is not None
+    }  # fmt: skip
+    context = context._replace(**of_roles)
     values = _values(motor)
     for key, binding in device.bindings.items():
         entry = dictionary.find(key)
@@ -225,6 +231,14 @@ def _values(motor: Motor) -> dict[str, float]:
         "acceleration": ramp,
         "deceleration": ramp,
         "quick_stop_deceleration": 2.0 * ramp,
+        "vl_min": 0.0,
+        "vl_max": motor.rated_speed,
+        "vl_acceleration_speed": ramp,
+        "vl_acceleration_time": 1.0,
+        "vl_deceleration_speed": ramp,
+        "vl_deceleration_time": 1.0,
+        "vl_quick_stop_speed": 2.0 * ramp,
+        "vl_quick_stop_time": 1.0,
         "homing_fast": HOMING_SPEED * motor.rated_speed,
         "homing_slow": SLOW_SPEED * motor.rated_speed,
         "homing_acceleration": ramp,

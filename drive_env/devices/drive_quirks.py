@@ -27,6 +27,7 @@ class DriveQuirks(NamedTuple):
         set_point_buffer: Set-points that pp keeps besides the one under way, 0 or 1.
         pv_slows_down_by_6084h: pv slows down with 6084h, not with 6083h.
         pv_starts_and_stops: pv jumps to the start velocity, and from the end velocity.
+        homing_here_sets_zero: Homing methods 35 and 37 set the position to 0, whatever 607Ch is.
     """
 
     mode_display_delay: float = 0.0
@@ -35,6 +36,7 @@ class DriveQuirks(NamedTuple):
     set_point_buffer: int = 0
     pv_slows_down_by_6084h: bool = False
     pv_starts_and_stops: bool = False
+    homing_here_sets_zero: bool = False
 
 
 def drive_quirks_of(data: Mapping[str, Any]) -> DriveQuirks:

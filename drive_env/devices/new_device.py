@@ -38,6 +38,7 @@ from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds
 from drive_env.dictionary.eds_values import number_of
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_file
+from drive_env.dictionary.roles import VL_FACTORS
 from drive_env.dictionary.units import find_unit
 from drive_env.whole_file import files_to_be
 
@@ -64,6 +65,7 @@ TRANSMISSION_TYPES = ["0...240", 254, 255]
 # What a drive has that has a mode, where its 6502h tells none.
 MODE_NEEDS = {
     cia402.PP: cia402.TARGET_POSITION,
+    cia402.VL: cia402.VL_TARGET_VELOCITY,
     cia402.PV: cia402.TARGET_VELOCITY,
     cia402.HM: cia402.HOMING_METHOD,
     cia402.CSP: cia402.TARGET_POSITION,
@@ -74,6 +76,7 @@ MODE_NEEDS = {
 # What a mode follows; homing has an object of the emulator's own where the drive has none.
 MODE_TARGETS = {
     cia402.PP: (cia402.TARGET_POSITION, 0),
+    cia402.VL: (cia402.VL_TARGET_VELOCITY, 0),
     cia402.PV: (cia402.TARGET_VELOCITY, 0),
     cia402.TQ: (cia402.TARGET_TORQUE, 0),
     cia402.IP: (cia402.INTERPOLATION_DATA, 1),
@@ -150,6 +153,7 @@ def new_device(
 
     Raises:
         ValueError: For a file that describes no CiA 402 drive, a folder that exists, or an unknown unit.
+        RuntimeError: For a drive that could be moved in no mode.
     """
     if folder.exists():
         raise ValueError(f"{folder} exists already, and is not overwritten; choose another folder with --out")
@@ -210,7 +214,7 @@ class _Draft:
         self._base = self._free_block()
         self._modes = self._supported_modes()
         self._bindings = self._standard_bindings()
-        self._roles: dict[str, Key] = dict(self._units.scale)
+        self._roles: dict[str, Key] = dict(self._units.scale) | self._vl_factors()
         self._own: list[tuple[Key, OwnObject]] = []
         self._take_current_limit()
         self._add_own_objects()
@@ -258,6 +262,7 @@ class _Draft:
         here = [mode for mode in MODES if mode.supported_bit is not None]
         if bits == 0:
             found = [mode for mode in here if (MODE_NEEDS.get(mode.number, -1), 0) in self._types]
+            found = [mode for mode in found if self._is_within_6060h(mode)]
             listed = ", ".join(mode.abbreviation for mode in found)
             self._fill_in.append(
                 Note(
@@ -268,7 +273,7 @@ class _Draft:
         else:
             found = [mode for mode in here if mode.supported_bit is not None and bits >> mode.supported_bit & 1]
             known = {mode.supported_bit for mode in here}
-            found = [mode for mode in found if self._has_target(mode)]
+            found = [mode for mode in found if self._has_target(mode) and self._is_within_6060h(mode)]
             others = [bit for bit in range(16) if bits >> bit & 1 and bit not in known]
             self._told_of_modes += [
                 Note(f"mode {bit + 1}", "6502h has it, and the emulator does not: 6060h refuses it") for bit in others
@@ -276,7 +281,14 @@ class _Draft:
         methods = self._homing_methods()
         numbers = [mode.number for mode in found if mode.number != cia402.HM or methods]
         names = [mode.abbreviation for mode in found if mode.number in numbers]
-        self._told_of_modes.insert(0, Note("taken", ", ".join(names) or "none"))
+        if not numbers:
+            why = "".join(f"; {note.what}: {note.why}" for note in self._told_of_modes)
+            raise RuntimeError(
+                f"{self._name}: the drive would have no mode of operation that works here{why}; nothing was written. "
+                "Complete a copy of the file: 6502h with the drive's modes, the target of one (6042h for vl, 60FFh for "
+                "pv, 607Ah for pp), and limits of 6060h that have its number"
+            )
+        self._told_of_modes.insert(0, Note("taken", ", ".join(names)))
         if cia402.HM in numbers:
             self._told_of_modes.append(
                 Note("homing methods", ", ".join(map(str, methods)) + " of 6098h; others are refused")
@@ -289,6 +301,17 @@ class _Draft:
                 for one in sorted(self._listed_methods() - set(methods))
             ]
         return numbers
+
+    def _is_within_6060h(self, mode: Mode) -> bool:
+        """Return whether the limits of 6060h have a mode; tell of one that they leave out."""
+        variable = self._types[cia402.MODE, 0]
+        low = -128 if variable.min is None else variable.min
+        high = 127 if variable.max is None else variable.max
+        if low <= mode.number <= high:
+            return True
+        why = f"6060h takes {low} to {high} alone by its limits, and refuses it"
+        self._told_of_modes.append(Note(f"mode {mode.number}, {mode.abbreviation}", why))
+        return False
 
     def _has_target(self, mode: Mode) -> bool:
         """Return whether the drive has the object that a mode of 6502h follows; tell of one that has not."""
@@ -326,11 +349,19 @@ class _Draft:
         return found
 
     def _unit(self, name: str) -> str:
+        factors = self._vl_factors()
+        by_dimension = "velocity unit" if "velocity_numerator" in factors else "rpm"
         return {
             "velocity": self._units.velocity,
             "acceleration": self._units.acceleration,
             "torque": self._units.torque,
+            "vl velocity": by_dimension,
+            "vl target": "set-point unit" if "set_point_numerator" in factors else by_dimension,
         }.get(name, name)
+
+    def _vl_factors(self) -> dict[str, Key]:
+        """Return the objects of the factors of vl that the drive has, by role."""
+        return {role.name.lower(): key for role, key in VL_FACTORS.items() if key in self._types}
 
     def _take_current_limit(self) -> None:
         """Let 6072h limit the current of a drive without 6073h: by its rated torque it is the same."""
@@ -420,6 +451,7 @@ class _Draft:
             self._section(exponent)["DefaultValue"] = "-3"
             self._changes.append(Note(f"[{_text(exponent)}]", "has no default: -3, milliseconds"))
         self._correct_scale()
+        self._correct_factors()
         for key, variable in self._types.items():
             if isinstance(variable.default, int) and variable.default >= 1 << 63:
                 self._section(key)["DefaultValue"] = "0"
@@ -438,6 +470,17 @@ class _Draft:
                 why = "with the others makes no scale of positions"
                 self._changes.append(
                     Note(f"[{_text(key)}]", f"DefaultValue={self._default(*key)} {why}: it is {value}")
+                )
+
+    def _correct_factors(self) -> None:
+        """Let the factors of vl be 1 and more: none divides by 0, and directions are not turned round."""
+        for key in self._vl_factors().values():
+            row = self._section(key)
+            row["LowLimit"] = str(max(number_of(row.get("LowLimit", "")) or 0, 1))
+            if self._default(*key) < 1:
+                row["DefaultValue"] = "1"
+                self._changes.append(
+                    Note(f"[{_text(key)}]", f"DefaultValue={self._default(*key)} is not possible here: it is 1")
                 )
 
     def _section(self, key: Key) -> Section:
@@ -487,7 +530,7 @@ class _Draft:
 
     def _without_effect(self) -> Iterable[Note]:
         own = {index for (index, _), _ in self._own}
-        scale = {index for index, _ in self._units.scale.values()}
+        scale = {index for index, _ in self._roles.values()}
         bound = {index for index, _ in self._bindings}
         for index in sorted({index for index, _ in self._types}):
             first = cia402.of_first_axis(index)

@@ -48,8 +48,10 @@ ALWAYS_SHOWN = ("name", "title", "activation")  # keys of a clock's row
 SMALLEST_EEPROM, BESIDE_IMAGES, CLOCK_ROW = 2048, 600, 24  # bytes; a name, type and group of 100 letters each in it
 BUFFERS = 3  # of a sync manager with process data
 # Images of a drive that has none: by their mode the object that is followed.
-OWN_SET = (("csp", cia402.TARGET_POSITION), ("csv", cia402.TARGET_VELOCITY), ("cst", cia402.TARGET_TORQUE))
-SHOWN = (cia402.STATUSWORD, cia402.MODE_DISPLAY, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+OWN_SET = (("csp", cia402.TARGET_POSITION), ("csv", cia402.TARGET_VELOCITY), ("cst", cia402.TARGET_TORQUE),
+           ("vl", cia402.VL_TARGET_VELOCITY))  # fmt: skip
+SHOWN = (cia402.STATUSWORD, cia402.MODE_DISPLAY, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL,
+         cia402.VL_VELOCITY_ACTUAL)  # fmt: skip
 CLASS_LAYOUT = EtherCatBehaviour(
     Place(0x1000, 256), Place(0x1100, 256), 0x1200, 0x1800, CLASS_CYCLE, CLASS_EEPROM, Place(0x1000, 256),
     Place(0x1100, 256),
@@ -339,13 +341,14 @@ class _Maker:
         """Return whether images command every axis by a cyclic target of any mode, or show where it is."""
         found = {key for pdo in assigned for key in pdo.keys}
         word = cia402.CONTROLWORD if is_output else cia402.STATUSWORD
-        places = [target for _, target in OWN_SET] if is_output else [cia402.POSITION_ACTUAL]
+        shown = cia402.POSITION_ACTUAL if (cia402.POSITION_ACTUAL, 0) in self._types else cia402.VL_VELOCITY_ACTUAL
+        places = [target for _, target in OWN_SET] if is_output else [shown]
         steps = [axis * cia402.AXIS_OFFSET for axis in range(self._axes)]
         return all((word + step, 0) in found and any((one + step, 0) in found for one in places) for step in steps)
 
     def _own_set(self, is_output: bool, pdos: Sequence[_Pdo]) -> list[_Pdo]:
         """Return images of our own: outputs for csp, csv and cst, or inputs."""
-        lacking = "a controlword or a cyclic target" if is_output else "6041h or 6064h"
+        lacking = "a controlword or a cyclic target" if is_output else "6041h or 6064h (6044h without that)"
         if self._esi is not None:
             manager = 2 if is_output else 3
             raise ValueError(
@@ -361,7 +364,7 @@ class _Maker:
             pdo = self._pdo(index, name, is_output, False, self._entries_of_axes(indices))
             own.append(replace(pdo, room=max(pdo.room, ROOM * self._axes)))
         if not own:
-            raise ValueError(f"{self._source} has no cyclic target (607Ah, 60FFh, 6071h): no master could move it")
+            raise ValueError(f"{self._source} has no target (607Ah, 60FFh, 6071h, 6042h): no master could move it")
         told = ", ".join(f"{pdo.index:04X}h {pdo.name}" for pdo in own)
         there = [pdo for pdo in pdos if pdo.is_output == is_output]
         why = f"has no images that carry {lacking} of each axis" if there else "has no images"

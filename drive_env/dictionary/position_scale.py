@@ -65,10 +65,16 @@ def _per_motor_turn(values: Sequence[Floats]) -> Floats:
 
 def velocity_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
     """Return the objects of the rpm of a velocity unit, and the function of their values; None for other drives."""
-    parts = (Role.VELOCITY_NUMERATOR, Role.VELOCITY_DIVISOR)
-    if not all(role in roles for role in parts):
-        return None
-    return PositionScale(tuple(roles[role] for role in parts), lambda values: values[0] / values[1])
+    return _ratio(roles, (Role.VELOCITY_NUMERATOR, Role.VELOCITY_DIVISOR))
+
+
+def set_point_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
+    """Return the same of the velocity units of a target velocity of vl (604Bh)."""
+    return _ratio(roles, (Role.SET_POINT_NUMERATOR, Role.SET_POINT_DIVISOR))
+
+
+def _ratio(roles: Mapping[Role, Key], parts: tuple[Role, Role]) -> PositionScale | None:
+    return PositionScale(tuple(roles[role] for role in parts), _quotient) if roles.keys() >= set(parts) else None
 
 
 def _units_of_turn(values: Sequence[Floats]) -> Floats:

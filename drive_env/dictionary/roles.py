@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from enum import Enum
 
+from drive_env import cia402
+
 
 class Role(Enum):
     """A part that an object plays; the value is its name in messages."""
@@ -25,6 +27,8 @@ class Role(Enum):
     POSITION_DIVISOR = "increments inside of a position unit: divisor"
     VELOCITY_NUMERATOR = "rpm of a velocity unit: numerator"
     VELOCITY_DIVISOR = "rpm of a velocity unit: divisor"
+    SET_POINT_NUMERATOR = "velocity units of a target velocity of vl: numerator"
+    SET_POINT_DIVISOR = "velocity units of a target velocity of vl: denominator"
     PEAK_CURRENT = "peak current of the motor, whose parts torques are"
     PROFILE_BITS = "increments of a revolution of the profile generator, as a power of two"
     SYNC_TIME = "measured time between two pulses of SYNC0"
@@ -73,3 +77,12 @@ class Role(Enum):
     OUTPUTS = "digital outputs"
     OUTPUTS_MASK = "mask of the digital outputs"
     ANALOG_INPUTS = "analog inputs"
+
+
+# Of CiA 402's drives with vl that have them: velocities are rpm times 604Ch, and targets of vl times 604Bh, too.
+VL_FACTORS = {
+    Role.VELOCITY_NUMERATOR: (cia402.VL_DIMENSION_FACTOR, 1),
+    Role.VELOCITY_DIVISOR: (cia402.VL_DIMENSION_FACTOR, 2),
+    Role.SET_POINT_NUMERATOR: (cia402.VL_SET_POINT_FACTOR, 1),
+    Role.SET_POINT_DIVISOR: (cia402.VL_SET_POINT_FACTOR, 2),
+}

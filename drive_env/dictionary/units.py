@@ -27,7 +27,8 @@ class Context(NamedTuple):
     position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
     rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
-    velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
+    velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h, or 604Ch)
+    set_point_ratio: Any = 1.0  # velocity units of a target velocity of vl (604Bh)
     peak_current: Any = math.nan  # of the motor [A], of which torques are parts
     profile_bits: Any = 16.0  # of a revolution's increments of a profile generator, as a power of two
 
@@ -68,6 +69,7 @@ UNITS: dict[str, Unit] = {
     for unit in (
         Unit("raw", "as it is", lambda c: 1.0),
         Unit("mA", "milliamperes of peak i_q", lambda c: 1e-3),
+        Unit("s", "seconds", lambda c: 1.0),
         Unit("ms", "milliseconds", lambda c: 1e-3),
         Unit("10ms", "hundredths of a second", lambda c: 1e-2),
         Unit("512 clocks", "512 clocks of a ramp generator at 16 MHz", lambda c: 512.0 / 16e6),
@@ -111,6 +113,12 @@ UNITS: dict[str, Unit] = {
             "velocity unit/s",
             "velocity units per second",
             lambda c: RPM * c.velocity_ratio,
+            follows_scale=True,
+        ),
+        Unit(
+            "set-point unit",
+            "velocity units times numerator over denominator of the set-point factor",
+            lambda c: RPM * c.velocity_ratio * c.set_point_ratio,
             follows_scale=True,
         ),
         Unit("pginc/s", "increments of the profile generator per second", _profile_angle, follows_scale=True),

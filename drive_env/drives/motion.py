@@ -29,6 +29,7 @@ STOP_TIMEOUT = 5.0  # s, for the stop of an axis whose own mode was changed whil
 # Of each mode that follows a target as soon as it is enabled: the target, and the object that is added to it.
 # ip and tq act as csp and cst where a drive has them (TGZ manual); pp and hm move at a rising edge of bit 4 alone.
 FOLLOWED = {
+    "vl": (cia402.VL_TARGET_VELOCITY, None),
     "pv": (cia402.TARGET_VELOCITY, None),
     "tq": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
     "ip": (cia402.TARGET_POSITION, cia402.POSITION_OFFSET),
@@ -486,20 +487,44 @@ def _window(drives: BasicDrives) -> int:
     return window if window < WIDEST else 0
 
 
-def _check_can_move(drives: BasicDrives, where: Mask | None) -> None:
+def _check_can_move(drives: BasicDrives, where: Mask | None, modes: tuple[str, ...] = ("pp",)) -> Integers:
+    """Return the mode of every axis; RuntimeError for one that is not enabled in one of the modes."""
     axes = np.ones(drives.num_axes, bool) if where is None else where
     status, shown = drives.read(cia402.STATUSWORD), _shown_modes(drives)
     mode = drives.read(cia402.MODE) if shown is None else shown
     off = axes & ~cia402.matches(status, cia402.OPERATION_ENABLED)
-    other = axes & (mode != cia402.MODES["pp"])
-    for wrong, what in ((off, "is not enabled"), (other, "is not in pp")):
+    other = axes & ~np.isin(mode, [cia402.MODES[name] for name in modes])
+    for wrong, what in ((off, "is not enabled"), (other, f"is not in {' or '.join(modes)}")):
         if wrong.any():
             axis = int(np.flatnonzero(wrong)[0])
             number = axis_number(drives, axis)
             raise RuntimeError(
                 f"axis {number} {what} and cannot move: statusword {status[axis]:04X}h, mode {mode[axis]}; "
-                'motion.enable(drives, mode="pp") first'
+                f'motion.enable(drives, mode="{modes[0]}") first'
             )
+    return mode
+
+
+def turn(drives: BasicDrives, velocity: ArrayLike, where: Mask | None = None) -> None:
+    """Have enabled axes turn at a velocity, in vl (6042h, and bits 4 to 6 of the controlword) or pv (60FFh).
+
+    In vl these bits let the ramp lead the axis; `enable` leaves them 0. With another controlword it comes to rest.
+
+    Args:
+        drives: The drives.
+        velocity: In the unit of 6042h, rpm unless 604Bh and 604Ch say another, or of 60FFh.
+        where: Axes; all by default.
+
+    Raises:
+        RuntimeError: If an axis is not enabled, or in neither mode; nothing is written.
+    """
+    in_vl = _check_can_move(drives, where, ("vl", "pv")) == cia402.VL
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    if (others := axes & ~in_vl).any():
+        drives.write(cia402.TARGET_VELOCITY, velocity, where=others)
+    if (axes & in_vl).any():
+        drives.write(cia402.VL_TARGET_VELOCITY, velocity, where=axes & in_vl)
+        drives.write(cia402.CONTROLWORD, cia402.FOLLOW_RAMP, where=axes & in_vl)
 
 
 def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) -> None:

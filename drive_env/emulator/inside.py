@@ -118,6 +118,7 @@ class Inside(Saved):
         records["set_point_buffer"] = device.quirks.set_point_buffer
         records["pv_slows_down_by_6084h"] = device.quirks.pv_slows_down_by_6084h
         records["pv_starts_and_stops"] = device.quirks.pv_starts_and_stops
+        records["homing_here_sets_zero"] = device.quirks.homing_here_sets_zero
         self._kind.set_constants(records, device, self.motor)
         if self._kind.connect is not None:
             self._kind.connect(records, device, np.full(self.num_axes, self.load.num_axes % device.num_axes == 0))

@@ -20,7 +20,7 @@ from drive_env.dictionary.access import check_allowed, check_in_range, check_rea
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
+from drive_env.dictionary.position_scale import PositionScale, position_scale, set_point_ratio, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import (
@@ -29,6 +29,7 @@ from drive_env.emulator.prepared_record import (
     RATIO_FIELD,
     SCALE_FIELD,
     SCALES,
+    SET_POINT_FIELD,
     PreparedObject,
     PreparedRecord,
 )
@@ -61,7 +62,11 @@ class LiveDictionary:
     ) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
-        found = {SCALE_FIELD: position_scale(device.roles), RATIO_FIELD: velocity_ratio(device.roles)}
+        found = {
+            SCALE_FIELD: position_scale(device.roles),
+            RATIO_FIELD: velocity_ratio(device.roles),
+            SET_POINT_FIELD: set_point_ratio(device.roles),
+        }
         # Fields of scales that objects make, as far as the device has them.
         self._scales: dict[str, PositionScale] = {name: scale for name, scale in found.items() if scale is not None}
         # Objects whose write gives what is stored another meaning.
@@ -72,6 +77,8 @@ class LiveDictionary:
             if role in device.roles
         }
         self.scale_keys += tuple(self._single_scales.values())
+        # Fields besides that of positions on which factors of this device's units depend.
+        self.other_scales = tuple(name for name in (*self._scales, *self._single_scales) if name != SCALE_FIELD)
         self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
@@ -375,15 +382,12 @@ class LiveDictionary:
 
     def context(self) -> units.Context:
         """Return the values that the factors of units depend on now, one per axis."""
-        scales = units.Context(
-            position_scaler=self._scale_field(SCALE_FIELD),
+        of_axes: dict[str, Any] = {name: self._scale_field(name) for name in (SCALE_FIELD, *self.other_scales)}
+        return units.Context(
+            **of_axes,
             current_lsb=self.device.current_full_scale / 32768.0,
             rated_current=self.device.rated_current,
         )
-        if not self._layout.has(RATIO_FIELD):
-            return scales
-        of_axes: dict[str, Any] = {name: self._scale_field(name) for name in (RATIO_FIELD, PEAK_FIELD, PROFILE_FIELD)}
-        return scales._replace(**of_axes)
 
     def _scale_field(self, name: str) -> Floats:
         return get_lanes(self._records, name, self.num_axes).astype(float)

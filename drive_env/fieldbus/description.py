@@ -18,7 +18,7 @@ from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName, written_objects
-from drive_env.dictionary.roles import Role
+from drive_env.dictionary.roles import VL_FACTORS, Role
 
 CYCLE = 0.001  # communication cycle where the device says nothing else [s]
 
@@ -216,6 +216,7 @@ def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = Fal
     except Exception as error:  # the reader raises whatever the broken line leads to
         raise ValueError(f"{path} cannot be read as an EDS: {error}; see whether CiA 306 allows that line") from error
     axes = axes_of(path, types)
+    dictionary.roles |= {role: key for role, key in VL_FACTORS.items() if dictionary.has(key)}
     return Description(path.stem, dictionary, axes, None, CIA_402, _types=types)
 
 

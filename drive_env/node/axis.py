@@ -25,7 +25,7 @@ from drive_env.emulator.live_dictionary import (
     check_supported,
     refuse_same_mode,
 )
-from drive_env.emulator.prepared_record import PEAK_FIELD, PROFILE_FIELD, RATIO_FIELD, SCALE_FIELD
+from drive_env.emulator.prepared_record import SCALE_FIELD
 from drive_env.firmware import cycle
 from drive_env.firmware.common.protection import COMMUNICATION
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
@@ -79,10 +79,8 @@ class Axis:
         self._queue = [self._place("emergency", k)[1] for k in range(EMERGENCY_QUEUE)]
         self._fsa = self._place("fsa")[1]
         self._fresh = self._place("set_point_fresh")[1]
-        layout = self._device.firmware.layout
         self._scaler = self._place(SCALE_FIELD)[1]
-        names = (RATIO_FIELD, PEAK_FIELD, PROFILE_FIELD) if layout.has(RATIO_FIELD) else ()
-        self._other_scales = {name: self._place(name)[1] for name in names}
+        self._other_scales = {name: self._place(name)[1] for name in objects.other_scales}
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
         self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew

@@ -12,7 +12,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.safety.bounds import COUNTED
+from drive_env.safety.bounds import COUNTED, velocity_object
 from drive_env.safety.objects import CURRENT, DEMAND, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped
 from mechanics.arrays import Floats, Integers, Mask
@@ -52,19 +52,23 @@ class Axes:
         velocity: As the drive says [inc/s].
         told_speed: As the drive says in another unit, by the scale of its positions [inc/s].
         speed_count: Increments a second of a count of 606Ch; nan where its unit tells none.
-        speed: From positions [inc/s].
+        speed: From positions [inc/s]; of a drive without any, as it says.
         has_scale: Whether the drive says how many increments a revolution has.
         mean_current: Over the last 30 ms [unit of 6077h].
         seen: When the statusword came last [s].
         mode_written: When the program last wrote the mode of operation, or the drive's own mode that must fit it [s].
         clock: The time of lockstep [s].
+        velocity_object: What shows the speed: 606Ch, or 6044h of a drive of vl alone.
         is_counted: Whether 606Ch counts what 6064h counts, per second.
     """
 
     def __init__(self, drives: WatchedDrives) -> None:
         self._drives = drives
         known = drives.description
-        self.is_counted = known.has(VELOCITY) and known.dictionary.find(VELOCITY).unit == COUNTED
+        self.velocity_object = velocity_object(known)
+        self.is_counted = self.velocity_object == VELOCITY and known.has(VELOCITY)
+        self.is_counted = self.is_counted and known.dictionary.find(VELOCITY).unit == COUNTED
+        self._has_position = known.has(POSITION)
         count = drives.num_axes
         self.lock = threading.RLock()
         self.everywhere = np.ones(count, bool)
@@ -203,16 +207,19 @@ class Axes:
             mean = rows[CURRENT].mean(axis=0) if len(rows[CURRENT]) > 1 else rows[CURRENT][0]
             self.mean_current += share * (mean - self.mean_current)
             self._current_time = np.where(where, now, self._current_time)
-        if VELOCITY in rows and self.is_counted:
-            self.velocity = np.where(where, rows[VELOCITY][-1], self.velocity).astype(float)
-        elif VELOCITY in rows:
-            self.told_speed = np.where(where, rows[VELOCITY][-1] * np.nan_to_num(self.speed_count), self.told_speed)
+        shows = self.velocity_object
+        if shows in rows and self.is_counted:
+            self.velocity = np.where(where, rows[shows][-1], self.velocity).astype(float)
+        elif shows in rows:
+            self.told_speed = np.where(where, rows[shows][-1] * np.nan_to_num(self.speed_count), self.told_speed)
+            if not self._has_position:
+                self.speed = self.velocity = self.told_speed
         if DEMAND in rows:
             self.demand = np.where(where, rows[DEMAND][-1], self.demand)
             self.demand_seen = np.where(where, now, self.demand_seen)
         if POSITION in rows:
             has_new_zero = self._take_position(rows[POSITION], now, where)
-        if POSITION in rows and not (VELOCITY in rows and self.is_counted):
+        if POSITION in rows and not (shows in rows and self.is_counted):
             self.velocity = np.where(where, self.speed, self.velocity)
         return has_new_zero
 

@@ -15,12 +15,13 @@ from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context, find_unit, split_unit
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
 from drive_env.fieldbus.errors import RefusedError
-from drive_env.safety.objects import CURRENT, VELOCITY
+from drive_env.safety.objects import CURRENT, POSITION, VELOCITY, VL_QUICK_STOP, VL_TARGET, VL_VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.fieldbus.description import Description
     from drive_env.safety.watched_drives import WatchedDrives
 
 
@@ -37,6 +38,8 @@ ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (
 )
 COUNTED = "pps"  # speeds in increments per second
 BY_RATIO = ("velocity unit", "velocity unit/s")  # of which two objects say how many rpm they are
+TARGET_UNIT = "set-point unit"  # of which two more say how many of those it is
+VL_SPEEDS = range(cia402.VL_TARGET_VELOCITY, cia402.VL_QUICK_STOP + 1)  # whose unit the standard knows
 BY_MINUTE = ("rpm", "rpm/s")  # which the scale of positions turns into increments; other units are not set off
 # A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
 SETTLED, SETTLED_TURNS = 200.0, 0.02
@@ -129,9 +132,38 @@ def rotor_limits(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, here:
     )
 
 
+def velocity_object(description: Description) -> Key:
+    """Return the object that shows the speed: 606Ch, or 6044h of a drive of vl alone, whose unit is known anyway."""
+    has = description.has
+    return VL_VELOCITY if has(VL_VELOCITY) and not (has(POSITION) and has(VELOCITY)) else VELOCITY
+
+
+def unit_of(description: Description, key: Key) -> str:
+    """Return the unit of a speed or an acceleration; "" where the drive has no such object."""
+    if key[0] in VL_SPEEDS:
+        return TARGET_UNIT if key == VL_TARGET else BY_RATIO[0]
+    return description.dictionary.find(key).unit if description.has(key) else ""
+
+
+def speed_in(key: Key, speed: Integers, bounds: Bounds, drives: WatchedDrives, rotor: RotorAngle) -> Integers:
+    """Return a limit of speed [counts of the object that shows it] in counts of another object.
+
+    As it is where both have one unit. Where their ratio is not known, what positions may show at most counts, and what
+    the drive shows is held against the limit all the same.
+    """
+    shown, own = velocity_object(drives.description), unit_of(drives.description, key)
+    if (shown != VL_VELOCITY and key[0] not in VL_SPEEDS) or own == unit_of(drives.description, shown):
+        return speed
+    count = increments_per_count(own, rotor)
+    ratio = bounds.count / count
+    known = np.isfinite(ratio) & (speed < NO_LIMIT)
+    by_position = np.nan_to_num(bounds.speed / count, nan=np.inf)
+    limit = np.where(known, np.floor(speed * np.where(known, ratio, 1.0) + 1e-6), float(NO_LIMIT))
+    return np.minimum(np.minimum(limit, np.floor(by_position)), float(NO_LIMIT)).astype(np.int64)
+
+
 def _speed_unit(drives: WatchedDrives) -> str:
-    known = drives.description
-    return known.dictionary.find(VELOCITY).unit if known.has(VELOCITY) else ""
+    return unit_of(drives.description, velocity_object(drives.description))
 
 
 def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
@@ -162,7 +194,7 @@ def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rot
     ours = (velocity >= NO_LIMIT) & known_scale & told
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
-    braking = _rate(drives, QUICK_STOP_DECELERATION, rotor)
+    braking = _braking(drives, rotor)
     # The scale of a revolution may be mistaken: a speed in rpm is checked by positions, too.
     by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
@@ -312,8 +344,9 @@ def increments_per_count(unit: str, rotor: RotorAngle) -> Floats:
     scale = rotor.scale
     if base in (COUNTED, f"{COUNTED}^2"):
         return np.full(len(scale), number)
-    if base in BY_RATIO:
-        return np.where(scale > 1.0, number * scale / 60.0 * rotor.ratio, np.nan)
+    if base in (*BY_RATIO, TARGET_UNIT):
+        ratio = rotor.ratio * (rotor.set_point_ratio if base == TARGET_UNIT else 1.0)
+        return np.where(scale > 1.0, number * scale / 60.0 * ratio, np.nan)
     return np.where(scale > 1.0, number * scale / 60.0, np.nan) if base in BY_MINUTE else np.full(len(scale), np.nan)
 
 
@@ -328,7 +361,26 @@ def _rate(drives: WatchedDrives, key: Key, rotor: RotorAngle) -> Floats:
     known = drives.description
     if not known.has(key):
         return np.zeros(drives.num_axes)
-    count = increments_per_count(known.dictionary.find(key).unit, rotor)
+    count = increments_per_count(unit_of(known, key), rotor)
     if np.isnan(count).all():
         return np.zeros(drives.num_axes)
     return np.asarray(read_own(drives, key, 0) * np.nan_to_num(count), float)
+
+
+def vl_rate(speed: Integers, time: Integers, rotor: RotorAngle) -> Floats:
+    """Return a deceleration of vl [inc/s^2]; 0 where the scale or the speed is not known, infinite without a time."""
+    count = np.nan_to_num(increments_per_count(BY_RATIO[0], rotor))
+    return np.asarray(np.where(time > 0, speed * count / np.maximum(time, 1), np.where(speed > 0, np.inf, 0.0)), float)
+
+
+def read_vl_rate(drives: WatchedDrives, keys: tuple[Key, Key], rotor: RotorAngle) -> Floats:
+    """Return the deceleration of a ramp of vl [inc/s^2], as `vl_rate` has it; 0 where the drive has none."""
+    speed, time = (read_own(drives, key, absent) for key, absent in zip(keys, (0, 1), strict=True))
+    return vl_rate(speed, time, rotor)
+
+
+def _braking(drives: WatchedDrives, rotor: RotorAngle) -> Floats:
+    """Return the deceleration of a quick stop [inc/s^2]: of 6085h and, in vl, 604Ah the least that is known."""
+    ramps = np.array([_rate(drives, QUICK_STOP_DECELERATION, rotor), read_vl_rate(drives, VL_QUICK_STOP, rotor)])
+    least = np.where(ramps > 0.0, ramps, np.inf).min(axis=0)
+    return np.where(np.isfinite(least), least, 0.0)

@@ -24,6 +24,10 @@ from drive_env.safety.bounds import (
     current_scales,
     increments_per_count,
     read_own,
+    read_vl_rate,
+    speed_in,
+    unit_of,
+    vl_rate,
 )
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
@@ -49,8 +53,10 @@ from drive_env.safety.objects import (
     TARGET_VELOCITY,
     TORQUE_OFFSET,
     UNRAMPED_MODES,
-    VELOCITY,
     VELOCITY_OFFSET,
+    VL,
+    VL_QUICK_STOP,
+    VL_TARGET,
 )
 from drive_env.safety.rotor import scale_objects
 from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
@@ -63,6 +69,7 @@ if TYPE_CHECKING:
 # Objects whose magnitude is a command, and which limit holds it.
 _MAGNITUDES = {
     TARGET_VELOCITY: "velocity",
+    VL_TARGET: "velocity",
     PROFILE_VELOCITY: "velocity",
     HOMING_SPEED_TO_SWITCH: "velocity",
     HOMING_SPEED_TO_ZERO: "velocity",
@@ -112,7 +119,8 @@ class Commands:
 
     def check_play(self, played: Mapping[Entry, Integers], words: Integers | None) -> None:
         """Raise SafetyError for rows that would pass a limit; `words` are those of the controlword among them."""
-        relative = words is not None and bool(np.any(words & cia402.RELATIVE))
+        has_target = self._drives.description.has(TARGET_POSITION)
+        relative = has_target and words is not None and bool(np.any(words & cia402.RELATIVE))
         for entry, rows in played.items():
             key = (entry.index, entry.sub)
             if rows.shape[0] == 0:
@@ -171,7 +179,7 @@ class Commands:
 
     def _speed_count(self) -> Floats:
         """Return the increments a second of a count of 60FFh; 0 where its unit tells none."""
-        return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
+        return np.nan_to_num(increments_per_count(unit_of(self._drives.description, TARGET_VELOCITY), self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
         """Forget a set-point, all by default, after a node reset or where the last write may not have arrived."""
@@ -278,6 +286,8 @@ class Commands:
                 self._check_jumps(entry, raw + other, where)
         elif key == QUICK_STOP_DECELERATION:
             self._check_braking(entry, raw, where)
+        elif key in VL_QUICK_STOP:
+            self._check_vl_braking(entry, raw, where)
         elif key == MODE:
             self.check_modes(where & self._axes.may_turn, raw)
             self._check_mode_room(raw, where & self._axes.live)
@@ -411,6 +421,7 @@ class Commands:
             limit, raw = self._own_current_limit(), np.floor(raw * counts_per_limit(self._drives)).astype(np.int64)
         elif key in _MAGNITUDES:
             limit = getattr(self._limits.bounds(), _MAGNITUDES[key])
+            limit = self._speed_in(key, limit) if _MAGNITUDES[key] == "velocity" else limit
         else:
             return
         name = _MAGNITUDES.get(key, "current")
@@ -436,6 +447,10 @@ class Commands:
                 f"less, or raise {remedy}"
             )
 
+    def _speed_in(self, key: Key, limit: NDArray[Any]) -> NDArray[Any]:
+        """Return a limit of speed [counts of what shows the speed] in counts of an object."""
+        return speed_in(key, limit, self._limits.bounds(), self._drives, self._axes.rotor)
+
     def _own_current_limit(self) -> Integers:
         """Return how high the drive's own current limit may be set: to the user's, or to anything."""
         user = given(self._limits.user.current, self._drives.num_axes)
@@ -448,7 +463,30 @@ class Commands:
         if not where.any():
             return
         raw = np.atleast_2d(raw).min(axis=0)
-        ramp = raw * np.nan_to_num(count)
+        ramp: Floats = np.asarray(raw * np.nan_to_num(count), float)
+        self._check_stops_turning(entry, raw, ramp, where)
+        axes = where & self._axes.may_turn
+        if np.any(slow := axes & (ramp < self._unramped_ramp())):
+            self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), ramp)
+        in_vl = np.any(read_vl_rate(self._drives, VL_QUICK_STOP, self._axes.rotor) > 0.0)  # which has its own ramp
+        modes = np.where(in_vl & (self._modes() == VL), 0, self._modes())
+        self._check_speeds(axes, modes, {**RUNNING_SPEEDS, **MOVING_SPEEDS}, raw * STOP_WITHIN)
+
+    def _check_vl_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Raise SafetyError for a ramp of a quick stop in vl that would let an axis that is turning run on."""
+        other = [read_own(self._drives, key, 0) for key in VL_QUICK_STOP]
+        is_speed = (entry.index, entry.sub) == VL_QUICK_STOP[0]
+        raw = np.atleast_2d(raw)
+        raw = raw.min(axis=0) if is_speed else raw.max(axis=0)
+        ramp = vl_rate(*((raw, other[1]) if is_speed else (other[0], raw)), self._axes.rotor)
+        where = where & (self._modes() == VL) & np.isfinite(ramp)
+        self._check_stops_turning(entry, raw, ramp, where)
+        count = np.nan_to_num(self._limits.bounds().count, nan=1.0)
+        limit = np.floor(np.where(where, ramp, 0.0) * STOP_WITHIN / count + 1e-6).astype(np.int64)
+        self._check_speeds(where & self._axes.may_turn, self._modes(), {VL: RUNNING_SPEEDS[VL]}, limit)
+
+    def _check_stops_turning(self, entry: Entry, raw: Integers, ramp: Floats, where: Mask) -> None:
+        """Raise SafetyError for a ramp [inc/s^2] that does not stop an axis soon enough from the speed that it has."""
         wrong = np.flatnonzero(where & self._axes.live & (ramp * STOP_WITHIN < np.abs(self._axes.velocity)))
         if wrong.size:
             axis = int(wrong[0])
@@ -456,10 +494,6 @@ class Commands:
                 f"axis {axis}: {entry.label} = {raw[axis]} would not stop it within {STOP_WITHIN:g} s from its "
                 f"{abs(self._axes.velocity[axis]):.0f} pps; nothing was sent. Choose more, or stop it first"
             )
-        axes = where & self._axes.may_turn
-        if np.any(slow := axes & (ramp < self._unramped_ramp())):
-            self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), ramp)
-        self._check_speeds(axes, self._modes(), {**RUNNING_SPEEDS, **MOVING_SPEEDS}, raw * STOP_WITHIN)
 
     def check_modes(
         self, axes: Mask, modes: Integers | None = None, played: Mapping[Entry, Integers] | None = None
@@ -495,11 +529,12 @@ class Commands:
         if not axes.any():
             return
         bounds = self._limits.bounds()
-        speed = np.abs(read_own(self._drives, VELOCITY, 0))
+        shows = self._axes.velocity_object
+        speed = np.abs(read_own(self._drives, shows, 0))
         wrong = axes & ((speed > bounds.velocity) | (np.abs(self._axes.speed) > bounds.speed))
         for axis in np.flatnonzero(wrong).tolist():
             raise SafetyError(
-                f"axis {axis}: it turns though it is off, {speed[axis]} by 606Ch, beyond the limit "
+                f"axis {axis}: it turns though it is off, {speed[axis]} by {shows[0]:04X}h, beyond the limit "
                 f"{int(bounds.velocity[axis])}; it was not enabled. Wait until it is slower, or raise "
                 f"{self._velocity_origin(axis)}"
             )
@@ -533,10 +568,11 @@ class Commands:
                 if played_keys & set(keys):
                     continue
                 value = sum((read_own(self._drives, key, 0) for key in keys), np.zeros(len(axes), np.int64))
-                for axis in np.flatnonzero(chosen & (np.abs(value) > limit)).tolist():
+                most = self._speed_in(keys[0], limit)
+                for axis in np.flatnonzero(chosen & (np.abs(value) > most)).tolist():
                     names = " + ".join(self._known.find(key).label for key in keys if self._drives.description.has(key))
                     raise SafetyError(
-                        f"axis {axis}: its drive has {names} = {value[axis]}, beyond the limit {int(limit[axis])}; "
+                        f"axis {axis}: its drive has {names} = {value[axis]}, beyond the limit {int(most[axis])}; "
                         f"nothing was sent. Write less there first, or raise {self._velocity_origin(axis)}"
                     )
 
@@ -567,7 +603,8 @@ class Commands:
         bounds = self._limits.bounds()
         by_ramp = bounds.braking[axis] * STOP_WITHIN / np.nan_to_num(bounds.count[axis], nan=1.0)
         if 0.0 < by_ramp <= bounds.velocity[axis] + 1e-6:
-            return f"the quick stop's ramp, 6085h: no axis may be faster than it stops within {STOP_WITHIN:g} s"
+            in_vl = " (in vl 604Ah)" if self._drives.description.has(VL_QUICK_STOP[0]) else ""
+            return f"the quick stop's ramp, 6085h{in_vl}: no axis may be faster than it stops within {STOP_WITHIN:g} s"
         if bounds.default_speed[axis]:
             return "Limits(velocity=...): this drive has no limit of its own; 6,000 rpm is used"
         return self._limits.origin(self._limits.user.velocity, "velocity", "607Fh")

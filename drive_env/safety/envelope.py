@@ -54,6 +54,7 @@ from drive_env.safety.objects import (
     SET_POINTS,
     STATUSWORD,
     STORE,
+    VL_QUICK_STOP,
 )
 from drive_env.safety.rotor import HOME_OFFSET, scale_objects
 from drive_env.safety.stop_runner import RAMPS, SLOW_DOWN_RAMPS, StopRunner
@@ -72,7 +73,7 @@ DEVICE_OBJECTS = 0x2000  # below are those of communication
 # Limits of the drives themselves, and what tells their stopping distance.
 _BOUNDS = (
     POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, QUICK_STOP_DECELERATION, ACCELERATION,
-    DECELERATION, HOME_OFFSET,
+    DECELERATION, HOME_OFFSET, *VL_QUICK_STOP,
 )  # fmt: skip
 
 
@@ -574,9 +575,9 @@ class Envelope:
 
     def _brake(self, axes: Mask) -> None:
         """Bring axes that turn to rest before their voltage is taken away; then it is."""
+        rest = self._limits.bounds().rest  # also how a speed counts that is looked at
         if self._drives.is_dry or not self._watch.look_for_live():
             return
-        rest = self._limits.bounds().rest
         turning = axes & self._axes.live & (np.maximum(np.abs(self._axes.speed), np.abs(self._axes.velocity)) > rest)
         if turning.any():
             self._arm()  # also axes that another program has enabled, once they are ours to stop

@@ -14,7 +14,7 @@ from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import LimitsInForce, bound_text
-from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, PP, STATUSWORD, VELOCITY
+from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, PP, STATUSWORD
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
 from drive_env.safety.rotor import wrapped
 from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, is_led, sees_demand
@@ -62,9 +62,9 @@ class Judging:
         if not judged.any():
             return
         bounds = self._limits.bounds()
-        if VELOCITY in rows:
-            fastest = np.abs(rows[VELOCITY]).max(axis=0)
-            self._trip(judged, fastest, bounds.velocity, VELOCITY, "lower the profile velocity or the target")
+        if (shows := self._axes.velocity_object) in rows:
+            fastest = np.abs(rows[shows]).max(axis=0)
+            self._trip(judged, fastest, bounds.velocity, shows, "lower the profile velocity or the target")
         if POSITION in rows:
             self._judge_speed(judged, bounds)
         self._stop_ends.take(rows, bounds)

@@ -24,10 +24,11 @@ from drive_env.safety.bounds import (
     read_bounds,
     read_own,
     rotor_limits,
+    speed_in,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.objects import POSITION
-from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
+from drive_env.safety.objects import POSITION, VL_MAX
+from drive_env.safety.rotor import HOME_OFFSET, read_ratios, read_scale
 from mechanics.arrays import Floats, Integers
 
 if TYPE_CHECKING:
@@ -82,9 +83,9 @@ class LimitsInForce:
     def keep_place(self) -> None:
         """Note where the rotors are before an object is written that moves their scale; `place` is called after it."""
         position, scale = read_own(self._drives, POSITION, 0), read_scale(self._drives)
-        ratio = read_ratio(self._drives)
+        ratios = read_ratios(self._drives)
         with self._axes.lock:
-            self._axes.rotor.ratio = ratio
+            self._axes.rotor.ratio, self._axes.rotor.set_point_ratio = ratios
             self._axes.place(position, scale)
             self._axes.keep_place()
 
@@ -96,6 +97,13 @@ class LimitsInForce:
     def _capture(self) -> RotorLimits:
         """Return the user's limits as the rotors' own, at the scale and zero of now."""
         user = self.user
+        if not self._drives.description.has(POSITION):
+            for name, value in (("position", user.position), ("following_error", user.following_error)):
+                if value is not None:
+                    raise ValueError(
+                        f"Limits({name}=...): the drive shows no position (it has no 6064h), so that nothing could be "
+                        "held against it; leave it out, and give Limits(velocity=...)"
+                    )
         if not (user.position is None and user.velocity is None and user.following_error is None):
             self.place()
         return rotor_limits(user, self._drives, self._axes.rotor, self._axes.position)
@@ -103,9 +111,9 @@ class LimitsInForce:
     def place(self) -> None:
         """Read where the rotors are and the scale of a revolution; changes of scale or zero have not moved them."""
         position = read_own(self._drives, POSITION, 0)
-        scale, ratio = read_scale(self._drives), read_ratio(self._drives)
+        scale, ratios = read_scale(self._drives), read_ratios(self._drives)
         with self._axes.lock:
-            self._axes.rotor.ratio = ratio
+            self._axes.rotor.ratio, self._axes.rotor.set_point_ratio = ratios
             self._axes.place(position, scale)
             self._must_place = False
             self.forget()
@@ -151,6 +159,9 @@ class LimitsInForce:
         ):
             if limit is not None:
                 wanted[key] = (np.where(highest < NO_LIMIT, highest, math.inf), True)
+        if self.user.velocity is not None:
+            most = speed_in(VL_MAX, bounds.velocity, bounds, self._drives, self._axes.rotor)
+            wanted[VL_MAX] = (np.where(most < NO_LIMIT, most, math.inf), True)
         if self.user.velocity is not None and self._axes.is_counted and np.all(self._axes.rotor.scale > 1.0):
             wanted[MAX_MOTOR_SPEED] = (np.ceil(60.0 * bounds.velocity / self._axes.rotor.scale), True)
         for key, (value, is_upper) in wanted.items():

@@ -14,7 +14,7 @@ from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import LimitsInForce
-from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
+from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Looks:
         bounds = self._limits.bounds()
         if self._watched is not None and self._watched[0] is bounds:
             return self._watched[1]
-        keys = [STATUSWORD, POSITION, VELOCITY]
+        keys = [STATUSWORD, POSITION, self._axes.velocity_object]
         if np.any(bounds.current < NO_LIMIT):
             keys.insert(2, CURRENT)
         if bounds.has_position or np.any(bounds.following < NO_LIMIT):

@@ -18,6 +18,13 @@ POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET = (
     (cia402.VELOCITY_OFFSET, 0),
     (cia402.TORQUE_OFFSET, 0),
 )
+VL_TARGET, VL_VELOCITY = (cia402.VL_TARGET_VELOCITY, 0), (cia402.VL_VELOCITY_ACTUAL, 0)
+VL_MAX = (cia402.VL_VELOCITY_LIMITS, 2)
+# A speed, and the time over which it is lost: by "disable operation", and by a quick stop.
+VL_DECELERATION, VL_QUICK_STOP = (
+    ((cia402.VL_DECELERATION, 1), (cia402.VL_DECELERATION, 2)),
+    ((cia402.VL_QUICK_STOP, 1), (cia402.VL_QUICK_STOP, 2)),
+)
 INTERPOLATED_POSITION = (cia402.INTERPOLATION_DATA, 1)
 PROFILE_VELOCITY, POSITIONING_OPTIONS = (cia402.PROFILE_VELOCITY, 0), (cia402.POSITIONING_OPTIONS, 0)
 HOMING_RAMP = (cia402.HOMING_ACCELERATION, 0)
@@ -37,13 +44,13 @@ DISABLE_OPERATION_OPTION, HALT_OPTION, FAULT_REACTION_OPTION = (
 # What makes an axis move, or changes how far: writing one arms the envelope.
 SET_POINTS = (
     TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
-    INTERPOLATED_POSITION,
+    INTERPOLATED_POSITION, VL_TARGET,
 )  # fmt: skip
 
-PP, PV, HM, IP, CSP, CSV = 1, 3, 6, 7, 8, 9  # modes of operation
+PP, VL, PV, HM, IP, CSP, CSV = 1, 2, 3, 6, 7, 8, 9  # modes of operation
 LED_MODES = (IP, CSP)  # by a position in each cycle
 TORQUE_MODES = (4, 10)
 UNRAMPED_MODES = (4, *LED_MODES, 10)  # tq, ip, csp, cst: no object says how fast what they command may become
 # What sets the speed of a mode, sums in brackets: from when the mode is on, and from when a move is started.
-RUNNING_SPEEDS = {PV: ((TARGET_VELOCITY,),), CSV: ((TARGET_VELOCITY, VELOCITY_OFFSET),)}
+RUNNING_SPEEDS = {VL: ((VL_TARGET,),), PV: ((TARGET_VELOCITY,),), CSV: ((TARGET_VELOCITY, VELOCITY_OFFSET),)}
 MOVING_SPEEDS = {PP: ((PROFILE_VELOCITY,),), HM: ((HOMING_SPEED_TO_SWITCH,), (HOMING_SPEED_TO_ZERO,))}

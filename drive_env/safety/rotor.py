@@ -8,7 +8,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
+from drive_env.dictionary.position_scale import PositionScale, position_scale, set_point_ratio, velocity_ratio
 from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.errors import RefusedError
 from mechanics.arrays import Floats, Integers
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 
+TURN = 65536.0  # increments of a revolution of drives without a position
 HOME_OFFSET = (cia402.HOME_OFFSET, 0)
 
 
@@ -40,6 +41,7 @@ class RotorAngle:
         self._turns = np.zeros(num_axes)
         self.scale = np.ones(num_axes)  # increments per revolution; 1 where the drive does not say
         self.ratio = np.ones(num_axes)  # rpm of a velocity unit, of drives that have such
+        self.set_point_ratio = np.ones(num_axes)  # velocity units of a target of vl, of drives that have 604Bh
         self.is_placed = False
 
     def place(self, increments: Integers, scale: Floats, turns: Floats | None = None) -> None:
@@ -67,23 +69,28 @@ def _own_scale(description: Description) -> PositionScale | None:
 
 
 def scale_objects(description: Description) -> tuple[Key, ...]:
-    """Return the objects that say how many increments a revolution has, and how many rpm a velocity unit."""
-    ratio = _own_ratio(description)
-    return _position_objects(description) + (() if ratio is None else ratio.keys)
+    """Return the objects that say how many increments a revolution has, and how many rpm a unit of velocity."""
+    roles = description.dictionary.roles
+    ratios = (_there(description, ratio) for ratio in (velocity_ratio(roles), set_point_ratio(roles)))
+    return _position_objects(description) + tuple(key for ratio in ratios if ratio is not None for key in ratio.keys)
 
 
-def _own_ratio(description: Description) -> PositionScale | None:
-    ratio = velocity_ratio(description.dictionary.roles)
+def _there(description: Description, ratio: PositionScale | None) -> PositionScale | None:
     return ratio if ratio is not None and all(description.has(key) for key in ratio.keys) else None
 
 
-def read_ratio(drives: WatchedDrives) -> Floats:
-    """Return the rpm of a velocity unit of every axis; 1 of drives that have no such unit."""
-    ratio = _own_ratio(drives.description)
-    if ratio is None:
+def read_ratios(drives: WatchedDrives) -> tuple[Floats, Floats]:
+    """Return the rpm of a velocity unit of every axis, and the velocity units of a target of vl; 1 without such."""
+    roles = drives.description.dictionary.roles
+    return _read(drives, velocity_ratio(roles)), _read(drives, set_point_ratio(roles))
+
+
+def _read(drives: WatchedDrives, ratio: PositionScale | None) -> Floats:
+    there = _there(drives.description, ratio)
+    if there is None:
         return np.ones(drives.num_axes)
     known = drives.description.dictionary
-    return ratio.increments([drives.read_entry(known.find(key)).astype(float) for key in ratio.keys])
+    return there.increments([drives.read_entry(known.find(key)).astype(float) for key in there.keys])
 
 
 def _position_objects(description: Description) -> tuple[Key, ...]:
@@ -99,7 +106,13 @@ def _position_objects(description: Description) -> tuple[Key, ...]:
 
 
 def read_scale(drives: WatchedDrives) -> Floats:
-    """Return the increments of a revolution of every axis; nan where the drive does not say."""
+    """Return the increments of a revolution of every axis; nan where the drive does not say.
+
+    A drive that shows the speed of vl and no position has none: it tells rpm, counted in parts of a turn of ours.
+    """
+    has = drives.description.has
+    if has((cia402.VL_VELOCITY_ACTUAL, 0)) and not has((cia402.POSITION_ACTUAL, 0)):
+        return np.full(drives.num_axes, TURN)
     keys = _position_objects(drives.description)
     known = drives.description.dictionary
     try:

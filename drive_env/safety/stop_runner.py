@@ -15,7 +15,7 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
-from drive_env.safety.bounds import increments_per_count, read_own
+from drive_env.safety.bounds import increments_per_count, read_own, read_vl_rate, unit_of
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
@@ -30,6 +30,8 @@ from drive_env.safety.objects import (
     MODE,
     PV,
     QUICK_STOP_OPTION,
+    VL,
+    VL_DECELERATION,
 )
 from drive_env.safety.stop_ends import LATENCY, ends_by_itself, outside, stop_way
 from drive_env.safety.stopping import GRACE, REPEAT, SHARE, AxisStop, Phase, Sample, Stop
@@ -53,8 +55,13 @@ RAMPS = {
     FAULT_REACTION_OPTION: {COASTS: 2, 1: 2},
 }
 # What "disable operation" may ramp by, and in which modes: in all of them 6084h; some drives have one ramp for both
-# ways in pv, and another in hm.
-SLOW_DOWN_RAMPS = {(cia402.PROFILE_DECELERATION, 0): (), (cia402.PROFILE_ACCELERATION, 0): (PV,), HOMING_RAMP: (HM,)}
+# ways in pv, and another in hm and vl.
+SLOW_DOWN_RAMPS = {
+    (cia402.PROFILE_DECELERATION, 0): (),
+    (cia402.PROFILE_ACCELERATION, 0): (PV,),
+    HOMING_RAMP: (HM,),
+    **dict.fromkeys(VL_DECELERATION, (VL,)),
+}
 # Option codes of 605Ah that end in switch on disabled, and those with the same ramp that end in quick stop active.
 _ENDS_HELD = {1: 5, 2: 6}
 
@@ -171,8 +178,10 @@ class StopRunner:
         for key, modes in SLOW_DOWN_RAMPS.items():
             if not self._drives.description.has(key):
                 continue
-            count = increments_per_count(self._known.find(key).unit, self._axes.rotor)
-            own = read_own(self._drives, key, 0) * np.nan_to_num(count)
+            count = increments_per_count(unit_of(self._drives.description, key), self._axes.rotor)
+            own: Floats = np.asarray(read_own(self._drives, key, 0) * np.nan_to_num(count), float)
+            if key in VL_DECELERATION:
+                own = read_vl_rate(self._drives, VL_DECELERATION, self._axes.rotor)
             counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode without a ramp of its own has 6084h
             ramp = np.where(counts & np.isin(self._axes.mode, modes or self._axes.mode), np.minimum(ramp, own), ramp)
         return ramp

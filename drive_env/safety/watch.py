@@ -20,7 +20,7 @@ from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.judging import Judging
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.looks import Looks
-from drive_env.safety.objects import CONTROLWORD, CURRENT, MODE_DISPLAY, POSITION, STATUSWORD, VELOCITY
+from drive_env.safety.objects import CONTROLWORD, CURRENT, MODE_DISPLAY, POSITION, STATUSWORD, VL_VELOCITY
 from drive_env.safety.stop_runner import StopRunner
 from drive_env.safety.stopping import BLIND as BLIND_TIMEOUT
 from drive_env.safety.stopping import LONGEST_FOLLOWING, LOST, RAMP_TIMEOUT
@@ -173,11 +173,9 @@ class Watch:
         """See every axis once, or raise SafetyError: an axis that cannot be seen is not moved."""
         if self._drives.is_dry:
             return
-        missing = [
-            label
-            for key, label in ((POSITION, "6064h"), (STATUSWORD, "6041h"))
-            if not self._drives.description.has(key)
-        ]
+        has = self._drives.description.has
+        needed = ((has(POSITION) or has(VL_VELOCITY), "6064h"), (has(STATUSWORD), "6041h"))
+        missing = [label for is_there, label in needed if not is_there]
         if missing:
             raise SafetyError(f"the EDS has no {', '.join(missing)}: the drives cannot be monitored; complete the EDS")
         if not self._drives.time_waits:
@@ -246,9 +244,8 @@ class Watch:
 
     def look_for_live(self) -> bool:
         """Return whether an axis is live, by the drives' present statuswords; one that does not answer is as before."""
-        entries = (
-            self._known.find(key) for key in (STATUSWORD, POSITION, VELOCITY) if self._drives.description.has(key)
-        )
+        keys = (STATUSWORD, POSITION, self._axes.velocity_object)
+        entries = (self._known.find(key) for key in keys if self._drives.description.has(key))
         with contextlib.suppress(SafetyError):  # the caller is about to stop; beyond a limit the stop has begun
             self.looks.ask(list(entries))
         return bool(self._axes.may_turn.any())
@@ -289,8 +286,8 @@ class Watch:
         except BusError as error:
             logger.error("%s", error)
             self._axes.clock += SILENT_CYCLE
-        there = [key for key in (STATUSWORD, POSITION, VELOCITY, CURRENT) if self._drives.description.has(key)]
-        self.looks.ask([self._known.find(key) for key in there])
+        keys = (STATUSWORD, POSITION, self._axes.velocity_object, CURRENT)
+        self.looks.ask([self._known.find(key) for key in keys if self._drives.description.has(key)])
         self._axes.clock += self._drives.description.cycle
         with self._axes.lock:
             if self._stops.current is not None:

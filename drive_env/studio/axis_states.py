@@ -27,7 +27,7 @@ QUICK = 0.08  # s between two pictures of what is sampled
 SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
 INPUTS = ("negative limit switch", "positive limit switch", "home switch")  # bits 0 to 2 of 60FDh
 MODE_NAMES = {
-    "pp": "profile position", "pv": "profile velocity", "tq": "profile torque", "hm": "homing",
+    "pp": "profile position", "vl": "velocity", "pv": "profile velocity", "tq": "profile torque", "hm": "homing",
     "ip": "interpolated position", "csp": "cyclic synchronous position", "csv": "cyclic synchronous velocity",
     "cst": "cyclic synchronous torque",
 }  # fmt: skip

@@ -7,6 +7,8 @@ demands, loop_level, drive_function, theta_m, omega_m and tau_reaction.
 
 from __future__ import annotations
 
+import math
+
 from drive_env.firmware.record import EMERGENCY_QUEUE, MAX_SUBSTEPS, Field
 
 PARAMETERS = (
@@ -40,6 +42,18 @@ PARAMETERS = (
     Field("acceleration", "f8", "rad/s^2", "6083h"),
     Field("deceleration", "f8", "rad/s^2", "6084h"),
     Field("quick_stop_deceleration", "f8", "rad/s^2", "6085h"),
+    # Of the velocity mode of frequency inverters; a drive without it leaves them so.
+    Field("vl_target", "f8", "rad/s", "6042h"),
+    Field("vl_min", "f8", "rad/s", "6046h:01: least speed of what turns"),
+    Field("vl_max", "f8", "rad/s", "6046h:02: highest speed", math.inf),
+    Field("vl_acceleration_speed", "f8", "rad/s", "6048h:01: gained in 6048h:02; 0: the axis does not speed up"),
+    Field("vl_acceleration_time", "f8", "s", "6048h:02; 0: at once", 1.0),
+    Field("vl_deceleration_speed", "f8", "rad/s", "6049h:01: lost in 6049h:02; 0: as 6048h"),
+    Field("vl_deceleration_time", "f8", "s", "6049h:02; 0: at once", 1.0),
+    Field("vl_quick_stop_speed", "f8", "rad/s", "604Ah:01: lost in 604Ah:02 at a quick stop; 0: as 6085h"),
+    Field("vl_quick_stop_time", "f8", "s", "604Ah:02; 0: at once", 1.0),
+    Field("velocity_ratio", "f8", "rpm", "604Ch, or 6094h: of a velocity unit", 1.0),
+    Field("set_point_ratio", "f8", "1", "604Bh: velocity units of 6042h and 6043h", 1.0),
     # Of a six-point ramp; a drive without one leaves them 0.
     Field("start_velocity", "f8", "rad/s", "2010h: jumped to at the beginning of a ramp"),
     Field("end_velocity", "f8", "rad/s", "6082h: jumped from at its end, or where the ramp of 2014h begins"),
@@ -75,6 +89,7 @@ PARAMETERS = (
     Field("set_point_buffer", "i4", "", "1: pp keeps a second set-point while it moves to the first"),
     Field("pv_slows_down_by_6084h", "i4", "", "1: pv slows down with 6084h; 0: with 6083h, as it speeds up"),
     Field("pv_starts_and_stops", "i4", "", "1: pv jumps to the start velocity, and from the end velocity"),
+    Field("homing_here_sets_zero", "i4", "", "1: methods 35 and 37 leave 607Ch out"),
     # --- data of the device and of its power stage ----------------------------------------------------------------
     Field("undervoltage", "f8", "V", "limit below which the stage is cut"),
     Field("overvoltage", "f8", "V", "limit above which the stage is cut"),

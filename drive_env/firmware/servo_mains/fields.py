@@ -6,7 +6,6 @@ Names that a device binds, or a test reads:
 - i_low, i_high: what C-LimN, C-LimP, M-Ipeak and the image leave of the current [A]; i_max is the greater of them
 - target_torque: 6071h [A]: set-point of cst and pt, feed-forward in csp and ip, with torque_offset (loops.py)
 - image_limit: current limit of the process images, raw: 0 none, 32767 no current at all
-- velocity_ratio: 6094h: rpm of a velocity unit; only units read it
 - d_mode: 2303h, 2403h;  d_mode_needed: by mode of operation, 0 any (d_mode.py)
 - profile_shape: 6086h as it is, -3 to 1 (common/shaped.py)
 - following_error_time: 6066h [s]
@@ -61,7 +60,6 @@ PARAMETERS = (
     Field("profile_position", "f8", "rad", "DPosAngle and DPosRevol"),
     Field("profile_mode", "i4", "", "Mode of the profile generator: 0 speed, 1 position", 1),
     Field("image_limit", "f8", "1/32767", "share of M-Ipeak that is taken away: 0 none, 32767 all"),
-    Field("velocity_ratio", "f8", "rpm", "6094h: of a velocity unit", 1.0),
     Field("profile_bits", "f8", "", "BitsPerRevol: only units read it", 16.0),
     Field("d_mode", "i4", "", "2303h, 2403h"),
     Field("following_error_time", "f8", "s", "6066h: for which the error may be outside of 6065h"),

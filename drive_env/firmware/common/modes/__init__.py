@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa, profiles, protection, start_up
-from drive_env.firmware.common.modes import csp, cst, csv, cyclic, hm, idle, pp, pv
+from drive_env.firmware.common.modes import csp, cst, csv, cyclic, hm, idle, pp, pv, vl
 from mechanics.compiled import stage
 
 
@@ -23,6 +23,7 @@ class Mode(NamedTuple):
 MODES = (
     Mode(0, "no", "No mode", None, 1),
     Mode(cia402.PP, "pp", "Profile position mode", 0, 2),
+    Mode(cia402.VL, "vl", "Velocity mode", 1, 1),
     Mode(cia402.PV, "pv", "Profile velocity mode", 2, 1),
     Mode(cia402.TQ, "tq", "Profile torque mode", 3, 0),
     Mode(cia402.HM, "hm", "Homing mode", 5, 2),
@@ -32,7 +33,7 @@ MODES = (
     Mode(cia402.CST, "cst", "Cyclic synchronous torque mode", 9, 0),
 )
 PP, PV, HM, CSP, CSV, CST = cia402.PP, cia402.PV, cia402.HM, cia402.CSP, cia402.CSV, cia402.CST
-TQ, IP = cia402.TQ, cia402.IP
+TQ, IP, VL = cia402.TQ, cia402.IP, cia402.VL
 
 
 @stage
@@ -55,7 +56,15 @@ def slow_down_ramp(drive, lane):
         rate = drive.deceleration[lane]
     if drive.mode_display[lane] == PV:
         return pv.slow_down_ramp(drive, lane)
+    if drive.mode_display[lane] == VL:
+        return vl.slow_down_ramp(drive, lane)
     return rate if rate > 0.0 else drive.acceleration[lane]
+
+
+@stage
+def quick_stop_ramp(drive, lane):
+    """Return the deceleration of a quick stop [rad/s^2] in the mode in use."""
+    return vl.quick_stop_ramp(drive, lane) if drive.mode_display[lane] == VL else drive.quick_stop_deceleration[lane]
 
 
 @stage
@@ -64,7 +73,7 @@ def stop_ramp(drive, lane):
     state = drive.fsa[lane]
     option = drive.quick_stop_option[lane]
     if state == fsa.REACTING or (state == fsa.STOPPING and (option == 2 or option == 6)):
-        return drive.quick_stop_deceleration[lane]
+        return quick_stop_ramp(drive, lane)
     return slow_down_ramp(drive, lane)
 
 
@@ -156,6 +165,8 @@ def asked_direction(drive, lane):
         way = drive.profile_target[lane] - drive.position_demand[lane] if drive.set_point_valid[lane] == 1 else 0.0
     elif mode == PV:
         way = drive.target_velocity[lane]
+    elif mode == VL:
+        way = vl.ramp_input(drive, lane)
     elif mode == CSP and drive.set_point_steps[lane] != cyclic.NO_SET_POINT:
         way = drive.target_position[lane] + drive.position_offset[lane] - drive.position_demand[lane]
     elif mode == CSV:
@@ -180,6 +191,8 @@ def follow(drive, lane, mode, dt):
         pp.generate(drive, lane, slow_down_ramp(drive, lane), dt)
     elif mode == PV:
         pv.generate(drive, lane, dt)
+    elif mode == VL:
+        vl.generate(drive, lane, dt)
     elif mode == HM:
         hm.generate(drive, lane, dt)
     elif mode == CSP:
@@ -231,7 +244,7 @@ def generate_demand(drive, lane, dt):
         # CiA 402: with halt set, bit 10 tells that the axis has come to rest.
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
     elif is_blocked(drive, lane):
-        brake(drive, lane, drive.quick_stop_deceleration[lane], dt)
+        brake(drive, lane, quick_stop_ramp(drive, lane), dt)
         drive.internal_limit[lane] = 1
         drive.target_reached[lane] = 0
         if drive.velocity_demand[lane] == 0.0:

@@ -18,6 +18,8 @@ edge as the methods have them:
 A limit switch turns the search for a home switch round. The edge where a switch becomes active is found from the same
 edge where it was left: slowly off it, and back.
 
+Zero is at home plus 607Ch, so that home itself has the position -607Ch.
+
 A way of more than a turn without an index is one on which none comes: homing fails, rather than run into a stop.
 """
 
@@ -116,7 +118,8 @@ def start_or_stop(drive, lane, word_before):
             # Does not need operation enabled. At rest the demand is zero too, whatever is left of the position error.
             if drive.velocity_demand[lane] == 0.0:
                 drive.position_demand[lane] = drive.theta_meas[lane]
-            set_home(drive, lane, drive.theta_meas[lane], 0.0)
+            offset = 0.0 if drive.homing_here_sets_zero[lane] == 1 else drive.home_offset[lane]
+            set_home(drive, lane, drive.theta_meas[lane], -offset)
             drive.homing_state[lane] = DONE
             drive.homing_attained[lane] = 1
             drive.target_reached[lane] = 1

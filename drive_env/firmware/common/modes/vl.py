@@ -1,0 +1,79 @@
+"""Velocity mode of frequency inverters (CiA 402-2, IEC 61800-7-201: limit and ramp function, controlword).
+
+The target 6042h is limited by 6046h and followed by a ramp, each way by a speed over a time. Of the controlword
+
+    bit 4 = 0  the ramp is not used: the axis comes to rest, by 6049h (the standard leaves the way to the maker)
+    bit 5 = 0  the ramp's output is held
+    bit 6 = 0  the ramp's input is 0
+
+so that an axis that is enabled with none of them does not move, whatever 6042h says. A target of 0 is rest, and
+6046h:01 holds for the others: a drive may turn at 6046h:01 instead.
+"""
+
+from __future__ import annotations
+
+from drive_env import cia402
+from drive_env.firmware.common.modes import pv
+from mechanics.compiled import stage
+
+AT_ONCE = 1e9  # rad/s^2
+
+
+@stage
+def rate(speed, time):
+    """Return the acceleration [rad/s^2] of a speed [rad/s] over a time [s]; 0 without a speed, AT_ONCE for 0 s."""
+    if speed <= 0.0:
+        return 0.0
+    return speed / time if time > 0.0 else AT_ONCE
+
+
+@stage
+def slow_down_ramp(drive, lane):
+    """Return the deceleration of the mode [rad/s^2]: 6049h, else 6048h; 0 where neither is set."""
+    down = rate(drive.vl_deceleration_speed[lane], drive.vl_deceleration_time[lane])
+    return down if down > 0.0 else rate(drive.vl_acceleration_speed[lane], drive.vl_acceleration_time[lane])
+
+
+@stage
+def quick_stop_ramp(drive, lane):
+    """Return the deceleration of a quick stop in this mode [rad/s^2]: 604Ah, else 6085h."""
+    down = rate(drive.vl_quick_stop_speed[lane], drive.vl_quick_stop_time[lane])
+    return down if down > 0.0 else drive.quick_stop_deceleration[lane]
+
+
+@stage
+def limited_target(drive, lane):
+    """Return 6042h [rad/s] within 6046h."""
+    target = drive.vl_target[lane]
+    if target == 0.0:
+        return 0.0
+    size = min(max(abs(target), drive.vl_min[lane]), drive.vl_max[lane])
+    return size if target > 0.0 else -size
+
+
+@stage
+def ramp_input(drive, lane):
+    """Return what the ramp leads to [rad/s], by bits 4 and 6 of the controlword."""
+    bits = cia402.ENABLE_RAMP | cia402.REFERENCE_RAMP
+    return limited_target(drive, lane) if drive.controlword[lane] & bits == bits else 0.0
+
+
+@stage
+def generate(drive, lane, dt):
+    """Ramp the velocity demand to the limited target; bit 11 tells that 6046h limits it, bit 10 that it is reached."""
+    drive.loop_level[lane] = 1
+    v = drive.velocity_demand[lane]
+    word = drive.controlword[lane]
+    if limited_target(drive, lane) != drive.vl_target[lane]:
+        drive.internal_limit[lane] = 1
+    v_new = v
+    if word & cia402.ENABLE_RAMP == 0 or word & cia402.UNLOCK_RAMP:
+        up = rate(drive.vl_acceleration_speed[lane], drive.vl_acceleration_time[lane])
+        down = slow_down_ramp(drive, lane)
+        target = ramp_input(drive, lane)
+        if up == 0.0:  # no faster than it is
+            target = min(max(target, min(v, 0.0)), max(v, 0.0))
+        v_new = pv.approach(drive, lane, v, target, up, down if down > 0.0 else AT_ONCE, dt)
+    drive.position_demand[lane] += 0.5 * (v + v_new) * dt
+    drive.velocity_demand[lane] = v_new
+    drive.target_reached[lane] = 1 if v_new == drive.vl_target[lane] else 0
