@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import pytest
+from rigs.chip_gains import chip_gains
 
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, bandwidths_from_gains, gains_from_bandwidths
+from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.motors import MOTORS
 
 DEVICE = find_device("tmcm1636")
@@ -28,7 +29,7 @@ W750 = table_motor(0.05, 0.1e-3, 0.11, 1.2e-4, 4, 48.0)
 
 def gains_of(motor, **bandwidths):
     wanted = {"current_hz": 1000.0, "velocity_hz": 50.0, "position_hz": 10.0, **bandwidths}
-    return gains_from_bandwidths(DEVICE, motor, 3.0 * motor.inertia, **wanted)
+    return chip_gains(DEVICE, motor, 3.0 * motor.inertia, **wanted)
 
 
 @pytest.mark.parametrize(("motor", "P", "I"), [(W20, 3015, 12815), (EC_I_40, 1438, 3284), (W750, 335, 1310)])
@@ -81,9 +82,7 @@ def test_the_largest_and_the_smallest_gain_are_allowed():
 
 def test_supply_changes_torque_p_alone():
     at_24 = gains_of(W20)
-    at_48 = gains_from_bandwidths(
-        DEVICE, W20, 3 * W20.inertia, current_hz=1000.0, velocity_hz=50.0, position_hz=10.0, supply=48.0
-    )
+    at_48 = chip_gains(DEVICE, W20, 3 * W20.inertia, current_hz=1000.0, velocity_hz=50.0, position_hz=10.0, supply=48.0)
     assert abs(at_48.torque_p - at_24.torque_p / 2) <= 1
     assert at_48[1:] == at_24[1:]
 
@@ -91,7 +90,7 @@ def test_supply_changes_torque_p_alone():
 @pytest.mark.parametrize("motor", [W20, EC_I_40, W750, MOTORS["qbl4208"], MOTORS["ec_i_40"]])
 def test_bandwidths_come_back_from_gains_within_rounding(motor):
     inertia = 3.0 * motor.inertia
-    gains = gains_from_bandwidths(DEVICE, motor, inertia, current_hz=1000.0, velocity_hz=60.0, position_hz=15.0)
+    gains = chip_gains(DEVICE, motor, inertia, current_hz=1000.0, velocity_hz=60.0, position_hz=15.0)
     back = bandwidths_from_gains(DEVICE, motor, inertia, gains)
     assert back.current_hz == pytest.approx(1000.0, rel=0.5 / gains.torque_p)
     assert back.velocity_hz == pytest.approx(60.0, rel=0.5 / gains.velocity_p)

@@ -24,7 +24,6 @@ from drive_env.devices.gains import (
     bandwidth_gains,
     bandwidths_from_gains,
     check_linear_model,
-    gains_from_bandwidths,
     gains_in_si,
 )
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
@@ -128,8 +127,6 @@ def test_bandwidths_become_its_integers_and_back(device):
     assert meaning.current_hz == pytest.approx(900.0, rel=0.005)  # by whole numbers: one of 140
     assert meaning.velocity_hz == pytest.approx(25.0, rel=0.01)
     assert meaning.position_hz == pytest.approx(6.0, rel=1e-4)
-    with pytest.raises(ValueError, match=r"has the gains position_gain, .*, not torque_p, .* take bandwidth_gains"):
-        gains_from_bandwidths(device, MOTOR, J, **wanted)
 
 
 def test_gains_in_si_have_its_names_in_its_order(device):

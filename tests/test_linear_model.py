@@ -5,11 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from rigs.chip_gains import chip_gains
 from scipy.linalg import expm
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, gains_from_bandwidths, gains_in_si
+from drive_env.devices.gains import Gains, gains_in_si
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.loop_trace import trace_loops
 from drive_env.loops.linear_model import (
@@ -33,9 +34,7 @@ from tuning.identify.identified_axis import Identification
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1.5e-5)
 ELASTIC = Plant.from_data_sheet(DEVICE, MOTOR, 24.0, 1.5e-5, anti_resonance=80.0, resonance=140.0, damping=0.02)
-GAINS = gains_from_bandwidths(
-    DEVICE, MOTOR, RIGID.inertia, current_hz=1000.0, velocity_hz=30.0, position_hz=5.0, supply=24.0
-)
+GAINS = chip_gains(DEVICE, MOTOR, RIGID.inertia, current_hz=1000.0, velocity_hz=30.0, position_hz=5.0, supply=24.0)
 TWO_PI = 2.0 * math.pi
 
 
@@ -147,7 +146,7 @@ def test_a_machine_without_faults_has_the_loop_that_the_model_computes(load):
         load=load, ideal=True, friction="none", parameters={"motor.encoder_interpolation": 65536.0}
     ) as drives:
         plant = true_plant(drives)
-        gains = gains_from_bandwidths(
+        gains = chip_gains(
             drives.device, drives.motor, plant.inertia, current_hz=1000.0, velocity_hz=20.0, position_hz=5.0
         )
         write_gains(drives, np.array([gains]))

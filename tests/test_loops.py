@@ -16,10 +16,10 @@ import re
 import numpy as np
 import pytest
 from numba import njit, typeof
+from rigs.chip_gains import chip_gains
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import gains_from_bandwidths
 from drive_env.emulator.group import rates_of
 from drive_env.firmware.cycle import mechanics_window
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
@@ -599,9 +599,9 @@ def test_makers_gains_give_a_stable_axis(ideal):
     assert np.ptp(trace[0x6064]) < 1500
 
 
-def test_gains_from_bandwidths_give_the_velocity_bandwidth_asked_for_on_the_default_motor():
+def test_gains_by_bandwidths_give_the_velocity_bandwidth_asked_for_on_the_default_motor():
     motor = MOTORS["qbl4208"]
-    gains = gains_from_bandwidths(
+    gains = chip_gains(
         find_device("tmcm1636"), motor, 3.0 * motor.inertia, current_hz=1000.0, velocity_hz=60.0, position_hz=6.0
     )
     frequency = 60.0 * np.array([0.75, 0.85, 1.0, 1.1, 1.25, 1.5])

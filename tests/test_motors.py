@@ -6,12 +6,12 @@ import re
 
 import numpy as np
 import pytest
+from rigs.chip_gains import chip_gains
 from rigs.tables import every_row
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.devices.commissioning import preset as rule
-from drive_env.devices.gains import gains_from_bandwidths
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import find_motor
 from mechanics.untrusted import read_toml
@@ -179,7 +179,7 @@ def test_what_is_written_is_for_a_motor_that_the_rule_serves_otherwise():
 
 @every_row("motor", MOTORS.values())
 def test_preset_gains_are_those_of_its_bandwidths(motor):
-    gains = gains_from_bandwidths(DEVICE, motor, 3.0 * motor.inertia, current_hz=1000, velocity_hz=20, position_hz=5)
+    gains = chip_gains(DEVICE, motor, 3.0 * motor.inertia, current_hz=1000, velocity_hz=20, position_hz=5)
     objects = DEVICE.preset(motor)
     written = (
         objects["Torque Mode Settings.Torque_P"],

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from rigs.chip_gains import chip_gains
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
@@ -16,7 +17,6 @@ from drive_env.devices.gains import (
     Gains,
     bandwidth_gains,
     bandwidths_from_gains,
-    gains_from_bandwidths,
     rule_gains,
     small_time_constants,
 )
@@ -256,7 +256,7 @@ def test_the_rule_is_its_formula_in_bandwidths():
     gains = rule_gains(DEVICE, MOTOR, J, rule)
     w_v = 0.2 / float(small_time_constants(DEVICE, 400.0))
     for k in range(2):
-        exact = gains_from_bandwidths(
+        exact = chip_gains(
             DEVICE, MOTOR, J[k], current_hz=1000.0, velocity_hz=w_v / 2 / np.pi, position_hz=0.25 * w_v / 2 / np.pi
         )
         assert np.abs(gains[k] - np.array(exact)).max() <= 1

@@ -65,7 +65,6 @@ def test_a_ring_keeps_the_newest_samples():
     assert rows.first == 4
     assert rows.t.tolist() == [4, 5, 6, 7, 8]
     assert rows.values[VELOCITY][:, 0].tolist() == [4, 5, 6, 7, 8]
-    assert ring.number_at(6.0) == 6
 
 
 def test_more_samples_than_a_ring_holds_at_once():

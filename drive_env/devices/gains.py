@@ -85,44 +85,6 @@ def gains_in_si(device: Device, supply: float, gains: RawGains) -> SiGains:
     )
 
 
-def gains_from_bandwidths(
-    device: Device,
-    motor: Motor,
-    inertia: float,
-    *,
-    current_hz: float,
-    velocity_hz: float,
-    position_hz: float,
-    supply: float | None = None,
-    integration: float = DEFAULT_INTEGRATION,
-) -> Gains:
-    """Return the raw gains for the bandwidths wanted, of a device whose gain set is that of the chip.
-
-    Args:
-        device: The drive.
-        motor: The motor.
-        inertia: Total inertia, rotor and load [kg*m^2].
-        current_hz: Bandwidth of the current loop [Hz].
-        velocity_hz: Bandwidth of the velocity loop [Hz].
-        position_hz: Gain k_v of the position loop over 2 pi [Hz].
-        supply: Supply voltage [V]; the motor's own by default.
-        integration: Integration time of the velocity loop as a multiple of 1/w_v.
-
-    Raises:
-        ValueError: If a gain leaves its range, or the device has other gains than the chip: `bandwidth_gains` has any.
-    """
-    if device.gains.names != Gains._fields:
-        raise ValueError(
-            f"{device.name} has the gains {', '.join(device.gains.names)}, not {', '.join(Gains._fields)}; take "
-            "bandwidth_gains, which returns those of any device"
-        )
-    raw = bandwidth_gains(
-        device, motor, inertia, current_hz=current_hz, velocity_hz=velocity_hz, position_hz=position_hz,
-        supply=supply, integration=integration,
-    )  # fmt: skip
-    return Gains(*raw.tolist())
-
-
 def bandwidth_gains(
     device: Device,
     motor: Motor,
@@ -134,7 +96,17 @@ def bandwidth_gains(
     supply: float | None = None,
     integration: float = DEFAULT_INTEGRATION,
 ) -> Integers:
-    """Return the device's gains for the bandwidths wanted, shape (count,); arguments as `gains_from_bandwidths` has.
+    """Return the device's gains for the bandwidths wanted, shape (count,).
+
+    Args:
+        device: The drive.
+        motor: The motor.
+        inertia: Total inertia, rotor and load [kg*m^2].
+        current_hz: Bandwidth of the current loop [Hz].
+        velocity_hz: Bandwidth of the velocity loop [Hz].
+        position_hz: Gain k_v of the position loop over 2 pi [Hz].
+        supply: Supply voltage [V]; the motor's own by default.
+        integration: Integration time of the velocity loop as a multiple of 1/w_v.
 
     Raises:
         ValueError: If a gain leaves its range, or the device names no cascade.

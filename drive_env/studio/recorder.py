@@ -69,17 +69,6 @@ class SampleRing:
         values = self._values[places]
         return RingSamples(first, self._t[places], {key: values[:, k] for k, key in enumerate(self.keys)})
 
-    def number_at(self, t: float) -> int:
-        """Return the number of the first sample that is not before a time [s]."""
-        low, high = self.oldest, self.total
-        while low < high:
-            middle = (low + high) // 2
-            if self._t[middle % self._capacity] < t:
-                low = middle + 1
-            else:
-                high = middle
-        return low
-
 
 class ScopeRecorder:
     """Keeps the samples of every call that lets time pass; read by any thread.
