@@ -39,6 +39,7 @@ class Corrections(NamedTuple):
     # Angle of an axis at the step's end, to add per displacement there as the leapfrog has it, and per speed [s].
     ends: Floats  # (C, A, D)
     ends_of_speed: Floats  # (C, A, D)
+    begin: Floats  # (C, D, D) displacement as the leapfrog has it, per displacement at rest
 
 
 def corrections(inertia: Floats, stiffness: Floats, damping: Floats, axes: Floats, h: float) -> Corrections:
@@ -83,9 +84,10 @@ def corrections(inertia: Floats, stiffness: Floats, damping: Floats, axes: Float
     begun = (1.0 - end * np.exp(-2.0 * d * h)) / h - d
     ends = axes @ shapes @ ((1.0 / alpha - 1.0)[:, :, None] * into_modes)
     ends_of_speed = axes @ shapes @ (((0.5 * h - beta) / alpha)[:, :, None] * into_modes)
+    begin = np.eye(len(index)) + shapes @ ((alpha - 1.0)[:, :, None] * into_modes)
     return Corrections(
         0.5 * h * w, coupling, shapes, corrected, weighted @ (begun[:, :, None] * into_modes), held, moment,
-        np.ascontiguousarray(np.swapaxes(kick, 1, 2)), ends, ends_of_speed,
+        np.ascontiguousarray(np.swapaxes(kick, 1, 2)), ends, ends_of_speed, begin,
     )  # fmt: skip
 
 

@@ -123,6 +123,7 @@ class PackedLoad:
             store(name, np.asarray(values, float), slice(None))
         self.data = mujoco.MjData(self.model)
         self.plant = self._new_plant()
+        self._begin = np.zeros((self.copies, self.num_dofs, self.num_dofs))
         if ready:
             self._apply()
             self.reset(np.ones(self.copies, bool))
@@ -193,6 +194,8 @@ class PackedLoad:
         """Put the copies where the mask is true to rest at their start; a frozen one lives again."""
         plant, data = self.plant, self.data
         self._by_copy(data.qpos)[where] = self.start
+        if self._elastic:
+            self._stagger(where)
         for array in (data.qvel, data.qfrc_applied, data.qacc_warmstart, plant.qvel_before):
             self._by_copy(array)[where] = 0.0
         plant.holding[:, where] = 0.0
@@ -201,7 +204,11 @@ class PackedLoad:
 
     def place(self, joint: int, position: Floats, where: Mask) -> None:
         """Put a joint of the copies where the mask is true to a position [rad or m], shape (copies,), at rest."""
+        if self._elastic:
+            self._stagger(where, back=True)
         self._by_copy(self.data.qpos)[where, joint] = position[where]
+        if self._elastic:
+            self._stagger(where)
         for array in (self.data.qvel, self.plant.qvel_before):
             self._by_copy(array)[where, joint] = 0.0
 
@@ -233,8 +240,7 @@ class PackedLoad:
         speed = self._by_copy(self.data.qvel)
         if element in self.joints:
             dof = self.joints.index(element)
-            position[where, dof] = self.plant.spring_zero[dof]
-            speed[where, dof] = before[where, dof] = 0.0
+            self.place(dof, np.full(self.copies, self.plant.spring_zero[dof]), where)
             return
         motion = next(row.motion for row in self.load.contacts if row.name == element)
         joint = next(name for name in motion if name not in self.load.joints)
@@ -278,6 +284,7 @@ class PackedLoad:
             "data": {name: getattr(self.data, name).copy() for name in self.template.data_arrays},
             "values": {name: getattr(self.values, name).copy() for name in VALUE_ARRAYS},
             "plant": self.plant.save_state(),
+            "begin": self._begin.copy(),
         }
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
@@ -287,6 +294,7 @@ class PackedLoad:
                 getattr(own, name)[...] = values
         self.model.stat.meaninertia = state["mean_inertia"]
         self.plant.restore_state(state["plant"])
+        self._begin[...] = state["begin"]
 
     def joint_positions(self) -> Floats:
         """Return the joints' positions [rad or m], shape (copies, D), half a step ago if staggered."""
@@ -295,6 +303,16 @@ class PackedLoad:
     # --- inside ---------------------------------------------------------------------------------------------------
     def _by_copy(self, array: Floats) -> Floats:
         return array.reshape(self.copies, self.num_dofs)
+
+    def _stagger(self, where: Mask, *, back: bool = False) -> None:
+        """Bring positions at rest of the copies where the mask is true to what the leapfrog has for them, or back.
+
+        It has a spring's displacement half a step later: without this, one that starts tense swings too far.
+        """
+        position, zero = self._by_copy(self.data.qpos), self.plant.spring_zero
+        begin = self._begin[where]
+        tense = (position[where] - zero)[:, :, None]
+        position[where] = zero + (np.linalg.solve(begin, tense) if back else begin @ tense)[:, :, 0]
 
     def _new_plant(self) -> PackedPlant:
         copies, dofs, axes = self.copies, self.num_dofs, self.num_axes
@@ -516,6 +534,8 @@ def _derive(loads: Sequence[PackedLoad], changed: NDArray[np.intp] | None = None
     derived["contact"] = _contacts(first, gathered("contact"), mass[first.num_frictions :], machines)
     for load, part in zip(loads, parts, strict=True):
         plant, values = load.plant, load.values
+        if first.staggered:
+            load._begin[copies] = found.begin[part]
         # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
         load._by_copy(load.model.jnt_stiffness)[:] = 0.0 if load.staggered else values.stiffness
         load._by_copy(load.model.dof_damping)[:] = values.damping * (0.5 if load.staggered else 1.0)

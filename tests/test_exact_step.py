@@ -166,6 +166,37 @@ def test_damping_that_couples_resonances_too_strongly_for_the_step_is_refused():
     machine_of("three_mass", damping=0.002)
 
 
+# --- starts -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("how", ["start", "place"])
+@pytest.mark.parametrize("damping_ratio", [0.0, 0.05])
+def test_a_shaft_that_starts_tense_swings_as_far_as_it_was_twisted(how, damping_ratio):
+    """400 Hz, 12.5 steps a period: angle and speed at the end of each step, from the first one on."""
+    J_L, w, twisted = 1e-5, 2.0 * math.pi * 400.0, 0.1
+    J_R = J_M + 1e-9  # with the MJCF's hub
+    k = w * w * J_R * J_L / (J_R + J_L)
+    load = LOADS["two_mass"]
+    if how == "start":
+        load = dataclasses.replace(load, start={"twist": twisted})
+    c = 2.0 * damping_ratio * k / w
+    row = {"inertia": J_L, "stiffness": k, "damping": c, "coulomb": 0.0, "breakaway": 0.0, "viscous": 0.0}
+    machine = machine_of(load, **row)
+    if how == "place":
+        machine.place(machine.joints.index("twist"), np.array([twisted]), np.array([True]))
+    theta, _, qvel = run(machine, np.zeros(500))
+    # No torque from outside: the twist swings alone, and the rotor has the load's share of it, the other way.
+    t = (np.arange(500) + 1) * H
+    d = damping_ratio * w
+    swing = math.sqrt(w * w - d * d)
+    twist = twisted * np.exp(-d * t) * (np.cos(swing * t) + d / swing * np.sin(swing * t))
+    share = J_L / (J_R + J_L)
+    assert np.abs(theta - share * (twisted - twist)).max() < 1e-9 * twisted
+    speed = -twisted * np.exp(-d * t) * w * w / swing * np.sin(swing * t)
+    assert np.abs(qvel[:, machine.joints.index("twist")] - speed).max() < 1e-9 * w * twisted
+    machine.reset(np.array([True]))
+    again = run(machine, np.zeros(500))[0]
+    assert (np.abs(again).max() > 0.0) == (how == "start")  # and is at its start again after a reset
+
+
 # --- efficiency -------------------------------------------------------------------------------------------------------
 def without_drag(load):
     """Return a load that loses by its efficiency alone."""

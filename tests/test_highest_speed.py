@@ -20,7 +20,8 @@ def parameters(motor, **others):
     own = {"R_s": motor.R_s, "L_s": motor.L_q, "psi_m": motor.psi_m, "saturation": motor.saturation,
            "coulomb": 0.0, "viscous": 0.0}  # fmt: skip
     found = {f"motor.{name}": np.array([value]) for name, value in own.items()}
-    beside = {"load.coulomb": 0.0, "load.viscous": 0.0, "supply.voltage": motor.voltage, "start.winding": 25.0}
+    beside = {"load.coulomb": 0.0, "load.viscous": 0.0, "supply.voltage": motor.voltage, "start.winding": 25.0,
+              "stage.on_resistance": 0.0}  # fmt: skip
     return found | {name: np.array([value]) for name, value in (beside | others).items()}
 
 

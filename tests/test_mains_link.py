@@ -27,7 +27,7 @@ NOMINAL = {
     "supply_resistance": 0.8, "charging_resistance": 47.0, "idle_power": 12.0, "link_charged": 1.0,
     "chopper_resistance": 47.0, "chopper_voltage": 760.0, "chopper_hysteresis": 20.0, "chopper_enable": 1.0,
     "brake_power": 500.0, "brake_thermal_time": 30.0, "link_shared": 1.0,
-    "R_s": MOTOR.R_s, "psi_m": MOTOR.psi_m, "L_d": MOTOR.L_d, "L_q": MOTOR.L_q, "n_p": MOTOR.n_p,
+    "on_resistance": 0.5, "R_s": MOTOR.R_s, "psi_m": MOTOR.psi_m, "L_d": MOTOR.L_d, "L_q": MOTOR.L_q, "n_p": MOTOR.n_p,
     "pole_pairs": MOTOR.n_p, "encoder_counts": MOTOR.encoder_counts, "feedback_resolution": MOTOR.encoder_counts,
     "J_rotor": 4e-4, "duty_limit": 3.0**-0.5, "adc_step": 1e-4, "adc_step_lsb": 0.05, "dead_time_current": 0.2,
     "current_p": 0.02, "current_integration": 50e-6 / 0.05, "i_max": PEAK, "peak_current": PEAK,
@@ -76,7 +76,7 @@ def run_module(records, rates, periods, sums, trace):
                         # Mean square of the parabola through start and end with that mean, by Simpson's rule.
                         middle = 1.5 * mean - 0.25 * (start + last)
                         square = (start * start + 4.0 * middle * middle + last * last) / 6.0
-                        sums[COPPER, lane] += 1.5 * drive.R_s[lane] * square * dt
+                        sums[COPPER, lane] += 1.5 * (drive.R_s[lane] + drive.on_resistance[lane]) * square * dt
                     sums[SHAFT, lane] += drive.tau_m[lane] * 0.5 * (omega[lane] + drive.omega_m[lane]) * dt
         trace[period, 0], trace[period, 1] = drive.u_dc[0], drive.u_dc[1]
 

@@ -247,6 +247,20 @@ def test_supply_sags_with_the_current_it_delivers():
     assert np.all(trace[0, 3, 1:] > trace[-1, 3, 1:])  # the sag follows the current, which has to rise first
 
 
+@pytest.mark.parametrize("is_dc", [0.0, 1.0])
+def test_the_stages_resistance_is_in_the_windings_circuit(is_dc):
+    """Locked rotor: i = duty u_dc / R (1 - exp(-R t / L)), R with one switch of a phase, two of a brushed motor."""
+    on = np.array([0.0, 0.004, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0])
+    axis = {"is_dc": 1.0, "phase_factor": 1.0, "n_p": 1.0, "theta_m": -0.5 * math.pi} if is_dc else {}
+    records = new_stage(on_resistance=on, psi_m=0.0, **axis)
+    n = 40
+    trace = run(records, np.broadcast_to(np.array([0.2, 0.0])[:, None], (n, 2, LANES)))
+    path = R + (2.0 if is_dc else 1.0) * on
+    t = (np.arange(n) + 1)[:, None] * DT
+    current = trace[:, 1] if is_dc else trace[:, 0]
+    assert current == pytest.approx(0.2 * SUPPLY / path * -np.expm1(-path * t / L), rel=1e-9)
+
+
 def test_dead_time_costs_each_phase_its_share_of_the_supply_against_the_current():
     """Mean voltage error of a phase: dead time per period times the supply, in the sign of its current."""
     lost = 0.0075 * SUPPLY  # 300 ns at 25 kHz

@@ -10,6 +10,7 @@ from scipy import stats
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.loops.true_plant import terminal_resistance
 from tuning.identify import standstill as module
 from tuning.identify.identification import identify
 from tuning.identify.standstill import standstill_resistances
@@ -27,7 +28,7 @@ def test_dead_time_of_any_kind_is_in_the_interval():
     ends = [(dead, fades) for dead in (100e-9, 700e-9) for fades in (0.1, 0.8)]
     machines = {"stage.dead_time": [dead for dead, _ in ends], "stage.dead_time_current": [fades for _, fades in ends]}
     target = emulated(load="inertia", num_machines=4, parameters=machines, num_threads=1)
-    for found, true in zip(at_rest(target), target.drives.machine.parameters["motor.R_s"], strict=True):
+    for found, true in zip(at_rest(target), terminal_resistance(target.drives.machine.parameters, "pmsm"), strict=True):
         assert found.low < true < found.high
         assert found.value == pytest.approx(true, rel=0.03)
         assert found.high - found.low < 0.1 * true
@@ -95,7 +96,7 @@ def test_over_a_bus_in_real_time_resistance_is_told_and_inductance_refused(monke
         monkeypatch.setattr("tuning.identify.winding.time", drives)
         target = Target(drives, own.device, own.motor, own.supply, own.low, own.high, own.speed, own.current)
         found = identify(replace(target))[0]
-        true = float(own.drives.machine.parameters["motor.R_s"][0])
+        true = float(terminal_resistance(own.drives.machine.parameters, own.motor.kind)[0])
     resistance = found.estimates["resistance"]
     assert resistance.value == pytest.approx(true, rel=0.1)
     assert resistance.low < true < resistance.high

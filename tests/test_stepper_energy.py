@@ -1,4 +1,4 @@
-"""Energy of a stepper: what the bridges take is shaft work, copper loss and change of magnetic energy; the shaft's
+"""Energy of a stepper: what the bridges take is shaft work, loss in copper and stage and magnetic energy; the shaft's
 work is kinetic energy, friction and load. Sums tick by tick from currents and speeds, by formulas of its own."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from drive_env.motors import MOTORS
 from mechanics.compiled import cached
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
-BRIDGE, COPPER, SHAFT = range(3)
+BRIDGE, COPPER, SHAFT, STAGE = range(4)
 SPEEDS = np.array([0.05, 0.5, 1.0, 1.3])  # of the rated speed
 KINDS = ("motoring", "braking", "speeding up", "slowing down")
 PPS = MICROSTEPS / (2.0 * math.pi)
@@ -26,7 +26,7 @@ PPS = MICROSTEPS / (2.0 * math.pi)
 
 @cached()
 def run_axes(records, plant, rates, scratch, num_axes, cycles, sums):
-    """Run whole communication cycles; sums (3, axes) [J]: bridge, copper, shaft."""
+    """Run whole communication cycles; sums (4, axes) [J]: bridge, copper, shaft, stage."""
     dt = rates.tick
     i_a, i_b = np.zeros(LANES), np.zeros(LANES)
     for _ in range(cycles):
@@ -56,6 +56,7 @@ def run_axes(records, plant, rates, scratch, num_axes, cycles, sums):
                             square += (start * start + 4.0 * middle * middle + end * end) / 6.0
                         sums[BRIDGE, axis] += drive.bridge_power[lane_] * dt
                         sums[COPPER, axis] += drive.R_s[lane_] * square * dt
+                        sums[STAGE, axis] += drive.on_resistance[lane_] * square * dt
                         torque[axis] += (drive.tau_m[lane_] + drive.tau_detent[lane_]) / rates.ticks
             mechanics_window(records, plant, rates, scratch)
             for axis in range(num_axes):
@@ -69,6 +70,7 @@ def energies(request):
     speed = np.tile(SPEEDS, 4) * motor.rated_speed
     # Without friction nothing but the load takes energy; a heavy disc keeps the speed.
     parameters = FREE | {"motor.coulomb": 0.0, "load.inertia": 20.0 * motor.inertia, "load.viscous": motor.viscous}
+    parameters["stage.on_resistance"] = 0.5
     with build(request.param, num_machines=16, parameters=parameters | {"motor.viscous": 0.0}) as drives:
         motion.enable(drives, mode="pv")
         drives.write(0x6083, round(speed.max() * PPS / 2.0))
@@ -89,7 +91,7 @@ def energies(request):
             kinetic = 0.5 * lane(drives, "J_rotor") * lane(drives, "omega_m") ** 2
             return np.array([0.5 * lane(drives, "L_s") * currents, kinetic, lane(drives, "theta_m")])
 
-        before, sums = stored(), np.zeros((3, 16))
+        before, sums = stored(), np.zeros((4, 16))
         rates, blocks = rates_of(drives.device, 1), len(drives.inside.records)
         run_axes(
             drives.inside.records, drives.inside.groups[0].load.plant, rates, np.zeros((7, 8 * blocks)), 16, 200, sums
@@ -98,15 +100,17 @@ def energies(request):
         assert drives.emergencies() == []
         assert np.all(np.abs(50.0 * (lane(drives, "step_position") - lane(drives, "theta_m"))) < math.pi)  # in step
         drag = motor.viscous * speed * turned  # of a speed that hardly changes
-        terms = (*sums, magnetic, kinetic, drives.machine.load_torque * turned, drag)
+        terms = (*sums[:STAGE], magnetic, kinetic, drives.machine.load_torque * turned, drag, sums[STAGE])
         yield tuple(term.reshape(4, 4) for term in terms)
 
 
 @pytest.mark.parametrize("kind", range(4), ids=KINDS)
-def test_the_bridges_energy_is_shaft_work_copper_loss_and_magnetic_energy_within_0_1_percent(energies, kind):
+def test_the_bridges_energy_is_shaft_work_losses_and_magnetic_energy_within_0_1_percent(energies, kind):
     bridge, copper, shaft, magnetic = (term[kind] for term in energies[:4])
+    stage = energies[7][kind]
+    assert np.all(stage >= 0.08 * copper)
     scale = np.maximum(np.abs(bridge), np.maximum(np.abs(shaft), copper))
-    assert np.all(np.abs(bridge - shaft - copper - magnetic) <= 1e-3 * scale), (bridge, shaft, copper, magnetic)
+    assert np.all(np.abs(bridge - shaft - copper - stage - magnetic) <= 1e-3 * scale), (bridge, shaft, copper, stage)
 
 
 @pytest.mark.parametrize("kind", [0, 1], ids=KINDS[:2])

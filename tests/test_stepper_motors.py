@@ -134,7 +134,7 @@ def test_a_stepper_of_ones_own_needs_seven_numbers():
         ({}, {"pull_out": CURVE | {"source": "x"}}, "pull_out: there is no source 'x'"),
         ({}, {"pull_out": CURVE | {"speed_rpm": [300, 100]}}, "pull_out: speed_rpm must increase"),
         ({}, {"pull_out": CURVE | {"torque_nm": [1.0]}}, "lists of the same length"),
-        ({}, {"kind": "pmsm"}, "rated_torque_nm is missing"),
+        ({}, {"kind": "pmsm"}, "pole_pairs is missing"),
     ],
 )
 def test_a_wrong_file_is_told_with_the_remedy(change, other, message):

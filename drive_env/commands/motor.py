@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from drive_env.motors import Motor
 
+Printed = tuple[float, str]  # a number's value in the file, and as it was typed
+
 motor_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
 
@@ -42,18 +44,21 @@ def new_motor(
     title: Annotated[str, typer.Option("--title", help="Name of the motor.")] = "",
     numbers: Annotated[
         list[str] | None,
-        typer.Option("--number", "-n", help="A number of the data sheet, e.g. inertia_kg_m2=4.8e-6; may be repeated."),
+        typer.Option("--number", "-n", help="A number as it is printed, e.g. inertia='48 gcm2'; may be repeated."),
     ] = None,
     source: Annotated[str, typer.Option("--source", help="Where the numbers come from.")] = "",
     list_numbers: Annotated[bool, typer.Option("--list", help="List the numbers that can be given, and stop.")] = False,
+    unchecked: Annotated[bool, typer.Option("--unchecked", help="Accept numbers that contradict each other.")] = False,
 ) -> None:
     """Write a motor's file from its data sheet; in a terminal, missing numbers are asked for.
 
     A data sheet gives resistance and inductance of a phase or between two terminals, the torque constant per ampere
-    peak or RMS, or a back-EMF; each has a number of its own, and is converted. Friction and cogging, which data sheets
-    do not give, are taken from motors of its class; correct them in the file.
+    peak or RMS, a back-EMF or KV; each has a number of its own, and is converted from the unit that is printed. Numbers
+    that contradict each other are refused. Friction and cogging, which data sheets do not give, are taken from motors
+    of its class; correct them in the file.
     """
     from drive_env.motors import MotorError, load_motor, motor_of
+    from drive_env.motors.plausibility import doubts
 
     with errors_as_exit_codes():
         if list_numbers:
@@ -67,21 +72,29 @@ def new_motor(
         given = _given(numbers or [])
         if kind is None:
             kind = _asked("kind of motor, pmsm (brushless), dc (brushed) or stepper", "pmsm")
-        missing = _missing(kind, given)
-        if missing and not _is_answered():
-            hint = f"; {ESTIMATES[missing[0][0]]}" if missing[0][0] in ESTIMATES else ""
-            raise ValueError(f"{' or '.join(missing[0])} is missing; give it with --number (--list describes it){hint}")
-        for choice in missing:
-            name, value = _ask_for(choice)
-            given[name] = value
+        while missing := _missing(kind, given):
+            if not _is_answered():
+                hint = f"; {ESTIMATES[missing[0][0]]}" if missing[0][0] in ESTIMATES else ""
+                raise ValueError(
+                    f"{' or '.join(missing[0])} is missing; give it with --number (--list describes it){hint}"
+                )
+            name, printed = _ask_for(missing[0])
+            given |= _read(name, printed)
         where = source or _asked("source of the numbers (data sheet, revision)", "data sheet")
         data = {"title": title or file.stem, "kind": kind, "sources": {"data_sheet": where},
-                "numbers": {name: [value, "data_sheet"] for name, value in given.items()}}  # fmt: skip
+                "numbers": {name: [value, "data_sheet"] for name, (value, _) in given.items()}}  # fmt: skip
         try:
-            motor_of(file.stem, data)
+            row = motor_of(file.stem, data)
         except MotorError as error:
             raise ValueError(f"{error}; nothing was written") from None
-        _write(file, data)
+        contradictions = [] if unchecked else doubts(row)
+        for text in contradictions if _is_answered() else ():
+            typer.echo(f"  {text}", err=True)
+        if contradictions and not (_is_answered() and typer.confirm("keep these numbers", err=True)):
+            raise ValueError(
+                f"{'; '.join(contradictions)}; nothing was written (--unchecked keeps numbers that are right)"
+            )
+        _write(file, data, {name: printed for name, (_, printed) in given.items()})
         _tell(file, load_motor(file))
 
 
@@ -90,7 +103,10 @@ def _list_numbers() -> None:
     from drive_env import motors
 
     brushed = motors.OF_DC
-    phases = (*motors.RESISTANCE, *motors.INDUCTANCE, *motors.TORQUE_CONSTANT, *motors.RATED_CURRENT, "pole_pairs")
+    phases = (
+        *motors.RESISTANCE, *motors.INDUCTANCE, *motors.INDUCTANCE_D, *motors.INDUCTANCE_Q, *motors.TORQUE_CONSTANT,
+        *motors.RATED_CURRENT, "pole_pairs",
+    )  # fmt: skip
     brushless = tuple(name for name in phases if name not in brushed)
     needed = motors.NEEDED
     of_stepper = tuple(name for name in (*motors.STEPPER_NEEDED, *motors.RATED_CURRENT, *motors.STEPPER_MAY))
@@ -111,31 +127,24 @@ def _list_numbers() -> None:
             print(f"  {name}: {row.meaning}" + (f" [{row.unit}]" if row.unit else ""))
 
 
-def _given(texts: list[str]) -> dict[str, float]:
+def _given(texts: list[str]) -> dict[str, Printed]:
     """Return the numbers of the command line."""
-    from drive_env.motors import NUMBERS
-    from mechanics.near_names import did_you_mean
-
-    found: dict[str, float] = {}
+    found: dict[str, Printed] = {}
     for text in texts:
         name, _, value = (part.strip() for part in text.partition("="))
-        if name not in NUMBERS:
-            raise ValueError(f"{name!r} is not a number of a motor{did_you_mean(name, NUMBERS)}; --list shows them")
-        found[name] = _number(name, value)
+        found |= _read(name, value)
     return found
 
 
-def _number(name: str, text: str) -> float:
-    from drive_env.motors import WHOLE
+def _read(name: str, text: str) -> dict[str, Printed]:
+    """Return a number by its name in the file."""
+    from drive_env.motors.data_sheet import read_number
 
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(f"{name} = {text!r} is not a number; write it as 4.8e-6") from None
-    return int(value) if name in WHOLE and value == int(value) else value
+    key, value = read_number(name, text)
+    return {key: (value, text)}
 
 
-def _missing(kind: str, given: Mapping[str, float]) -> list[tuple[str, ...]]:
+def _missing(kind: str, given: Mapping[str, Printed]) -> list[tuple[str, ...]]:
     """Return the quantities that are still missing, each as the names by which it can be given."""
     from drive_env import motors
 
@@ -143,18 +152,20 @@ def _missing(kind: str, given: Mapping[str, float]) -> list[tuple[str, ...]]:
         wanted: list[tuple[str, ...]] = [*((name,) for name in motors.STEPPER_NEEDED), motors.RATED_CURRENT]
         return [choice for choice in wanted if not any(name in given for name in choice)]
     if kind == "dc":
-        wanted = [(name,) for name in motors.OF_DC]
+        wanted = [("resistance_ohm",), ("inductance_h",), motors.DC_CONSTANT]
     else:
-        forms = (motors.RESISTANCE, motors.INDUCTANCE, motors.TORQUE_CONSTANT)
+        forms = (motors.RESISTANCE, (*motors.INDUCTANCE, *motors.INDUCTANCE_D), motors.TORQUE_CONSTANT)
         wanted = [tuple(name for name in form if name not in motors.OF_DC) for form in forms]
         if any(name in given for name in motors.RATED_CURRENT):
             wanted.pop()  # the torque constant follows from the rated point
+        wanted += [(name.replace("_d_", "_q_"),) for name in motors.INDUCTANCE_D if name in given]
         wanted.append(("pole_pairs",))
     wanted += [(name,) for name in motors.NEEDED]
     return [choice for choice in wanted if not any(name in given for name in choice)]
 
 
-def _ask_for(choice: tuple[str, ...]) -> tuple[str, float]:
+def _ask_for(choice: tuple[str, ...]) -> tuple[str, str]:
+    """Return the form of a quantity that the user chooses, and what he types."""
     from drive_env.motors import NUMBERS
 
     name = choice[0]
@@ -166,7 +177,7 @@ def _ask_for(choice: tuple[str, ...]) -> tuple[str, float]:
             raise ValueError(f"{which!r} is not one of 1 to {len(choice)}")
         name = choice[int(which) - 1]
     row = NUMBERS[name]
-    return name, _number(name, _asked(f"{row.meaning}{f' [{row.unit}]' if row.unit else ''}", ""))
+    return name, _asked(f"{row.meaning}{f' [{row.unit}, or with its unit]' if row.unit else ''}", "")
 
 
 def _is_answered() -> bool:
@@ -181,7 +192,7 @@ def _asked(what: str, default: str) -> str:
     return str(typer.prompt(what, default=default or None, err=True))
 
 
-def _write(file: Path, data: Mapping[str, object]) -> None:
+def _write(file: Path, data: Mapping[str, object], printed: Mapping[str, str]) -> None:
     from drive_env.motors import NUMBERS
     from drive_env.whole_file import write_whole
 
@@ -192,7 +203,8 @@ def _write(file: Path, data: Mapping[str, object]) -> None:
     lines += ["", "[numbers]  # each with its source"]
     for name, (value, source) in numbers.items():
         unit = f"{NUMBERS[name].unit}, " if NUMBERS[name].unit else ""
-        lines.append(f'{name} = [{value!r}, "{source}"]  # {unit}{NUMBERS[name].meaning}')
+        typed = f": {printed[name]}" if printed[name] != repr(value) else ""
+        lines.append(f'{name} = [{value!r}, "{source}"]  # {unit}{NUMBERS[name].meaning}{typed}')
     write_whole(file, "\n".join(lines) + "\n")
 
 
@@ -201,11 +213,12 @@ def _tell(file: Path, row: Motor) -> None:
     from drive_env.devices import device_names, find_device
     from drive_env.firmware import motor_kinds
     from drive_env.motors import is_extra_low
+    from drive_env.motors.plausibility import no_load_speed
 
-    no_load = row.voltage / math.sqrt(3.0) / (row.n_p * row.psi_m) if row.kind != "dc" else row.voltage / row.psi_m
-    rpm = 30.0 / math.pi
+    no_load, rpm = no_load_speed(row), 30.0 / math.pi
     print(f"{file}: {row.title}")
-    print(f"  a phase: {row.R_s:.4g} ohm, {1e3 * row.L_q:.4g} mH; rated current {row.rated_current:.3g} A peak")
+    inductance = " and ".join(f"{1e3 * each:.4g}" for each in dict.fromkeys((row.L_d, row.L_q)))
+    print(f"  a phase: {row.R_s:.4g} ohm, {inductance} mH; rated current {row.rated_current:.3g} A peak")
     if row.kind == "stepper":
         print(f"  holding torque {row.rated_torque:.4g} N*m, detent torque {row.cogging_torque:.3g} N*m")
         print(f"  {row.voltage:g} V carry the rated current up to {row.rated_speed * rpm:.0f} rpm")

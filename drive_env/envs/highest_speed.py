@@ -41,7 +41,8 @@ def highest_speeds(motor: Motor, current: ArrayLike, parameters: Mapping[str, Ar
     """
     values = {name: np.asarray(parameters[name], float) for name in ELECTRICAL}
     warmer = np.asarray(parameters["start.winding"], float) - NOMINAL
-    values["motor.R_s"] = values["motor.R_s"] * (1.0 + COPPER * warmer)
+    bridge = np.asarray(parameters["stage.on_resistance"], float)
+    values["motor.R_s"] = values["motor.R_s"] * (1.0 + COPPER * warmer) + bridge
     values["motor.psi_m"] = values["motor.psi_m"] * (1.0 + motor.flux_temperature * warmer)
     friction = [
         np.asarray(parameters[f"motor.{name}"], float) + parameters[f"load.{name}"] for name in ("coulomb", "viscous")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
     factor = 1.0 if motor.kind == "dc" else 1.5
     known = {} if pair is None else {"anti_resonance": pair[0], "resonance": pair[1], "damping": pair[2]}
     return Plant(
-        R=true["motor.R_s"],
+        R=float(terminal_resistance(true, motor.kind)),
         L=true["motor.L_q"],
         supply=float(drives.machine.supply[axis]),
         torque_constant=factor * motor.n_p * psi,
@@ -52,6 +52,14 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
         counts=round(motor.encoder_counts * true["motor.encoder_interpolation"]),
         **known,
     )
+
+
+def terminal_resistance(parameters: Mapping[str, Any], kind: str) -> Any:
+    """Return the resistance that a drive sees [ohm]: of one phase of the winding, with that of the stage in its path.
+
+    A brushed motor's current flows through both legs of its bridge.
+    """
+    return parameters["motor.R_s"] + (2.0 if kind == "dc" else 1.0) * parameters["stage.on_resistance"]
 
 
 class LinearLoad(NamedTuple):
@@ -98,7 +106,7 @@ def true_machines(drives: Drives) -> LinearMachines:
     M, D, K = (np.concatenate([getattr(part, name) for part in parts]) for name in ("M", "D", "K"))
     emf = motor.n_p * true["motor.psi_m"]
     windings = Windings(
-        true["motor.R_s"], true["motor.L_q"], emf, (1.0 if motor.kind == "dc" else 1.5) * emf,
+        terminal_resistance(true, motor.kind), true["motor.L_q"], emf, (1.0 if motor.kind == "dc" else 1.5) * emf,
         np.asarray(drives.machine.supply, float).reshape(len(M), axes), true["stage.velocity_filter"],
     )  # fmt: skip
     return linear_machines(windings, M, D, K, parts[0].rotors)

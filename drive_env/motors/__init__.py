@@ -141,13 +141,16 @@ class Number(NamedTuple):
 # Of one quantity a file has one number, in the form of its data sheet.
 RESISTANCE = ("resistance_phase_ohm", "resistance_line_to_line_ohm", "resistance_ohm")
 INDUCTANCE = ("inductance_phase_h", "inductance_line_to_line_h", "inductance_h")
+INDUCTANCE_D = ("inductance_d_phase_h", "inductance_d_line_to_line_h")  # each with that of q, in place of INDUCTANCE
+INDUCTANCE_Q = ("inductance_q_phase_h", "inductance_q_line_to_line_h")
 TORQUE_CONSTANT = (
     "torque_constant_peak", "torque_constant_rms", "torque_constant_line_to_line", "back_emf_line_peak_v_per_krpm",
-    "back_emf_line_rms_v_per_krpm", "torque_constant",
+    "back_emf_line_rms_v_per_krpm", "speed_constant_rpm_per_v", "torque_constant",
 )  # fmt: skip
 RATED_CURRENT = ("rated_current_peak_a", "rated_current_rms_a")
 KINDS = {"pmsm": "brushless", "dc": "brushed", "stepper": "two-phase hybrid stepper"}
 OF_DC = ("resistance_ohm", "inductance_h", "torque_constant")  # a brushed motor's, which has no phases
+DC_CONSTANT = ("torque_constant", "speed_constant_rpm_per_v")
 NUMBERS: dict[str, Number] = {
     "resistance_phase_ohm": Number("ohm", "winding resistance of one phase", 0.0),
     "resistance_line_to_line_ohm": Number("ohm", "winding resistance between two terminals", 0.0),
@@ -155,11 +158,16 @@ NUMBERS: dict[str, Number] = {
     "inductance_phase_h": Number("H", "inductance of one phase", 0.0),
     "inductance_line_to_line_h": Number("H", "inductance between two terminals", 0.0),
     "inductance_h": Number("H", "inductance", 0.0),
+    "inductance_d_phase_h": Number("H", "inductance of one phase along the magnets' flux, L_d", 0.0),
+    "inductance_q_phase_h": Number("H", "inductance of one phase across the magnets' flux, L_q", 0.0),
+    "inductance_d_line_to_line_h": Number("H", "L_d between two terminals", 0.0),
+    "inductance_q_line_to_line_h": Number("H", "L_q between two terminals", 0.0),
     "torque_constant_peak": Number("N*m/A", "torque per ampere of peak phase current", 0.0),
     "torque_constant_rms": Number("N*m/A", "torque per ampere RMS of phase current", 0.0),
     "torque_constant_line_to_line": Number("N*m/A", "torque constant of block commutation, as catalogues have it", 0.0),
-    "back_emf_line_peak_v_per_krpm": Number("V", "back-EMF, peak between two terminals at 1000 rpm", 0.0),
-    "back_emf_line_rms_v_per_krpm": Number("V", "back-EMF, RMS between two terminals at 1000 rpm", 0.0),
+    "back_emf_line_peak_v_per_krpm": Number("V/krpm", "back-EMF, peak between two terminals at 1000 rpm", 0.0),
+    "back_emf_line_rms_v_per_krpm": Number("V/krpm", "back-EMF, RMS between two terminals at 1000 rpm", 0.0),
+    "speed_constant_rpm_per_v": Number("rpm/V", "speed constant KV, speed without load per volt of supply", 0.0),
     "torque_constant": Number("N*m/A", "torque constant", 0.0),
     "pole_pairs": Number("", "number of pole pairs", 1, 127, True),
     "inertia_kg_m2": Number("kg*m^2", "inertia of the rotor", 0.0),
@@ -292,20 +300,19 @@ def _checked(key: str, row: Any, texts: Mapping[str, Any]) -> tuple[float, str]:
 
 def _built(name: str, title: str, kind: str, values: Mapping[str, float], sources: Mapping[str, str]) -> Motor:
     """Return the motor of checked numbers, converted to phase values in SI."""
-    forms = (RESISTANCE, INDUCTANCE) if kind == "pmsm" else ()
-    for quantity in (*forms, *((key,) for key in NEEDED), *(() if kind == "dc" else (("pole_pairs",),))):
+    is_dc = kind == "dc"
+    forms = (("resistance_ohm",), ("inductance_h",), DC_CONSTANT) if is_dc else (RESISTANCE, ("pole_pairs",))
+    for quantity in (*forms, *((key,) for key in NEEDED)):
         _one_of(quantity, values)
-    if kind == "dc":
-        for key in OF_DC:
-            _one_of((key,), values)
-        wrong = [key for key in (*RESISTANCE, *INDUCTANCE, *TORQUE_CONSTANT) if key in values and key not in OF_DC]
-    else:
-        wrong = [key for key in OF_DC if key in values]
+    phases = {*RESISTANCE, *INDUCTANCE, *INDUCTANCE_D, *TORQUE_CONSTANT} - {*OF_DC, *DC_CONSTANT}
+    others = phases if is_dc else {*OF_DC}
+    wrong = [key for key in values if key in others]
     _refuse(OF_STEPPER, values, "only a stepper has it")
     if wrong:
-        other = "a brushed motor has no phases" if kind == "dc" else "of a brushless motor say between what"
-        raise MotorError(f"{wrong[0]}: {other}; there are {', '.join(k for k in NUMBERS if k[:5] == wrong[0][:5])}")
-    n_p = 1 if kind == "dc" else int(values["pole_pairs"])
+        other = "a brushed motor has no phases" if is_dc else "of a brushless motor say which"
+        near = [key for key in NUMBERS if key[:5] == wrong[0][:5] and key not in (*others, *OF_STEPPER)]
+        raise MotorError(f"{wrong[0]}: {other}; there are {', '.join(near)}")
+    n_p = 1 if is_dc else int(values["pole_pairs"])
     torque, speed = values["rated_torque_nm"], values["rated_speed_rpm"] * RPM
     k = _torque_constant(kind, n_p, values)
     current = _rated_current(values, torque, k, kind)
@@ -313,18 +320,15 @@ def _built(name: str, title: str, kind: str, values: Mapping[str, float], source
         k = torque / current
     halved = 0.5 if "resistance_line_to_line_ohm" in values else 1.0
     R = next(values[key] for key in RESISTANCE if key in values) * halved
-    L = next(values[key] for key in INDUCTANCE if key in values)
-    L *= 0.5 if "inductance_line_to_line_h" in values else 1.0
+    L_d, L_q = _inductances(values)
     line = values.get("torque_constant_line_to_line")
-    psi_m = k if kind == "dc" else k / (1.5 * n_p) if line is None else line / (_SQRT3 * n_p)
-    is_dc = kind == "dc"
     return Motor(
         name=name,
         title=title,
         R_s=R,
-        L_d=L,
-        L_q=L,
-        psi_m=psi_m,
+        L_d=L_d,
+        L_q=L_q,
+        psi_m=k if is_dc else k / (1.5 * n_p) if line is None else line / (_SQRT3 * n_p),
         n_p=n_p,
         inertia=values["inertia_kg_m2"],
         rated_torque=torque,
@@ -435,8 +439,8 @@ def _refuse(keys: Iterable[str], values: Mapping[str, float], why: str) -> None:
             raise MotorError(f"{key}: {why}")
 
 
-def _one_of(quantity: tuple[str, ...], values: Mapping[str, float]) -> None:
-    """Raise MotorError unless a quantity is given, in one form."""
+def _one_of(quantity: tuple[str, ...], values: Mapping[str, float]) -> str:
+    """Return the form in which a quantity is given; raise MotorError unless it is one."""
     given = [key for key in quantity if key in values]
     if len(given) != 1:
         said = (
@@ -445,6 +449,16 @@ def _one_of(quantity: tuple[str, ...], values: Mapping[str, float]) -> None:
             else f"{' or '.join(quantity)} is missing"
         )
         raise MotorError(said)
+    return given[0]
+
+
+def _inductances(values: Mapping[str, float]) -> tuple[float, float]:
+    """Return L_d and L_q of a phase [H], which are the same where a file has one inductance."""
+    key = _one_of((*INDUCTANCE, *INDUCTANCE_D), values)
+    across = key.replace("_d_", "_q_")
+    _refuse((each for each in INDUCTANCE_Q if each != across), values, f"does not go with {key}")
+    halved = 0.5 if "line_to_line" in key else 1.0
+    return halved * values[key], halved * values[_one_of((across,), values)]
 
 
 def _torque_constant(kind: str, n_p: int, values: Mapping[str, float]) -> float | None:
@@ -464,6 +478,7 @@ def _torque_constant(kind: str, n_p: int, values: Mapping[str, float]) -> float 
         "torque_constant_line_to_line": 0.5 * _SQRT3 * value,
         "back_emf_line_peak_v_per_krpm": 1.5 * value / per_rad,
         "back_emf_line_rms_v_per_krpm": 1.5 * math.sqrt(2.0) * value / per_rad,
+        "speed_constant_rpm_per_v": (1.0 if kind == "dc" else 0.5 * _SQRT3) / (value * RPM),
     }[key]
 
 

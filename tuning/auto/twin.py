@@ -139,7 +139,8 @@ def twin_parameters(
         for name, value in (("adc_noise", world.adc_noise), ("supply_resistance", world.supply_resistance))
     )
     values = {
-        "motor.R_s": plant.R,
+        "motor.R_s": plant.R,  # what was measured is winding and stage
+        "stage.on_resistance": 0.0,
         "motor.L_d": plant.L,
         "motor.L_q": plant.L,
         "stage.velocity_filter": float(np.clip(filtered, SLOWEST_FILTER, 0.4 * device.velocity_rate)),

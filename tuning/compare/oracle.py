@@ -24,6 +24,7 @@ import numpy as np
 
 from drive_env.devices.gains import has_linear_model, si_scales
 from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
+from drive_env.loops.true_plant import terminal_resistance
 from drive_env.whole_file import write_table
 from mechanics.arrays import Floats, Integers, Mask
 from mechanics.untrusted import read_rows
@@ -124,7 +125,8 @@ class _Box(NamedTuple):
         rule = np.log(np.maximum(yardstick.rule_gains[:axes], 1).astype(float))
         least, most = np.zeros_like(rule), np.log(np.broadcast_to(device.gains.highest, rule.shape).astype(float))
         if has_linear_model(device):
-            L, R = (float(yardstick.parameters[name][0]) for name in ("motor.L_q", "motor.R_s"))
+            L = float(yardstick.parameters["motor.L_q"][0])
+            R = float(terminal_resistance(yardstick.parameters, yardstick.motor.kind)[0])
             for axis in range(axes):
                 scales = si_scales(device, float(yardstick.supply[axis]))
                 p, i = device.gains.column("current", "P"), device.gains.column("current", "I")

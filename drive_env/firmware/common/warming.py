@@ -9,7 +9,7 @@ from mechanics.compiled import inlined
 NOMINAL = 25.0  # degC at which the motor's row holds
 
 PARAMETERS = (
-    Field("on_resistance", "f8", "ohm", "of the stage, per phase"),
+    Field("on_resistance", "f8", "ohm", "of the stage, in a phase's path"),
     Field("stage_thermal_resistance", "f8", "K/W", "stage to ambient", 1.0),
     Field("stage_thermal_time", "f8", "s", "", 100.0),
     Field("R_s", "f8", "ohm", "phase resistance at the present temperature", 1.0),

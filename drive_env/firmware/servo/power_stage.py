@@ -5,8 +5,9 @@ The bridge holds a voltage in the stator frame. In the rotor frame, at constant 
     di/dt = A i + B u + e      A = [[-R/L_d,  w L_q/L_d], [-w L_d/L_q, -R/L_q]],  B = diag(1/L_d, 1/L_q)
     du/dt = W u                W = [[0, w], [-w, 0]],  e = [0, -w psi/L_q]
 
-so one tick is i(dt) = exp(A dt) i + G u + g with G the solution of A G - G W = exp(A dt) B - B exp(W dt). The
-matrices change with speed only and are refreshed once per window. A DC motor is the q axis of a frame at rest.
+where R is that of winding and stage: a phase's current flows through one switch of its leg, a DC motor's through one of
+either leg. So one tick is i(dt) = exp(A dt) i + G u + g with G the solution of A G - G W = exp(A dt) B - B exp(W dt).
+The matrices change with speed only and are refreshed once per window. A DC motor is the q axis of a frame at rest.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ SQRT3 = 3.0**0.5
 def refresh_winding(drive, dt, h):
     """Compute the matrices of the exact step for ticks of dt [s] at the speed in the middle of this window of h [s]."""
     for lane in range(LANES):
-        R = drive.R_s[lane]
+        R = drive.R_s[lane] + (1.0 + drive.is_dc[lane]) * drive.on_resistance[lane]
         L_d = drive.L_d[lane]
         L_q = drive.L_q[lane]
         acceleration = (drive.tau_m[lane] + drive.tau_cogging[lane] - drive.tau_reaction[lane]) / drive.J_rotor[lane]

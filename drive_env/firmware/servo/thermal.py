@@ -17,7 +17,8 @@ def warm(drive, dt):
         square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
         factor = drive.phase_factor[lane]
         loss = factor * drive.R_s[lane] * square
-        warmed(drive, lane, loss, factor * drive.on_resistance[lane] * square, dt)
+        in_stage = factor * (1.0 + drive.is_dc[lane]) * drive.on_resistance[lane] * square  # in both legs of a DC motor
+        warmed(drive, lane, loss, in_stage, dt)
         share = square / (drive.nominal_current[lane] * drive.nominal_current[lane]) - 1.0
         used = drive.overload[lane] + dt * share / drive.overload_time[lane]
         drive.overload[lane] = used if used > 0.0 else 0.0

@@ -128,7 +128,7 @@ def find_ripple(drive):
         fast_decay = 32.0 * drive.hysteresis_start[lane] * clock * (1.0 - fast_chopper)
         # Slopes of a current of the set-point's size against the whole back-EMF [A/s].
         per_volt = 1.0 / drive.L_s[lane]
-        resisted = drive.R_s[lane] * drive.amplitude[lane]
+        resisted = (drive.R_s[lane] + drive.on_resistance[lane]) * drive.amplitude[lane]
         u = drive.u_dc[lane] * drive.duty_limit[lane]
         against = resisted + drive.psi[lane] * drive.n_p[lane] * abs(drive.omega_m[lane])
         rise = larger((u - against) * per_volt, SMALLEST_SLOPE)

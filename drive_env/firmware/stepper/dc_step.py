@@ -47,7 +47,7 @@ def release_steps(drive, h):
         off = 2.0 * slow_decay_clocks(drive.off_time[lane])
         time = drive.dc_time[lane]
         u = drive.u_dc[lane] * drive.duty_limit[lane]
-        resisted = drive.R_s[lane] * drive.amplitude[lane] * ROOT_HALF
+        resisted = (drive.R_s[lane] + drive.on_resistance[lane]) * drive.amplitude[lane] * ROOT_HALF
         per_speed = drive.psi[lane] * drive.n_p[lane] * direction
         # What the back-EMF may be at that on-time, as a share of its peak.
         share = (u * time / (time + off) - resisted) / larger(per_speed * drive.omega_m[lane], SMALLEST_EMF)

@@ -5,9 +5,10 @@ Each phase is a winding of its own; the rotor's flux links them as psi cos(theta
     L di_a/dt = u_a - R i_a + psi w sin(theta_e)        L di_b/dt = u_b - R i_b - psi w cos(theta_e)
     tau_m = n_p psi (i_b cos(theta_e) - i_a sin(theta_e))
 
-and the rotor is at rest where theta_e is the current vector's angle. Iron saturates with the current: psi = psi_m /
-sqrt(1 + saturation (i_a^2 + i_b^2)), in torque and back-EMF alike, so that energy balances. The teeth alone give the
-detent torque -T_d sin(4 theta_e), at rest where one phase would hold the rotor. Speed and psi are those of the window.
+where R is that of winding and stage, and the rotor is at rest where theta_e is the current vector's angle. Iron
+saturates with the current: psi = psi_m / sqrt(1 + saturation (i_a^2 + i_b^2)), in torque and back-EMF alike, so that
+energy balances. The teeth alone give the detent torque -T_d sin(4 theta_e), at rest where one phase would hold the
+rotor. Speed and psi are those of the window.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def refresh_winding(drive, dt, h):
     for lane in range(LANES):
         square = drive.i_a[lane] * drive.i_a[lane] + drive.i_b[lane] * drive.i_b[lane]
         psi = drive.psi_m[lane] / (1.0 + drive.saturation[lane] * square) ** 0.5
-        R = drive.R_s[lane]
+        R = drive.R_s[lane] + drive.on_resistance[lane]
         L = drive.L_s[lane]
         acceleration = (drive.tau_m[lane] + drive.tau_detent[lane] - drive.tau_reaction[lane]) / drive.J_rotor[lane]
         w = drive.n_p[lane] * (drive.omega_m[lane] + 0.5 * h * acceleration)
@@ -114,7 +115,8 @@ def power_stage(drive):
         )
         drive.tau_detent[lane] = -drive.detent_torque[lane] * 4.0 * sm * cm * (cm * cm - sm * sm)
         # A triangle of the ripple's size adds its mean square, a twelfth, to each phase's.
-        ripple_loss = drive.R_s[lane] * drive.ripple[lane] * drive.ripple[lane] * (1.0 / 12.0) * (on_a + on_b)
+        R = drive.R_s[lane] + drive.on_resistance[lane]
+        ripple_loss = R * drive.ripple[lane] * drive.ripple[lane] * (1.0 / 12.0) * (on_a + on_b)
         drive.bridge_power[lane] = u_a * mean_a + u_b * mean_b + ripple_loss
         drive.i_a[lane] = new_a
         drive.i_b[lane] = new_b
