@@ -388,7 +388,7 @@ def test_no_axis_is_faster_than_604ah_brings_to_rest_within_a_second(on_a_bus):
     drive.write((0x604A, 1), 300)
     with master as drives:
         motion.enable(drives, mode="vl")
-        with pytest.raises(SafetyError, match=r"= 301 is beyond the limit 300.*6085h \(in vl 604Ah\)"):
+        with pytest.raises(SafetyError, match=r"= 301 is beyond the limit 300.*6085h: .* it \(in vl 604Ah\) stops"):
             motion.turn(drives, 301)
         motion.turn(drives, 250)
         drives.advance(0.4)
