@@ -509,11 +509,11 @@ class Commands:
             modes: What they will be in, by default the modes that they have.
             played: Rows that are played at once, and are checked by themselves.
         """
-        bounds = self._limits.bounds()
         if not axes.any():
             return
-        self._check_resolution(axes)
         now = np.atleast_2d(self._modes() if modes is None else modes)
+        bounds = self._limits.bounds()
+        self._check_resolution(axes)
         known, key = self._drives.description, QUICK_STOP_DECELERATION
         if known.has(key):
             slow = axes & ~np.isnan(self._ramp_count()) & (bounds.braking < self._unramped_ramp())
