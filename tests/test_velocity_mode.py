@@ -388,7 +388,7 @@ def test_no_axis_is_faster_than_604ah_brings_to_rest_within_a_second(on_a_bus):
     drive.write((0x604A, 1), 300)
     with master as drives:
         motion.enable(drives, mode="vl")
-        with pytest.raises(SafetyError, match=r"= 301 is beyond the limit 300.*6085h \(in vl 604Ah\)"):
+        with pytest.raises(SafetyError, match=r"= 301 is beyond the limit 300.*6085h: .* it \(in vl 604Ah\) stops"):
             motion.turn(drives, 301)
         motion.turn(drives, 250)
         drives.advance(0.4)
@@ -397,6 +397,20 @@ def test_no_axis_is_faster_than_604ah_brings_to_rest_within_a_second(on_a_bus):
                 drives.write(name, value)
         drives.write((0x604A, 1), 2000)
         motion.turn(drives, 400)
+
+
+def test_604ah_limits_no_speed_of_other_modes(on_a_bus):
+    drive, master = on_a_bus("vl and pv", {(0x604A, 1): 300})
+    with master as drives:
+        motion.enable(drives, mode="pv")
+        motion.turn(drives, 600)
+        drives.advance(0.4)
+        assert rpm(drive) == pytest.approx(600, rel=0.02)
+        motion.turn(drives, 0)
+        drives.advance(0.4)
+        motion.select_mode(drives, "vl")
+        with pytest.raises(SafetyError, match="= 301 is beyond the limit 300"):
+            motion.turn(drives, 301)
 
 
 def test_a_slow_6049h_disables_no_axis_that_turns(on_a_bus):

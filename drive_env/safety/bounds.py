@@ -166,7 +166,9 @@ def _speed_unit(drives: WatchedDrives) -> str:
     return unit_of(drives.description, velocity_object(drives.description))
 
 
-def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
+def read_bounds(
+    limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rotors: RotorLimits, in_vl: Mask | None = None
+) -> Bounds:
     """Return the limits of every axis; those that the user left open are read from the drives.
 
     Args:
@@ -174,6 +176,7 @@ def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rot
         drives: The drives.
         rotor: Where their rotors are.
         of_rotors: The user's, as the rotors'.
+        in_vl: Axes in vl, of drives that have a ramp of its own for quick stops in it.
     """
     low, high = _own_range(drives)
     ends = (of_rotors.low, of_rotors.high)
@@ -194,7 +197,7 @@ def read_bounds(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rot
     ours = (velocity >= NO_LIMIT) & known_scale & told
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
-    braking = _braking(drives, rotor)
+    braking = _braking(drives, rotor, in_vl)
     # The scale of a revolution may be mistaken: a speed in rpm is checked by positions, too.
     by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
@@ -379,8 +382,10 @@ def read_vl_rate(drives: WatchedDrives, keys: tuple[Key, Key], rotor: RotorAngle
     return vl_rate(speed, time, rotor)
 
 
-def _braking(drives: WatchedDrives, rotor: RotorAngle) -> Floats:
-    """Return the deceleration of a quick stop [inc/s^2]: of 6085h and, in vl, 604Ah the least that is known."""
-    ramps = np.array([_rate(drives, QUICK_STOP_DECELERATION, rotor), read_vl_rate(drives, VL_QUICK_STOP, rotor)])
-    least = np.where(ramps > 0.0, ramps, np.inf).min(axis=0)
-    return np.where(np.isfinite(least), least, 0.0)
+def _braking(drives: WatchedDrives, rotor: RotorAngle, in_vl: Mask | None) -> Floats:
+    """Return the deceleration of a quick stop [inc/s^2]: 6085h, and in vl 604Ah where it is set; 0: not known."""
+    ramp = _rate(drives, QUICK_STOP_DECELERATION, rotor)
+    if in_vl is None:
+        return ramp
+    own = read_vl_rate(drives, VL_QUICK_STOP, rotor)
+    return np.where(in_vl & (own > 0.0), np.where(np.isfinite(own), own, 0.0), ramp)

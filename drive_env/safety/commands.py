@@ -509,11 +509,11 @@ class Commands:
             modes: What they will be in, by default the modes that they have.
             played: Rows that are played at once, and are checked by themselves.
         """
-        bounds = self._limits.bounds()
         if not axes.any():
             return
-        self._check_resolution(axes)
         now = np.atleast_2d(self._modes() if modes is None else modes)
+        bounds = self._limits.bounds()
+        self._check_resolution(axes)
         known, key = self._drives.description, QUICK_STOP_DECELERATION
         if known.has(key):
             slow = axes & ~np.isnan(self._ramp_count()) & (bounds.braking < self._unramped_ramp())
@@ -604,7 +604,7 @@ class Commands:
         by_ramp = bounds.braking[axis] * STOP_WITHIN / np.nan_to_num(bounds.count[axis], nan=1.0)
         if 0.0 < by_ramp <= bounds.velocity[axis] + 1e-6:
             in_vl = " (in vl 604Ah)" if self._drives.description.has(VL_QUICK_STOP[0]) else ""
-            return f"the quick stop's ramp, 6085h{in_vl}: no axis may be faster than it stops within {STOP_WITHIN:g} s"
+            return f"the quick stop's ramp, 6085h: no axis may be faster than it{in_vl} stops within {STOP_WITHIN:g} s"
         if bounds.default_speed[axis]:
             return "Limits(velocity=...): this drive has no limit of its own; 6,000 rpm is used"
         return self._limits.origin(self._limits.user.velocity, "velocity", "607Fh")

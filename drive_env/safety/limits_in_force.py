@@ -27,7 +27,7 @@ from drive_env.safety.bounds import (
     speed_in,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.objects import POSITION, VL_MAX
+from drive_env.safety.objects import POSITION, VL, VL_MAX, VL_QUICK_STOP
 from drive_env.safety.rotor import HOME_OFFSET, read_ratios, read_scale
 from mechanics.arrays import Floats, Integers
 
@@ -65,6 +65,8 @@ class LimitsInForce:
         self._drives = drives
         self._axes = axes
         self._lending = lending
+        self._has_vl_ramp = drives.description.has(VL_QUICK_STOP[0])
+        self._in_vl = np.zeros(drives.num_axes, bool)  # as the limits were read last
         self._of_rotors = self._capture()
 
     def change(self, user: Limits) -> None:
@@ -123,10 +125,13 @@ class LimitsInForce:
     def bounds(self) -> Bounds:
         """Return the limits of every axis as integers of its drive; those left open by the user are the drives' own."""
         bounds, generation = self.latest, self._generation
+        if self._has_vl_ramp and np.any(self._in_vl != (self._axes.mode == VL)):
+            bounds, self._in_vl = None, self._axes.mode == VL
         if bounds is None:
             if self._must_place or not self._axes.rotor.is_placed:
                 self.place()
-            bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._of_rotors)
+            in_vl = self._in_vl if self._has_vl_ramp else None
+            bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._of_rotors, in_vl)
             # A whole number of counts, but for rounding where they are rpm.
             counts = np.floor(bounds.braking * STOP_WITHIN / np.nan_to_num(bounds.count, nan=1.0) + 1e-6)
             ramp = np.where(bounds.braking > 0.0, counts, float(NO_LIMIT))

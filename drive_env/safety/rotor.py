@@ -108,7 +108,7 @@ def _position_objects(description: Description) -> tuple[Key, ...]:
 def read_scale(drives: WatchedDrives) -> Floats:
     """Return the increments of a revolution of every axis; nan where the drive does not say.
 
-    A drive that shows the speed of vl and no position has none: it tells rpm, counted in parts of a turn of ours.
+    A drive that shows the speed of vl and no position has none: it shows rpm, counted in parts of a turn of ours.
     """
     has = drives.description.has
     if has((cia402.VL_VELOCITY_ACTUAL, 0)) and not has((cia402.POSITION_ACTUAL, 0)):
