@@ -716,7 +716,7 @@ def test_a_unit_that_the_eds_does_not_tell_may_be_given(tmp_path):
         (None, (), "there is no EDS at"),
         ("no EDS at all\n", (), "describes no CiA 402 drive: it has no statusword 6041h"),
         (entry("6041", "Statusword", data_type="0x0006"), (), "no drive that could be enabled: it has no 6040h"),
-        (entry("6041", "Statusword", data_type="0x0007"), (), "CiA 402 has it with 16 bits; correct its DataType"),
+        (entry("6041", "Statusword", data_type="0x0005"), (), "CiA 402 has it with 16 bits; a drive needs an integer"),
         ("", ("--velocity-unit", "furlong"), "there is no unit 'furlong'"),
         ("", ("--motor", "none"), "no motor is named 'none'"),
     ],
