@@ -525,17 +525,16 @@ class _Draft:
             if key[0] in COMMUNICATION or variable.data_type not in INTEGER_TYPES or key in self._units.scale.values():
                 continue
             raw = variable.default if isinstance(variable.default, int) else 0
-            ends = {name: end for name in ("min", "max") if (end := getattr(variable, name)) is not None}
-            nearest = min(max(raw, ends.get("min", raw)), ends.get("max", raw))
-            if nearest == raw:
-                continue
             _, low, high = INTEGER_TYPES[variable.data_type]
-            widest = WIDEST.get((cia402.of_first_axis(key[0]), key[1]))
-            value = nearest if widest is None else ({"min": low, "max": high} | ends)[widest]
+            low = low if variable.min is None else variable.min
+            high = high if variable.max is None else variable.max
+            if low <= raw <= high:
+                continue
+            end = WIDEST.get((cia402.of_first_axis(key[0]), key[1]))
+            value = min(max(raw, low), high) if end is None else {"min": low, "max": high}[end]
             self._section(key)["DefaultValue"] = str(value)
             was = "none" if variable.default is None else str(raw)
-            told = f"{ends.get('min', low)} to {ends.get('max', high)}"
-            self._changes.append(Note(f"[{_text(key)}]", f"default {was} lies outside its limits {told}: {value}"))
+            self._changes.append(Note(f"[{_text(key)}]", f"default {was} lies outside {low} to {high}: {value}"))
 
     def _correct_scale(self) -> None:
         """Let the objects that make the scale of positions never be 0, by which others are divided."""

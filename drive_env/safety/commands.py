@@ -170,8 +170,9 @@ class Commands:
                 self._axes.asked_current = np.where(where, asked, self._axes.asked_current)
 
     def _speed_count(self) -> Floats:
-        """Return the increments a second of a count of 60FFh; 0 where its unit tells none."""
-        return np.nan_to_num(increments_per_count(self._known.find(TARGET_VELOCITY).unit, self._axes.rotor))
+        """Return the increments a second of a count of 60FFh; 0 where its unit tells none, or the drive has no 60FFh."""
+        unit = self._known.find(TARGET_VELOCITY).unit if self._known.has(TARGET_VELOCITY) else ""
+        return np.nan_to_num(increments_per_count(unit, self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
         """Forget a set-point, all by default, after a node reset or where the last write may not have arrived."""
