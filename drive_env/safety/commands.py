@@ -170,7 +170,7 @@ class Commands:
                 self._axes.asked_current = np.where(where, asked, self._axes.asked_current)
 
     def _speed_count(self) -> Floats:
-        """Return the increments a second of a count of 60FFh; 0 where its unit tells none, or the drive has no 60FFh."""
+        """Return the increments a second of a count of 60FFh; 0 where its unit tells none, or a drive has none."""
         unit = self._known.find(TARGET_VELOCITY).unit if self._known.has(TARGET_VELOCITY) else ""
         return np.nan_to_num(increments_per_count(unit, self._axes.rotor))
 
