@@ -183,6 +183,7 @@ def _rounded(value: float, digits: int = 2) -> float:
 # --- any CiA 402 drive ------------------------------------------------------------------------------------------------
 # Fields whose value here is no limit at all, which an object with limits of its own may not be able to say.
 NO_LIMIT = ("velocity_limit", "position_min", "position_max")
+SPEEDS = ("max_velocity", "homing_fast", "homing_slow")
 
 
 def standard_preset(device: Device, motor: Motor, given: Mapping[str, int] | None = None) -> dict[str, int]:
@@ -229,12 +230,15 @@ def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Ke
     dictionary = device.new_dictionary()
     context = Context(_increments(device, dictionary, given), device.current_full_scale / 32768.0, device.rated_current)
     values = _values(motor)
-    found = {}
-    for key, binding in device.bindings.items():
+    found: dict[Key, tuple[int, str]] = {}
+    fastest = math.inf
+    # First the limit of speed, which no speed passes.
+    for key, binding in sorted(device.bindings.items(), key=lambda row: row[1].field != "velocity_limit"):
         entry = dictionary.find(key)
-        if binding.field not in values or entry.access in ("ro", "const"):
+        if binding.field not in values:
             continue
-        value, code = values[binding.field], code_of(entry, binding)
+        code = code_of(entry, binding)
+        value = min(values[binding.field], fastest) if binding.field in SPEEDS else values[binding.field]
         assert entry.low is not None and entry.high is not None and isinstance(entry.default, int), "a number"
         free = encode_one(code._replace(low=-(2**63), high=2**63), value, code.factor(context))
         raw = max(free, 1) if value > 0.0 and free == 0 else free
@@ -245,8 +249,12 @@ def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Ke
                 raw = _widest(entry, binding.field)
             meant = "no limit" if binding.field in NO_LIMIT else f"{free}"
             why = f"{meant} lies outside its limits {entry.low} to {entry.high}: commissioned with {raw}"
-        found[key] = raw, why
-    return found
+        if is_written := entry.access not in ("ro", "const"):
+            found[key] = raw, why
+        limit = given.get(_text(key), raw if is_written else entry.default)
+        if binding.field == "velocity_limit" and limit:
+            fastest = limit * float(code.factor(context))
+    return {key: found[key] for key in device.bindings if key in found}
 
 
 def _widest(entry: Entry, field: str) -> int:

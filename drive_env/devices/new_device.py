@@ -491,7 +491,8 @@ class _Draft:
             unit = self._unit(row.unit)
             section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw"}
             shown = {} if unit == "raw" else {"Unit": _shown(unit)}
-            default = self._units.increments if row.field == "position_scaler" else 0
+            counts = self._units.increments or round(self._motor.encoder_counts)  # never 0, by which others are divided
+            default = counts if row.field == "position_scaler" else 0
             self._sections[object_section(index, sub)] = section | {"DefaultValue": str(default)} | shown
 
     def _correct_defaults(self) -> None:
