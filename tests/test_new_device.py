@@ -183,7 +183,7 @@ def test_what_is_stored_stays_and_a_dcf_makes_the_same_drive(folders, tmp_path, 
         was = {key: int(drives.read(key)[0]) for key in (0x6081, 0x6084)}
         factory = [known.new_dictionary().find(key).default for key in was]
         for key, raw in was.items():
-            drives.write(key, raw + 3)
+            drives.write(key, raw + 3 + np.arange(drives.num_axes))  # another value of each axis
         if has_store:
             drives.write((0x1010, 1), 0x65766173)
         drives.reset_node()

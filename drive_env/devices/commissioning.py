@@ -258,7 +258,7 @@ def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Ke
 
 
 def _widest(entry: Entry, field: str) -> int:
-    """Return what comes next to no limit within an object's own limits: the file's default, else the widest."""
+    """Return the raw value of an object that comes next to no limit: its default, else the widest it can have."""
     assert entry.low is not None and entry.high is not None and isinstance(entry.default, int), "a number"
     sign = -1 if field == "position_min" else 1
     if sign * entry.default > 0 and entry.low <= entry.default <= entry.high:

@@ -20,6 +20,7 @@ from drive_env.cia402 import Key
 from drive_env.devices import find_device
 from drive_env.devices.commissioning import STANDARD as STANDARD_RULE
 from drive_env.devices.commissioning import beyond_limits
+from drive_env.devices.dcf_values import COMMUNICATION, take_stored_values, with_defaults
 from drive_env.devices.eds_process_data import RPDOS, TPDOS, repair_process_data
 from drive_env.devices.new_images import EtherCatPart, ethercat_part
 from drive_env.devices.standard_objects import (
@@ -41,8 +42,7 @@ from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.drive_eds import axes_of, other_widths, read_types
 from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds, place_of
 from drive_env.dictionary.eds_values import number_of
-from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_file, read_eds
-from drive_env.dictionary.standard_types import COMMANDS
+from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_file
 from drive_env.dictionary.units import find_unit
 from drive_env.whole_file import files_to_be, write_whole
 
@@ -63,7 +63,6 @@ OWN_TITLES = ("Emulator: gains", "Emulator: motor", "Emulator: what the EDS lack
 STORE, RESTORE = 0x1010, 0x1011
 SYNC_ID = 0x1005
 CONSUMER_HEARTBEAT, GUARD_TIME, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x1029
-COMMUNICATION = range(0x1000, 0x2000)
 STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); those above are the maker's
 TRANSMISSION_TYPES = ["0...240", 254, 255]
 
@@ -222,9 +221,10 @@ class _Draft:
         self._fill_in: list[Note] = []
         self._told_of_modes: list[Note] = []
         self._changes: list[Note] = []
-        self._stored = self._take_stored_values()
+        self._stored = take_stored_values(eds, self._sections)
+        self._sections.pop("DeviceComissioning", None)
         self._leave_out_own_objects()
-        self._units = vendor_units(_with(self._types, self._stored), velocity_unit, acceleration_unit)
+        self._units = vendor_units(with_defaults(self._types, self._stored), velocity_unit, acceleration_unit)
         self._base = self._free_block()
         self._modes = self._supported_modes()
         self._bindings = self._standard_bindings()
@@ -273,36 +273,10 @@ class _Draft:
         }
 
     def stored_values(self) -> dict[str, int]:
-        """Return what a DCF says that the drive was commissioned with, as the files of a folder name objects."""
+        """Return the values of a DCF by the names that a folder's files have for objects."""
         return {_text(key): raw for key, raw in self._stored.items()}
 
     # --- what the file says of one drive ------------------------------------------------------------------------------
-    def _take_stored_values(self) -> dict[Key, int]:
-        """Take the values of a DCF out of its sections: those of parameters that can be written."""
-        node_id = number_of(self._sections.pop("DeviceComissioning", {}).get("NodeID", "")) or 1
-        texts = {
-            place: row.pop("ParameterValue")
-            for name, row in self._sections.items()
-            if "ParameterValue" in row and (place := place_of(name)) is not None
-        }
-        variables = {}
-        if texts:
-            for item in read_eds(self._eds, node_id).values():
-                for one in [item] if isinstance(item, ODVariable) else item.values():
-                    variables[one.index, one.subindex] = one
-        found = {}
-        for key in ((index, max(sub, 0)) for index, sub in texts):
-            variable = variables.get(key)
-            if variable is None or variable.data_type not in INTEGER_TYPES or not isinstance(variable.value, int):
-                continue
-            is_parameter = variable.access_type in ("rw", "rwr", "rww") and not COMMANDS.get(
-                cia402.of_first_axis(key[0])
-            )
-            follows = key[0] in COMMUNICATION and variable.value == variable.default  # COB-IDs: the node-ID
-            if is_parameter and not follows:
-                found[key] = variable.value
-        return found
-
     def _leave_out_own_objects(self) -> None:
         """Leave out the emulator's own objects of a file that a folder was exported as: they are made anew."""
         own = {
@@ -318,7 +292,7 @@ class _Draft:
 
     def _drop_wrong_process_data(self) -> None:
         """Leave the PDOs of a DCF whose values cannot be as the file's defaults have them."""
-        told = list(repair_process_data(copy.deepcopy(self._sections), _with(self._types, self._stored)))
+        told = list(repair_process_data(copy.deepcopy(self._sections), with_defaults(self._types, self._stored)))
         known = {note.what for note in self._changes}
         for where, why in told:
             index, _ = place_of(where.strip("[]")) or (0, 0)
@@ -335,6 +309,8 @@ class _Draft:
             variable = self._types.get(key)
             low, high = (None, None) if variable is None else (variable.min, variable.max)
             possible = raw in allowed.get((cia402.of_first_axis(key[0]), key[1]), (raw,))
+            possible &= raw > 0 or key not in self._units.scale.values()
+            possible &= not {object_section(*key), object_section(key[0])}.isdisjoint(self._sections)
             if not possible or (low is not None and raw < low) or (high is not None and raw > high):
                 del self._stored[key]
                 self._changes.append(Note(f"[{_text(key)}]", f"ParameterValue={raw} is not possible here: not taken"))
@@ -703,14 +679,6 @@ class _Draft:
                       f'object = "{_text(key)}"', "highest = 1_000_000", f'loop = "{loop}"', f'part = "{part.upper()}"',
                       ""]  # fmt: skip
         return "\n".join(lines)
-
-
-def _with(types: Types, values: Mapping[Key, int]) -> dict[Key, ODVariable]:
-    """Return entries with other defaults."""
-    changed = {key: copy.copy(types[key]) for key in values.keys() & types.keys()}
-    for key, variable in changed.items():
-        variable.default = values[key]
-    return {**types, **changed}
 
 
 def _why_not(method: int) -> str:

@@ -27,10 +27,10 @@ MOST_AXES = 8
 LONGEST = 32  # bits that one frame of SDO carries: a stop, and a look while an axis moves, wait for no second one
 
 
-def read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
+def read_types(path: Path | EdsText, node_id: int = 1) -> dict[Key, ODVariable]:
     """Return every entry of an EDS as python-canopen has it."""
     types = {}
-    for item in read_eds(path).values():
+    for item in read_eds(path, node_id).values():
         for variable in [item] if isinstance(item, ODVariable) else item.values():
             types[variable.index, variable.subindex] = variable
     return types
