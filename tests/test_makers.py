@@ -90,6 +90,13 @@ def test_no_limit_is_the_files_default_or_the_widest_and_told(made, name, key, r
     assert line in (device.folder / "to_fill_in.md").read_text(encoding="utf-8").splitlines()
 
 
+def test_no_speed_that_is_commissioned_passes_the_limit_of_speed(made):
+    """A master refuses every move of a drive with a profile velocity beyond its 607Fh."""
+    _, device = made("helvia_2")
+    with emulated(device) as drives:
+        assert drives.read(0x6081)[0] == drives.read(0x607F)[0] == 5000000
+
+
 def test_what_can_say_no_limit_says_it(made):
     _, device = made("iberis_1")
     with emulated(device) as drives:
