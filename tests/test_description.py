@@ -48,7 +48,7 @@ def test_any_other_drive_is_its_eds_and_the_defaults_of_cia_402(tmp_path):
         ),
         ([(0x6041, "u8", "ro")], "6041h object 6041 is an integer of 8 bits"),
         ([STATUS, (0x6841, "u16", "ro"), (0x6864, "f32", "ro")], r"6864h object 6864 is of no integer type \(0008h\)"),
-        ([STATUS, (0x6060, "i16", "rw")], "6060h .* CiA 402 has it with 8 bits; correct its DataType"),
+        ([STATUS, (0x6060, "i64", "rw")], "6060h .* CiA 402 has it with 8 bits; a drive needs an integer of 8 to 32"),
     ],
 )
 def test_what_decides_what_a_drive_does_has_cia_402s_length(tmp_path, rows, message):

@@ -6,6 +6,7 @@ The node has two axes, whose profile objects lie 800h apart, and of each directi
 from __future__ import annotations
 
 import dataclasses
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from rigs.small_eds import I8, I16, I32, TEXT, U16, described, small_eds
 
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.entries import EdsText
 from drive_env.fieldbus.errors import BusError, NoAnswerError, RefusedError
 from drive_env.master.can import pdo
 from drive_env.master.can.bus_time import BusTime
@@ -31,11 +33,11 @@ ODD = [(0x2000, "Flag", 0x01, "rw", 1), (0x2001, "Name", TEXT, "rw", 1)]
 NUMBERS = range(6)
 
 
-def node_eds(rpdo_access="rw", entries=4, most=None, odd=()):
+def node_eds(entries=4, most=None, odd=()):
     further = [(index + 0x800, f"{name} 2", *rest) for index, name, *rest in ROWS]
     records = []
     for number in NUMBERS:
-        records += [(0x1400 + number, rpdo_access, 2, None), (0x1600 + number, "rw", entries, most),
+        records += [(0x1400 + number, "rw", 2, None), (0x1600 + number, "rw", entries, most),
                     (0x1800 + number, "rw", 2, None), (0x1A00 + number, "rw", entries, most)]  # fmt: skip
     return small_eds([*ROWS, *further, *ODD], [*records, *odd])
 
@@ -288,7 +290,10 @@ def test_a_drive_that_takes_none_of_them_is_told(pdos, node, one):
 
 @pytest.mark.parametrize("access", ["ro", "const"])
 def test_a_type_that_nobody_can_write_is_left(node, access):
-    drive = described(node_eds(rpdo_access=access), 2)
+    eds = node_eds()
+    fixed = re.sub(r"(\[14..sub2\]\n[^[]*?AccessType=)rw", rf"\g<1>{access}", eds.text)
+    assert fixed.count(f"AccessType={access}") > eds.text.count(f"AccessType={access}")
+    drive = described(EdsText("fixed.eds", fixed), 2)
     found = PdoConfiguration(5, node, drive, SimpleNamespace(node_of=lambda node, axis: 6))
     found.configure([[drive.dictionary.find(0x6040)]], INTO_DRIVE)
     assert node.take()[:3] == ["1400:01 80000205", "1600:00 00", "1600:01 60400010"]
@@ -437,6 +442,9 @@ class Configured:
                 RemotePdo(f"PDO {number + 1}", direction.identifiers[number] + self.node, start, tuple(members))
             )
         return pdos
+
+    def standing(self, direction):
+        return ()
 
     def forget(self):
         self.asked.append("forget")

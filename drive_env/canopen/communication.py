@@ -13,6 +13,7 @@ from drive_env.dictionary.entries import Entry
 from drive_env.node import mapping
 from drive_env.node.node_objects import NodeObjects
 
+COMMUNICATION = range(0x1000, 0x2000)
 SYNC_ID = 0x1005
 SYNC_PERIOD = 0x1006
 SYNC_WINDOW = 0x1007

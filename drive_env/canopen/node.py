@@ -34,7 +34,7 @@ from drive_env.node.node_errors import NodeErrors
 from drive_env.node.node_objects import ERROR_HISTORY, IDENTITY, signed_command
 from drive_env.node.parameters import Parameters
 from drive_env.node.sdo_server import SdoServer
-from drive_env.node.store import PowerLostError, Store
+from drive_env.node.store import PowerLostError, Section, Store
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +118,7 @@ class Node:
         entries = self._objects.entries
         self._module = ModuleObjects(device, entries, self._configure)
         self.dictionary = NodeDictionary(device, entries, self._module, self._axes)
-        self._store = Store(store, device.name)
+        self._store = Store(store, device.name, self._commissioned())
         self._parameters = Parameters(
             device, self._module, self._axes, self.dictionary, self._store, lambda: self.node_id, self._works_on_store
         )
@@ -136,6 +136,16 @@ class Node:
         self._make_services(sorted({entry.index for entry in entries}))
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
         self._empty_buffers(takes_time)
+
+    def _commissioned(self) -> dict[str, Section]:
+        """Return the section of communication as the drives were commissioned; {} where that is the factory's."""
+        found: Section = {}
+        for entry in self._objects.entries:
+            if entry.index in communication.COMMUNICATION and entry.access in ("rw", "rwr", "rww") and entry.bits:
+                raw = int(self._objects.read((entry.index, entry.sub))[self.first_axis])
+                if raw != entry.default:
+                    found[entry.index, entry.sub] = raw
+        return {"communication": found} if found else {}
 
     def _empty_buffers(self, takes_time: bool) -> None:
         """Drop received frames and answers under way."""

@@ -11,6 +11,7 @@ in the order of writing, each with an integer, or with a quantity of the rule:
     "Hall Polarity" = { of = "hall_polarity", unless = 0 }  # left out where the quantity is that
 
 `standard_preset` needs no file: it writes what a drive's bindings tell it of, each value in the unit that they name.
+With one (rule = "standard") the objects listed there have the values given there instead, whatever the motor.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.devices.standard_objects import HOMING_HERE
 from drive_env.dictionary.codec import code_of, encode_one
 from drive_env.dictionary.position_scale import position_scale, set_point_ratio, velocity_ratio
@@ -30,7 +32,7 @@ from drive_env.dictionary.units import Context
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.dictionary.entries import ObjectDictionary
+    from drive_env.dictionary.entries import Entry, ObjectDictionary
     from drive_env.motors import Motor
 
 # Servo. Gains of the cascade for a total inertia of three rotors, the velocity loop with T_i = 5/w_v.
@@ -75,8 +77,12 @@ def preset(device: Device, motor: Motor, table: Mapping[str, Any]) -> dict[str, 
         ValueError: If a gain leaves the drive's range: the motor does not suit this drive; or for an unknown rule or
             quantity.
     """
+    if table["rule"] == STANDARD:
+        return standard_preset(device, motor, table["objects"])
     if (rule := RULES.get(table["rule"])) is None:
-        raise ValueError(f"commissioning.toml: no rule is named {table['rule']!r}; there are {', '.join(RULES)}")
+        raise ValueError(
+            f"commissioning.toml: no rule is named {table['rule']!r}; there are {', '.join((*RULES, STANDARD))}"
+        )
     quantities = rule(device, motor)
     found = {}
     for name, row in table["objects"].items():
@@ -153,6 +159,7 @@ def _stepper(device: Device, motor: Motor) -> dict[str, float]:
 
 
 RULES = {"servo": _servo, "stepper": _stepper}
+STANDARD = "standard"
 
 
 def corner_speed(motor: Motor, current: float, supply: float) -> float:
@@ -174,8 +181,18 @@ def _rounded(value: float, digits: int = 2) -> float:
 
 
 # --- any CiA 402 drive ------------------------------------------------------------------------------------------------
-def standard_preset(device: Device, motor: Motor) -> dict[str, int]:
+# Fields whose value here is no limit at all, which an object with limits of its own may not be able to say.
+NO_LIMIT = ("velocity_limit", "position_min", "position_max")
+SPEEDS = ("max_velocity", "homing_fast", "homing_slow")
+
+
+def standard_preset(device: Device, motor: Motor, given: Mapping[str, int] | None = None) -> dict[str, int]:
     """Return object ("6081:0") -> raw value, in the order of writing.
+
+    Args:
+        device: The drive.
+        motor: What it is commissioned for.
+        given: Values that stand whatever the motor; None: nothing is given.
 
     Raises:
         ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
@@ -183,22 +200,10 @@ def standard_preset(device: Device, motor: Motor) -> dict[str, int]:
     from drive_env.devices.gains import bandwidth_gains
 
     dictionary = device.new_dictionary()
-    found = _scale(device, dictionary, motor)
-    context = Context(_increments(device, dictionary, found), device.current_full_scale / 32768.0, device.rated_current)
-    ratios = {"velocity_ratio": velocity_ratio(device.roles), "set_point_ratio": set_point_ratio(device.roles)}
-    of_roles: dict[str, Any] = {
-        name: scale.increments([np.array(float(dictionary.find(key).default)) for key in scale.keys])
-        for name, scale in ratios.items() if scale is not None
-    }  # fmt: skip
-    context = context._replace(**of_roles)
-    values = _values(motor)
-    for key, binding in device.bindings.items():
-        entry = dictionary.find(key)
-        if binding.field not in values or entry.access in ("ro", "const") or _text(key) in found:
-            continue
-        code = code_of(entry, binding)
-        raw = encode_one(code, values[binding.field], code.factor(context))
-        found[_text(key)] = max(raw, 1) if values[binding.field] > 0.0 and raw == 0 else raw
+    given = dict(given or {})
+    found = {key: raw for key, raw in _scale(device, dictionary, motor).items() if key not in given}
+    for key, (raw, _) in _of_motor(device, motor, found | given).items():
+        found.setdefault(_text(key), raw)
     gains = bandwidth_gains(device, motor, ROTORS * motor.inertia, **BANDWIDTHS)
     found |= {_text(row.key): int(raw) for row, raw in zip(device.gains.rows, gains, strict=True)}
     for index, rated in (
@@ -206,11 +211,65 @@ def standard_preset(device: Device, motor: Motor) -> dict[str, int]:
         (cia402.RATED_TORQUE, 1e3 * motor.rated_torque),
     ):
         if dictionary.has(index) and dictionary.find(index).access not in ("ro", "const"):
-            found[_text((index, 0))] = max(round(rated), 1)
+            entry = dictionary.find(index)
+            assert entry.low is not None and entry.high is not None, "a number"
+            found[_text((index, 0))] = min(max(round(rated), 1, entry.low), entry.high)
     methods = device.allowed_values.get((cia402.HOMING_METHOD, 0), ())
     if methods and dictionary.find(cia402.HOMING_METHOD).default not in methods:
         found[_text((cia402.HOMING_METHOD, 0))] = next((one for one in HOMING_HERE if one in methods), methods[-1])
-    return found
+    return found | given
+
+
+def beyond_limits(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Key, str]:
+    """Return the objects that cannot have what `standard_preset` would write, each with what they have instead."""
+    return {key: why for key, (_, why) in _of_motor(device, motor, given).items() if why and _text(key) not in given}
+
+
+def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Key, tuple[int, str]]:
+    """Return the raw values that follow from a motor, each with what its object's limits made of it, "" for nothing."""
+    dictionary = device.new_dictionary()
+    context = Context(_increments(device, dictionary, given), device.current_full_scale / 32768.0, device.rated_current)
+    ratios = {"velocity_ratio": velocity_ratio(device.roles), "set_point_ratio": set_point_ratio(device.roles)}
+    of_roles: dict[str, Any] = {
+        name: scale.increments([np.array(float(given.get(_text(k), dictionary.find(k).default))) for k in scale.keys])
+        for name, scale in ratios.items() if scale is not None
+    }  # fmt: skip
+    context = context._replace(**of_roles)
+    values = _values(motor)
+    found: dict[Key, tuple[int, str]] = {}
+    fastest = math.inf
+    # First the limit of speed, which no speed passes.
+    for key, binding in sorted(device.bindings.items(), key=lambda row: row[1].field != "velocity_limit"):
+        entry = dictionary.find(key)
+        if binding.field not in values:
+            continue
+        code = code_of(entry, binding)
+        value = min(values[binding.field], fastest) if binding.field in SPEEDS else values[binding.field]
+        assert entry.low is not None and entry.high is not None and isinstance(entry.default, int), "a number"
+        free = encode_one(code._replace(low=-(2**63), high=2**63), value, code.factor(context))
+        raw = max(free, 1) if value > 0.0 and free == 0 else free
+        why = ""
+        if not entry.low <= raw <= entry.high:
+            raw = min(max(raw, entry.low), entry.high)
+            if binding.field in NO_LIMIT:
+                raw = _widest(entry, binding.field)
+            meant = "no limit" if binding.field in NO_LIMIT else f"{free}"
+            why = f"{meant} lies outside its limits {entry.low} to {entry.high}: commissioned with {raw}"
+        if is_written := entry.access not in ("ro", "const"):
+            found[key] = raw, why
+        limit = given.get(_text(key), raw if is_written else entry.default)
+        if binding.field == "velocity_limit" and limit:
+            fastest = limit * float(code.factor(context))
+    return {key: found[key] for key in device.bindings if key in found}
+
+
+def _widest(entry: Entry, field: str) -> int:
+    """Return the raw value of an object that comes next to no limit: its default, else the widest it can have."""
+    assert entry.low is not None and entry.high is not None and isinstance(entry.default, int), "a number"
+    sign = -1 if field == "position_min" else 1
+    if sign * entry.default > 0 and entry.low <= entry.default <= entry.high:
+        return entry.default
+    return entry.low if sign < 0 else entry.high
 
 
 def _values(motor: Motor) -> dict[str, float]:
@@ -263,7 +322,7 @@ def _scale(device: Device, dictionary: ObjectDictionary, motor: Motor) -> dict[s
     return {_text(key): round(first) if k == 0 else 1 for k, key in enumerate(scale.keys)}
 
 
-def _increments(device: Device, dictionary: ObjectDictionary, found: dict[str, int]) -> float:
+def _increments(device: Device, dictionary: ObjectDictionary, found: Mapping[str, int]) -> float:
     scale = position_scale(device.roles)
     if scale is None:
         return 65536.0
@@ -271,5 +330,5 @@ def _increments(device: Device, dictionary: ObjectDictionary, found: dict[str, i
     return float(scale.increments([np.array(float(value)) for value in values]))
 
 
-def _text(key: tuple[int, int]) -> str:
+def _text(key: Key) -> str:
     return f"{key[0]:04X}:{key[1]}"

@@ -1,4 +1,4 @@
-"""Process data of an EDS that a node could not start with: missing COB-IDs, mappings of missing objects."""
+"""Process data of an EDS that a node could not start with: missing COB-IDs, mappings of missing objects or lengths."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from canopen.objectdictionary import ODVariable
 
 from drive_env.cia402 import Key
 from drive_env.dictionary.eds_file import Section, object_section
+from drive_env.dictionary.entries import INTEGER_TYPES
 
 RPDOS, TPDOS = range(0x1400, 0x1600), range(0x1800, 0x1A00)
 TO_MAPPING = 0x200
@@ -17,7 +18,9 @@ LONGEST = 64  # bits
 
 
 def repair_process_data(sections: dict[str, Section], types: Mapping[Key, ODVariable]) -> Iterator[tuple[str, str]]:
-    """Give PDOs without a COB-ID that of the predefined set, or none; map nothing where a mapping cannot be.
+    """Give PDOs without a COB-ID that of the predefined set, or none; lengths are those of the mapped objects.
+
+    Nothing is mapped where a mapping cannot be.
 
     Returns:
         Where, and what was done.
@@ -33,23 +36,32 @@ def repair_process_data(sections: dict[str, Section], types: Mapping[Key, ODVari
         count = types.get((mapping, 0))
         if cob_id is None or count is None or not count.default:
             continue
-        wrong = _wrong_mapping([types.get((mapping, sub)) for sub in range(1, int(count.default) + 1)], types)
+        entries = [types.get((mapping, sub)) for sub in range(1, int(count.default) + 1)]
+        raws = [one.default if one is not None and isinstance(one.default, int) else None for one in entries]
+        wrong = _wrong_mapping(raws, types)
+        for sub, raw in enumerate(raws if not wrong else (), 1):
+            assert raw is not None, "nothing is wrong"
+            bits = len(types[raw >> 16, raw >> 8 & 0xFF])
+            if bits != raw & 0xFF:
+                name, right = object_section(mapping, sub), f"0x{raw & ~0xFF | bits:08X}"
+                sections[name]["DefaultValue"] = right
+                yield f"[{name}]", f"0x{raw:08X} is read as {right}, by the length of what it maps"
         if wrong:
             sections[object_section(mapping, 0)]["DefaultValue"] = "0"
             yield f"[{mapping:04X}]", f"{wrong}: nothing is mapped"
 
 
-def _wrong_mapping(mapped: list[ODVariable | None], types: Mapping[Key, ODVariable]) -> str:
-    """Return why objects cannot be mapped, "" if they can."""
+def _wrong_mapping(raws: list[int | None], types: Mapping[Key, ODVariable]) -> str:
+    """Return why objects cannot be mapped, "" if they can; lengths are the objects' own."""
     length = 0
-    for sub, variable in enumerate(mapped, 1):
-        if variable is None or not isinstance(variable.default, int):
+    for sub, raw in enumerate(raws, 1):
+        if raw is None:
             return f"sub-index {sub} is missing"
-        index, place, bits = variable.default >> 16, variable.default >> 8 & 0xFF, variable.default & 0xFF
+        index, place = raw >> 16, raw >> 8 & 0xFF
         target = types.get((index, place))
         if target is None:
             return f"{index:04X}h:{place:02X} does not exist"
-        if len(target) != bits:
-            return f"{index:04X}h:{place:02X} has {len(target)} bits, not {bits}"
-        length += bits
+        if len(target) != raw & 0xFF and (target.data_type not in INTEGER_TYPES or len(target) % 8):
+            return f"{index:04X}h:{place:02X} has {len(target)} bits, not {raw & 0xFF}"
+        length += len(target)
     return f"{length} bits are more than {LONGEST}" if length > LONGEST else ""

@@ -7,16 +7,21 @@ effect here stays an entry that can be read and written, and is listed as such.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from canopen.objectdictionary import ODVariable
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.devices.eds_process_data import repair_process_data
+from drive_env.devices import find_device
+from drive_env.devices.commissioning import STANDARD as STANDARD_RULE
+from drive_env.devices.commissioning import beyond_limits
+from drive_env.devices.dcf_values import COMMUNICATION, take_stored_values, with_defaults
+from drive_env.devices.eds_process_data import RPDOS, TPDOS, repair_process_data
 from drive_env.devices.new_images import EtherCatPart, ethercat_part
 from drive_env.devices.standard_objects import (
     BY_THEMSELVES,
@@ -34,13 +39,13 @@ from drive_env.devices.variants import TYPES
 from drive_env.devices.vendor_esi import read_esi
 from drive_env.devices.vendor_units import vendor_units
 from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.drive_eds import axes_of, read_types
-from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds
+from drive_env.dictionary.drive_eds import axes_of, other_widths, read_types
+from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds, place_of
 from drive_env.dictionary.eds_values import number_of
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_file
 from drive_env.dictionary.roles import VL_FACTORS
 from drive_env.dictionary.units import find_unit
-from drive_env.whole_file import files_to_be
+from drive_env.whole_file import files_to_be, write_whole
 
 if TYPE_CHECKING:
     from drive_env.firmware.common.modes import Mode
@@ -55,9 +60,10 @@ LIST_NAME, EDS_NAME = "to_fill_in.md", "drive.eds"
 # Where the emulator's own objects may lie: the first block of the manufacturer's area that the EDS leaves free.
 OWN_BLOCKS = range(0x5F00, 0x1FFF, -0x100)
 OWN_PER_AXIS = 0x10
+OWN_TITLES = ("Emulator: gains", "Emulator: motor", "Emulator: what the EDS lacks")
 STORE, RESTORE = 0x1010, 0x1011
 SYNC_ID = 0x1005
-ERROR_BEHAVIOUR = 0x1029
+CONSUMER_HEARTBEAT, GUARD_TIME, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x1029
 STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); those above are the maker's
 TRANSMISSION_TYPES = ["0...240", 254, 255]
 
@@ -84,6 +90,12 @@ MODE_TARGETS = {
     cia402.CSV: (cia402.TARGET_VELOCITY, 0),
     cia402.CST: (cia402.TARGET_TORQUE, 0),
 }
+
+
+# Limits: where the default lies outside an object's own limits it becomes the widest of these, of others the nearest.
+WIDEST = {(index, 0): "max" for index in (cia402.FOLLOWING_WINDOW, cia402.MAX_TORQUE, cia402.MAX_CURRENT,
+          cia402.MAX_PROFILE_VELOCITY, cia402.MAX_MOTOR_SPEED)}  # fmt: skip
+WIDEST |= {(cia402.POSITION_LIMITS, 1): "min", (cia402.POSITION_LIMITS, 2): "max"}
 
 
 class Note(NamedTuple):
@@ -173,13 +185,16 @@ def new_device(
     assert source is not None, "an EDS, or what was made of an ESI"
     draft = _Draft(source, (esi or eds or folder).name, motor, velocity_unit, acceleration_unit, part)
     made = draft.made(folder)
-    files: dict[Path, str | bytes] = {folder / name: text for name, text in draft.files(folder).items()}
     try:
-        with files_to_be(files | {folder / LIST_NAME: made.text()}):
+        with files_to_be({folder / name: text for name, text in draft.files(folder).items()}):
             pass
+        device = find_device.__wrapped__(str(folder))  # not kept: a person goes on to edit these files
+        limited = beyond_limits(device, motor, draft.stored_values())
+        notes = tuple(Note(f"{_text(key)} of drive.eds", why) for key, why in limited.items())
+        made = made._replace(fill_in=(*notes, *made.fill_in))
+        write_whole(folder / LIST_NAME, made.text())
     except BaseException:
-        with suppress(OSError):
-            folder.rmdir()  # it would be refused the next time
+        rmtree(folder, ignore_errors=True)  # it would be refused the next time
         raise
     return made
 
@@ -207,10 +222,13 @@ class _Draft:
             if (index, 0) not in self._types:
                 raise ValueError(f"{eds} describes no drive that could be enabled: it has no {index:04X}h")
         self._sections: dict[str, Section] = {name: dict(row) for name, row in self._file.sections.items()}
-        self._units = vendor_units(self._types, velocity_unit, acceleration_unit)
         self._fill_in: list[Note] = []
         self._told_of_modes: list[Note] = []
         self._changes: list[Note] = []
+        self._stored = take_stored_values(eds, self._sections)
+        self._sections.pop("DeviceComissioning", None)
+        self._leave_out_own_objects()
+        self._units = vendor_units(with_defaults(self._types, self._stored), velocity_unit, acceleration_unit)
         self._base = self._free_block()
         self._modes = self._supported_modes()
         self._bindings = self._standard_bindings()
@@ -221,12 +239,18 @@ class _Draft:
         self._correct_defaults()
         if part is None:
             self._changes += [Note(*row) for row in repair_process_data(self._sections, self._types)]
+            self._drop_wrong_process_data()
             self._tell_of_communication()
         else:
             self._fill_in += [Note(*row) for row in part.class_values]
             self._changes += [Note(*row) for row in part.changes]
         self._tell_of_units()
         self._drop_twinless()
+        self._check_stored_values()
+        self._fill_in += [
+            Note(f"{index:04X}h", f"has {bits} bits in the EDS and {usual} in CiA 402: taken as the EDS has it")
+            for (index, _), bits, usual in other_widths(self._types)
+        ]
 
     def made(self, folder: Path) -> NewDevice:
         repairs = [Note(one.where, one.what) for one in self._file.repairs]
@@ -240,7 +264,10 @@ class _Draft:
 
     def files(self, folder: Path) -> dict[str, str]:
         """Return the folder's files."""
+        stored = "".join(f'"{name}" = {raw}\n' for name, raw in self.stored_values().items())
+        head = "# What the drive of the DCF was commissioned with; the rest follows from the motor.\n\n"
         return {
+            **({"commissioning.toml": f'{head}rule = "{STANDARD_RULE}"\n\n[objects]\n{stored}'} if stored else {}),
             "device.toml": self._device_toml(folder),
             EDS_NAME: parse_eds(EdsFile(self._sections, ()).text()).text(),
             "bindings.toml": self._bindings_toml(),
@@ -248,6 +275,52 @@ class _Draft:
             + "".join(f'{name} = "{_text(key)}"\n' for name, key in self._roles.items()),
             "gains.toml": self._gains_toml(),
         }
+
+    def stored_values(self) -> dict[str, int]:
+        """Return the values of a DCF by the names that a folder's files have for objects."""
+        return {_text(key): raw for key, raw in self._stored.items()}
+
+    # --- what the file says of one drive ------------------------------------------------------------------------------
+    def _leave_out_own_objects(self) -> None:
+        """Leave out the emulator's own objects of a file that a folder was exported as: they are made anew."""
+        own = {
+            place[0]
+            for name, row in self._sections.items()
+            if (place := place_of(name)) is not None and row.get("ParameterName", "") in OWN_TITLES
+        }
+        wiring = {index for index in own if self._sections[object_section(index)]["ParameterName"] == OWN_TITLES[1]}
+        self._types = {key: one for key, one in self._types.items() if key[0] not in own}
+        self._stored = {key: raw for key, raw in self._stored.items() if key[0] not in wiring}
+        for name in [name for name in self._sections if (place_of(name) or (0, 0))[0] in own]:
+            del self._sections[name]
+
+    def _drop_wrong_process_data(self) -> None:
+        """Leave the PDOs of a DCF whose values cannot be as the file's defaults have them."""
+        told = list(repair_process_data(copy.deepcopy(self._sections), with_defaults(self._types, self._stored)))
+        known = {note.what for note in self._changes}
+        for where, why in told:
+            index, _ = place_of(where.strip("[]")) or (0, 0)
+            of_pdo = {index, index + 0x200, index - 0x200} & {key[0] for key in self._stored}
+            if where not in known and of_pdo:
+                self._stored = {key: raw for key, raw in self._stored.items() if key[0] not in of_pdo}
+                self._changes.append(Note(where, f"the DCF's values are not taken: {why}"))
+
+    def _check_stored_values(self) -> None:
+        """Leave out values of a DCF that their objects cannot have here."""
+        allowed = {(cia402.HOMING_METHOD, 0): {0, *self._homing_methods()}, (cia402.QUICK_STOP_OPTION, 0):
+                   set(QUICK_STOP_OPTIONS)}  # fmt: skip
+        for key, raw in list(self._stored.items()):
+            variable = self._types.get(key)
+            low, high = (None, None) if variable is None else (variable.min, variable.max)
+            possible = raw in allowed.get((cia402.of_first_axis(key[0]), key[1]), (raw,))
+            possible &= raw > 0 or key not in self._units.scale.values()
+            possible &= not {object_section(*key), object_section(key[0])}.isdisjoint(self._sections)
+            if not possible or (low is not None and raw < low) or (high is not None and raw > high):
+                del self._stored[key]
+                self._changes.append(Note(f"[{_text(key)}]", f"ParameterValue={raw} is not possible here: not taken"))
+        if self._stored:
+            why = "hold whatever the motor; the rest follows from it"
+            self._fill_in.append(Note(f"commissioning.toml, {len(self._stored)} values of the DCF", why))
 
     # --- what the drive has ---------------------------------------------------------------------------------------
     def _default(self, index: int, sub: int = 0) -> int:
@@ -390,10 +463,7 @@ class _Draft:
             for row in NEEDED
             if row.field not in fields and (not row.modes or any(mode in self._modes for mode in row.modes))
         ]
-        groups: tuple[tuple[str, Sequence[OwnObject]], ...] = (
-            ("Emulator: gains", GAINS), ("Emulator: motor", MOTOR), ("Emulator: what the EDS lacks", others)
-        )  # fmt: skip
-        for offset, (title, rows) in enumerate(groups):
+        for offset, (title, rows) in enumerate(zip(OWN_TITLES, (GAINS, MOTOR, others), strict=True)):
             for sub, row in enumerate(rows, 1):
                 key = (self._base + offset, sub)
                 self._own.append((key, row))
@@ -451,11 +521,29 @@ class _Draft:
             self._section(exponent)["DefaultValue"] = "-3"
             self._changes.append(Note(f"[{_text(exponent)}]", "has no default: -3, milliseconds"))
         self._correct_scale()
+        self._correct_defaults_beyond_limits()
         self._correct_factors()
         for key, variable in self._types.items():
             if isinstance(variable.default, int) and variable.default >= 1 << 63:
                 self._section(key)["DefaultValue"] = "0"
                 self._changes.append(Note(f"[{_text(key)}]", "the emulator keeps 63 bits: its default is 0"))
+
+    def _correct_defaults_beyond_limits(self) -> None:
+        """Let the factory value of an object, 0 where the file has none, be one that its own limits allow."""
+        for key, variable in self._types.items():
+            if key[0] in COMMUNICATION or variable.data_type not in INTEGER_TYPES or key in self._units.scale.values():
+                continue
+            raw = variable.default if isinstance(variable.default, int) else 0
+            _, low, high = INTEGER_TYPES[variable.data_type]
+            low = low if variable.min is None else variable.min
+            high = high if variable.max is None else variable.max
+            if low <= raw <= high:
+                continue
+            end = WIDEST.get((cia402.of_first_axis(key[0]), key[1]))
+            value = min(max(raw, low), high) if end is None else {"min": low, "max": high}[end]
+            self._section(key)["DefaultValue"] = str(value)
+            was = "none" if variable.default is None else str(raw)
+            self._changes.append(Note(f"[{_text(key)}]", f"default {was} lies outside {low} to {high}: {value}"))
 
     def _correct_scale(self) -> None:
         """Let the objects that make the scale of positions never be 0, by which others are divided."""
@@ -501,6 +589,28 @@ class _Draft:
     def _tell_of_communication(self) -> None:
         if (SYNC_ID, 0) not in self._types:
             self._fill_in.append(Note(f"{SYNC_ID:04X}h", "the EDS has none: SYNC is taken as 080h, as CiA 301 has it"))
+        indices = {index for index, _ in self._types}
+        if not {CONSUMER_HEARTBEAT, GUARD_TIME} & indices:
+            self._fill_in.append(
+                Note(
+                    f"{CONSUMER_HEARTBEAT:04X}h and {GUARD_TIME:04X}h",
+                    "the EDS has neither: the drive does not notice when its master dies, and goes on with what it was "
+                    "last told. A master moves it with Limits(silence=None) alone; keep the emergency stop at hand",
+                )
+            )
+        fixed = [f"{index:04X}h" for index in sorted(indices) if self._is_fixed_pdo(index)]
+        if fixed:
+            self._fill_in.append(
+                Note(
+                    ", ".join(fixed),
+                    "sub-index 1 can only be read: masters take them as they stand, or go by SDO",
+                )
+            )
+
+    def _is_fixed_pdo(self, index: int) -> bool:
+        cob_id = self._types.get((index, 1))
+        is_pdo = index in RPDOS or index in TPDOS
+        return is_pdo and cob_id is not None and cob_id.access_type in ("ro", "const")
 
     def _tell_of_units(self) -> None:
         units = self._units

@@ -1,8 +1,8 @@
-"""Checks that an EDS is of a CiA 402 drive: its axes, and objects that are integers of the standard's length."""
+"""Checks that an EDS is of a CiA 402 drive: its axes, and objects that are integers with room for the standard's."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from canopen.objectdictionary import ODVariable
@@ -12,8 +12,11 @@ from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.eds_file import place_of_line
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_text, read_eds
+from drive_env.dictionary.standard_types import STANDARD_TYPES
 
 # Objects whose integers are taken apart bit by bit, or tell where an axis is and goes: their length [bits] by CiA 402.
+# A drive may have others; words and positions of fewer bits would lack some that a master goes by.
+_NEEDED = (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.TARGET_POSITION)
 _BITS = {
     8: (cia402.MODE, cia402.MODE_DISPLAY),
     16: (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.TORQUE_ACTUAL, cia402.TARGET_TORQUE, cia402.QUICK_STOP_OPTION),
@@ -21,12 +24,13 @@ _BITS = {
 }
 KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
 MOST_AXES = 8
+LONGEST = 32  # bits that one frame of SDO carries: a stop, and a look while an axis moves, wait for no second one
 
 
-def read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
+def read_types(path: Path | EdsText, node_id: int = 1) -> dict[Key, ODVariable]:
     """Return every entry of an EDS as python-canopen has it."""
     types = {}
-    for item in read_eds(path).values():
+    for item in read_eds(path, node_id).values():
         for variable in [item] if isinstance(item, ODVariable) else item.values():
             types[variable.index, variable.subindex] = variable
     return types
@@ -59,8 +63,8 @@ def axes_of(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> int:
     """Return how many axes an EDS describes.
 
     Raises:
-        ValueError: If it describes no CiA 402 drive, or an object that decides what a drive does has another type
-            than the standard's.
+        ValueError: If it describes no CiA 402 drive, or an object that decides what a drive does is no integer, or too
+            short.
     """
     _check_values(path, types)
     axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(MOST_AXES))
@@ -70,10 +74,27 @@ def axes_of(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> int:
         for (index, sub), bits in KINDS.items():
             variable = types.get((index + cia402.AXIS_OFFSET * axis, sub))
             found = None if variable is None else INTEGER_TYPES.get(variable.data_type or 0)
-            if variable is not None and (found is None or found[0] != bits):
-                said = "of no integer type" if found is None else f"an integer of {found[0]} bits"
-                raise ValueError(
-                    f"{path}{_line_of(path, variable.index)}: {variable.index:04X}h {variable.name} is {said} "
-                    f"({variable.data_type or 0:04X}h), and CiA 402 has it with {bits} bits; correct its DataType"
-                )
+            if variable is None or (found is not None and _is_long_enough(index, found[0], bits)):
+                continue
+            said = "of no integer type" if found is None else f"an integer of {found[0]} bits"
+            least = bits if index in _NEEDED else 8
+            raise ValueError(
+                f"{path}{_line_of(path, variable.index)}: {variable.index:04X}h {variable.name} is {said} "
+                f"({variable.data_type or 0:04X}h), and CiA 402 has it with {bits} bits; a drive needs an integer of "
+                f"{least} to {LONGEST} to be commanded and watched. If its manual says so, too, it cannot be driven"
+            )
     return axes
+
+
+def _is_long_enough(index: int, bits: int, usual: int) -> bool:
+    return bits <= LONGEST and (bits >= usual or index not in _NEEDED)
+
+
+def other_widths(types: Mapping[Key, ODVariable]) -> Iterator[tuple[Key, int, int]]:
+    """Return the standard's objects of the first axis that an EDS has with other bits: these, and the standard's."""
+    for index, (kind, _) in STANDARD_TYPES.items():
+        for (one, sub), variable in types.items():
+            found, usual = INTEGER_TYPES.get(variable.data_type or 0), INTEGER_TYPES[kind]
+            is_value = one == index and (sub > 0) == any((index, k) in types for k in range(1, 255))
+            if is_value and found is not None and found[0] != usual[0]:
+                yield (index, sub), found[0], usual[0]

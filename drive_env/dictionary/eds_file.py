@@ -69,6 +69,14 @@ LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 me
 VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
 MEMBER_KEYS = (*VALUE_KEYS, "ParameterValue", "ObjFlags", "Unit", "Factor", "Description")  # that an array hands down
 
+# What the standard's format of an object needs, least and greatest: CiA 301's COB-IDs, whose bit 31 switches a service
+# off and whose bit 30 makes a device produce SYNC, and watched node-IDs above their times in ms (1016h).
+FORMATS = (
+    ((0x1005,), 0, (1, 0x400007FF)), ((0x1014,), 0, (1, 0x800007FF)), ((0x1016,), None, (0, 0x007FFFFF)),
+    ((*range(0x1400, 0x1600), *range(0x1800, 0x1A00)), 1, (1, 0x800007FF)),
+)  # fmt: skip
+_FORMAT_OF = {index: (sub, ends) for indices, sub, ends in FORMATS for index in indices}
+
 Section = dict[str, str]
 
 
@@ -248,7 +256,7 @@ class _Repairer:
             for sub in range(1, count + 1):
                 named = {"ParameterName": texts["Name"].get(str(sub), f"{row.get('ParameterName', '')} {sub}".strip())}
                 if value := texts["Value"].get(str(sub)):
-                    named["DefaultValue"] = value
+                    named["ParameterValue" if "DeviceComissioning" in self._sections else "DefaultValue"] = value
                 self._sections.setdefault(object_section(place[0], sub), member | named)
             self._check_number()
             for key in VALUE_KEYS:
@@ -373,6 +381,7 @@ class _Repairer:
                 self._tell(f"[{name}]", f"{key}={text} is read as {value}")
             row[key] = str(value)
         self._check_limits(name, row)
+        self._check_format(name, row)
 
     def _repair_floats(self, name: str, row: Section) -> None:
         for key in ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit"):
@@ -392,6 +401,21 @@ class _Repairer:
         if lowest is not None and highest is not None and lowest > highest:
             self._tell(f"[{name}]", f"LowLimit={lowest} and HighLimit={highest} were left out: they leave no range")
             del row["LowLimit"], row["HighLimit"]
+
+    def _check_format(self, name: str, row: Section) -> None:
+        """Leave out limits within which an object cannot have what the standard's format of it needs."""
+        index, sub = place_of(name) or (0, 0)
+        of_sub, (least, greatest) = _FORMAT_OF.get(index, (-1, (0, 0)))
+        is_it = max(sub, 0) == of_sub or (of_sub is None and sub > 0)
+        if index not in _FORMAT_OF or not is_it or row["AccessType"] in ("ro", "const"):
+            return
+        given = {key: row[key] for key in ("LowLimit", "HighLimit") if key in row}
+        low, high = number_of(given.get("LowLimit", "0")), number_of(given.get("HighLimit", str(greatest)))
+        if low is None or high is None or low > least or high < greatest:
+            told = " and ".join(f"{key}={text}" for key, text in given.items())
+            self._tell(f"[{name}]", f"{told} left out: CiA 301's values of it reach from {least} to {greatest:X}h")
+            for key in given:
+                del row[key]
 
     def _drop_limits_of_zero(self) -> None:
         """Take both limits 0 for none, where the file shows that its tool writes them so."""

@@ -1,4 +1,4 @@
-"""Data types and access of CiA 402's objects, for an EDS that leaves them out: index -> (type, access)."""
+"""What the standards say of objects: types and access, for an EDS that leaves them out; which are no parameters."""
 
 from __future__ import annotations
 
@@ -61,4 +61,26 @@ STANDARD_TYPES: dict[int, tuple[int, str]] = {
     cia402.DIGITAL_OUTPUTS: (U32, "rw"),
     cia402.TARGET_VELOCITY: (I32, "rw"),
     cia402.SUPPORTED_MODES: (U32, "ro"),
+}
+
+# What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
+COMMANDS = {
+    0x1003: "error history: a service",
+    0x1010: "store: a service",
+    0x1011: "restore defaults: a service",
+    0x1F50: "program download: a service",
+    0x1F51: "program control: a service",
+    0x1F52: "program verification: a service",
+    cia402.CONTROLWORD: "controlword: a command",
+    cia402.VL_TARGET_VELOCITY: "vl target velocity: a command",
+    cia402.MODE: "modes of operation: a command",
+    cia402.TARGET_TORQUE: "target torque: a command",
+    cia402.TARGET_POSITION: "target position: a command",
+    cia402.POSITION_OFFSET: "position offset: a command",
+    cia402.VELOCITY_OFFSET: "velocity offset: a command",
+    cia402.TORQUE_OFFSET: "torque offset: a command",
+    cia402.TOUCH_PROBE: "touch probe function: a command",
+    cia402.INTERPOLATION_DATA: "interpolation data: a command",
+    cia402.DIGITAL_OUTPUTS: "digital outputs: a command",
+    cia402.TARGET_VELOCITY: "target velocity: a command",
 }

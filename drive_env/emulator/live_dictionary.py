@@ -324,6 +324,11 @@ class LiveDictionary:
             raw = checked_values(entry, value, 1)
             self._check_value(entry, raw)
             stored[entry.index, entry.sub] = raw.copy()
+            axis, base = self.device.locate(entry.index)
+            if axis and (base, entry.sub) in stored:  # of the second axis of each drive alone, say
+                values_of_axes = np.resize(stored[base, entry.sub], self.num_axes)
+                values_of_axes[axis :: self.device.num_axes] = raw
+                stored[base, entry.sub] = values_of_axes
         unbound = [key for key in stored if key not in self.codes]
         values = np.zeros((len(unbound), self.num_axes), np.int64)
         for row, key in zip(values, unbound, strict=True):

@@ -14,6 +14,7 @@ from drive_env.canopen.frames import INVALID
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.standard_types import COMMANDS
 from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
 
@@ -24,27 +25,6 @@ if TYPE_CHECKING:
 
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
-# What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
-COMMANDS = {
-    0x1003: "error history: a service",
-    0x1010: "store: a service",
-    0x1011: "restore defaults: a service",
-    0x1F50: "program download: a service",
-    0x1F51: "program control: a service",
-    0x1F52: "program verification: a service",
-    cia402.CONTROLWORD: "controlword: a command",
-    cia402.VL_TARGET_VELOCITY: "vl target velocity: a command",
-    cia402.MODE: "modes of operation: a command",
-    cia402.TARGET_TORQUE: "target torque: a command",
-    cia402.TARGET_POSITION: "target position: a command",
-    cia402.POSITION_OFFSET: "position offset: a command",
-    cia402.VELOCITY_OFFSET: "velocity offset: a command",
-    cia402.TORQUE_OFFSET: "torque offset: a command",
-    cia402.TOUCH_PROBE: "touch probe function: a command",
-    cia402.INTERPOLATION_DATA: "interpolation data: a command",
-    cia402.DIGITAL_OUTPUTS: "digital outputs: a command",
-    cia402.TARGET_VELOCITY: "target velocity: a command",
-}
 _DEVICE_OBJECTS = 0x2000  # from here on; what lies below is how a node talks
 _COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
 _MAPPING_ABOVE = 0x200  # the mapping of a PDO lies so far above its communication parameter

@@ -35,18 +35,19 @@ class Store:
     Args:
         path: The file; it need not exist.
         device: Name of the device, which the file must be of.
+        commissioned: Sections of a memory into which nothing was saved.
 
     Raises:
         ValueError: If the file was not written by this class for this device.
     """
 
-    def __init__(self, path: Path | None, device: str) -> None:
+    def __init__(self, path: Path | None, device: str, commissioned: Mapping[str, Section] | None = None) -> None:
         self._path = path
         self._device = device
-        self.sections: dict[str, Section] = {}
+        self.sections: dict[str, Section] = dict(commissioned or {})
         self.loses_power = False
         if path is not None and path.exists():
-            self.sections = _parse(path, device)
+            self.sections |= _parse(path, device)
 
     def save(self, changed: Mapping[str, Section]) -> None:
         """Replace sections; all of them are saved or, if the file cannot be written, none.

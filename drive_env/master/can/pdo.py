@@ -79,23 +79,40 @@ def check_mappable(description: Description, entries: Sequence[Entry], direction
             )
 
 
-def slots(description: Description, direction: Direction, axis: int) -> Slots:
-    """Return the PDOs that an axis may use: the node's, in equal shares."""
+def _numbers(description: Description, direction: Direction) -> list[int]:
+    """Return the PDOs of a direction whose mapping has entries."""
     known = description.dictionary
     indices = {entry.index for entry in known}
-    there = [
+    mapped = {entry.index for entry in known if entry.sub > 0}
+    return [
         number
         for number in range(0x200)
-        if direction.communication + number in indices and direction.mapping + number in indices
+        if direction.communication + number in indices and direction.mapping + number in mapped
     ]
+
+
+def stands(description: Description, direction: Direction, number: int) -> bool:
+    """Return whether a PDO stays as it is: by the EDS identifier, mapping or a TPDO's type can only be read."""
+    communication, mapping = direction.communication + number, direction.mapping + number
+    kind = [(communication, 2)] if direction is OUT_OF_DRIVE else []
+    keys = [key for key in ((communication, 1), (mapping, 0), (mapping, 1), *kind) if description.has(key)]
+    return any(description.dictionary.find(key).access in ("ro", "const") for key in keys)
+
+
+def slots(description: Description, direction: Direction, axis: int) -> Slots:
+    """Return the PDOs that an axis may use: the node's that can be mapped anew, in equal shares."""
+    known = description.dictionary
+    there = [one for one in _numbers(description, direction) if not stands(description, direction, one)]
     share = len(there) // description.num_axes
     mine = tuple(there[axis * share : (axis + 1) * share])
     if not mine:
         return Slots((), 0)
-    mapping = [entry for entry in known if entry.index == direction.mapping + mine[0]]
-    limit = next((entry.high for entry in mapping if entry.sub == 0), None)
-    entries = max(entry.sub for entry in mapping)
-    return Slots(mine, min(entries, PDO_BITS // 8, limit if limit else PDO_BITS))
+    rooms = []
+    for number in mine:
+        mapping = [entry for entry in known if entry.index == direction.mapping + number]
+        limit = next((entry.high for entry in mapping if entry.sub == 0), None)
+        rooms.append(min(max(entry.sub for entry in mapping), PDO_BITS // 8, limit if limit else PDO_BITS))
+    return Slots(mine, min(rooms))
 
 
 def plan(description: Description, entries: Sequence[Entry], direction: Direction) -> list[list[Entry]] | None:
@@ -109,11 +126,14 @@ def too_many(description: Description, entries: Sequence[Entry], direction: Dire
     """Return the error for objects that do not fit into the PDOs."""
     room = slots(description, direction, 0)
     bits = sum(entry.bits or 0 for entry in entries)
+    standing = sum(stands(description, direction, number) for number in _numbers(description, direction))
+    of_those = "is played" if direction is INTO_DRIVE else "is wanted, at every SYNC (type 1)"
+    besides = f"; of {standing} that can only be read those are used of which all {of_those}" if standing else ""
     return ObjectAccessError(
         PDO_LENGTH_EXCEEDED,
         f"{len(entries)} objects of {bits} bits do not fit: {description.name} has {len(room.numbers)} "
-        f"{direction.name}s for an axis, each with at most {room.entries} objects of {PDO_BITS} bits together; take "
-        f"fewer at a time of {mappable_names(description, direction)}",
+        f"{direction.name}s for an axis, each with at most {room.entries} objects of {PDO_BITS} bits "
+        f"together{besides}; take fewer at a time of {mappable_names(description, direction)}",
     )
 
 
@@ -135,6 +155,8 @@ class PdoConfiguration:
         self._before: dict[tuple[str, int], _Before] = {}
         self._silenced: dict[int, int] = {}  # TPDO -> its COB-ID as it was found
         self._quiet: set[int] = set()  # TPDOs that do not go with SYNC as they are
+        self._standing: dict[str, tuple[RemotePdo, ...]] = {}
+        self._types: dict[int, int] = {}  # TPDO that stands but for its type -> its type as it was found
 
     def configure(self, groups: Sequence[Sequence[Entry]], direction: Direction) -> list[RemotePdo]:
         """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
@@ -160,6 +182,45 @@ class PdoConfiguration:
             self._silence({pdo for _, pdo in used})
         return pdos
 
+    def standing(self, direction: Direction) -> tuple[RemotePdo, ...]:
+        """Return the PDOs that are on and stay as they are, as far as our cycles can have them, as the drive has them.
+
+        Of a TPDO at every SYNC; a TPDO whose type can be written is given that.
+        """
+        if direction.name not in self._standing:
+            numbers = [
+                one for one in _numbers(self._description, direction) if stands(self._description, direction, one)
+            ]
+            found = [self._as_it_stands(direction, number) for number in numbers]
+            self._standing[direction.name] = tuple(one for one in found if one is not None)
+        return self._standing[direction.name]
+
+    def _as_it_stands(self, direction: Direction, number: int) -> RemotePdo | None:
+        """Return a PDO as the drive has it; None for one that is off, or that our cycles cannot have."""
+        before = self._look(direction, number)
+        if before.cob_id & (INVALID | EXTENDED) or not before.in_use:
+            return None
+        further = self._description.of_further_axes()
+        members, start = [], 0
+        for raw in before.mapping:
+            key, size = (raw >> 16, raw >> 8 & 0xFF), (raw & 0xFF) // 8
+            if self._description.has(key):
+                entry, axis = further.get(key, (self._description.dictionary.find(key), 0))
+                if entry.bits != raw & 0xFF or not size:
+                    return None
+                members.append(Member(entry, axis, start, size))
+            elif direction is INTO_DRIVE or raw % 8:
+                return None
+            start += size
+        kind = direction.communication + number, 2
+        if direction is OUT_OF_DRIVE and before.kind != SYNC_EVERY:
+            if self._description.dictionary.find(kind).access in ("ro", "const"):
+                return None
+            self._types[number] = before.kind
+            self._put(*kind, SYNC_EVERY, 1, self._sdo.write)
+        label = f"{direction.name} {number + 1} of node {self._node}"
+        return RemotePdo(label, before.cob_id & IDENTIFIER, start, tuple(members))
+
     def restore(self) -> None:
         """Put every PDO back as it was found.
 
@@ -173,6 +234,10 @@ class PdoConfiguration:
         silenced, self._silenced = self._silenced, {}
         for number, cob_id in silenced.items():
             tidying.step(partial(self._put, OUT_OF_DRIVE.communication + number, 1, cob_id, 4, self._sdo.put_back))
+        types, self._types = self._types, {}
+        for number, kind in types.items():
+            tidying.step(partial(self._put, OUT_OF_DRIVE.communication + number, 2, kind, 1, self._sdo.put_back))
+        self._standing.clear()
         tidying.end()
 
     def forget(self) -> None:
@@ -180,6 +245,8 @@ class PdoConfiguration:
         self._before.clear()
         self._silenced.clear()
         self._quiet.clear()
+        self._standing.clear()
+        self._types.clear()
 
     def _silence(self, used: set[int]) -> None:
         """Switch off the TPDOs besides those in use that go with SYNC."""

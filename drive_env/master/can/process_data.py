@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from drive_env.dictionary.aborts import PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
@@ -23,7 +24,17 @@ from drive_env.master.can.samples import PdoSamples
 from drive_env.master.packing import Bytes, pack_rows
 from mechanics.arrays import Integers
 
-Groups = list[list[Entry]]
+
+class _Plan(NamedTuple):
+    """How objects are carried: the entries of each PDO that is mapped for them, and each node's PDOs that stand."""
+
+    groups: list[list[Entry]]
+    standing: list[list[RemotePdo]]
+
+    @property
+    def all_groups(self) -> list[list[Entry]]:
+        """The entries of each PDO of an axis."""
+        return self.groups + [[member.entry for member in pdo.members] for pdo in self.standing[0]]
 
 
 class RpdoRows:
@@ -73,7 +84,7 @@ class PdoProcessData:
         self._configurations = configurations
         self._dry = dry
         self._mapped: dict[str, tuple[tuple[Entry, ...], list[list[RemotePdo]]]] = {}
-        self._plans: dict[tuple[str, tuple[Entry, ...]], Groups | None] = {}
+        self._plans: dict[tuple[str, tuple[Entry, ...]], _Plan | None] = {}
         self.mapping = 0
 
     def check_sampled(self, entries: Sequence[Entry]) -> None:
@@ -98,10 +109,10 @@ class PdoProcessData:
             ObjectAccessError: 06040042h if not even the wanted ones fit.
         """
         besides = [entry for entry in welcome if entry not in wanted]
-        into = self._plan(INTO_DRIVE, tuple(played)) or []
+        into = self._groups(INTO_DRIVE, tuple(played)) or []
         while True:
             entries = (*wanted, *besides)
-            out = self._plan(OUT_OF_DRIVE, entries)
+            out = self._groups(OUT_OF_DRIVE, entries)
             if out is not None and (not besides or self._bus_time.has_room_besides((*into, *out), self._axes)):
                 return entries
             if not besides:
@@ -118,7 +129,7 @@ class PdoProcessData:
         Raises:
             ObjectAccessError: If they do not fit, into PDOs or into a cycle of the bus, or a drive refuses them.
         """
-        groups = [*(self._plan(INTO_DRIVE, played) or []), *(self._plan(OUT_OF_DRIVE, sampled) or [])]
+        groups = [*(self._groups(INTO_DRIVE, played) or []), *(self._groups(OUT_OF_DRIVE, sampled) or [])]
         if (excess := self._bus_time.excess(groups, self._axes)) is not None:
             raise ObjectAccessError(PDO_LENGTH_EXCEEDED, excess)
         if played and played != self._entries(INTO_DRIVE):
@@ -156,6 +167,7 @@ class PdoProcessData:
             self._configurations[k].forget()
         self.mapping += 1
         self._mapped.clear()
+        self._plans.clear()  # what stands may have been changed back
 
     def restore(self, node: int) -> None:
         """Put every PDO of a node back as it was found.
@@ -172,16 +184,52 @@ class PdoProcessData:
         return set(sampled) <= set(self._entries(OUT_OF_DRIVE))
 
     def _map(self, direction: Direction, entries: tuple[Entry, ...]) -> None:
-        groups = self._plan(direction, entries)
-        if groups is None:
+        made = self._plan(direction, entries)
+        if made is None:
             raise too_many(self._description, entries, direction)
         self.mapping += 1
         self._mapped.pop(direction.name, None)
-        pdos = [configuration.configure(groups, direction) for configuration in self._configurations]
-        self._mapped[direction.name] = (entries, pdos)
+        pdos = [configuration.configure(made.groups, direction) for configuration in self._configurations]
+        self._mapped[direction.name] = (entries, [a + b for a, b in zip(pdos, made.standing, strict=True)])
 
-    def _plan(self, direction: Direction, entries: tuple[Entry, ...]) -> Groups | None:
+    def _groups(self, direction: Direction, entries: tuple[Entry, ...]) -> list[list[Entry]] | None:
+        made = self._plan(direction, entries)
+        return None if made is None else made.all_groups
+
+    def _plan(self, direction: Direction, entries: tuple[Entry, ...]) -> _Plan | None:
         key = (direction.name, entries)
         if key not in self._plans:
-            self._plans[key] = plan(self._description, entries, direction)
+            carried, standing = self._of_standing(direction, entries)
+            rest = [entry for entry in entries if entry not in carried]
+            groups = plan(self._description, rest, direction)
+            self._plans[key] = None if groups is None else _Plan(groups, standing)
         return self._plans[key]
+
+    def _of_standing(
+        self, direction: Direction, entries: tuple[Entry, ...]
+    ) -> tuple[set[Entry], list[list[RemotePdo]]]:
+        """Return the entries that PDOs which stand carry of every axis, and these PDOs of each node.
+
+        What goes into a drive goes there whole: of an RPDO every object must be played, lest it bring an old command.
+        """
+        usable = [
+            [
+                pdo
+                for pdo in configuration.standing(direction)
+                if direction is OUT_OF_DRIVE or all(member.entry in entries for member in pdo.members)
+            ]
+            for configuration in self._configurations
+        ]
+        axes = range(self._description.num_axes)
+        there = [{(member.entry, member.axis) for pdo in pdos for member in pdo.members} for pdos in usable]
+        carried = {entry for entry in entries if all((entry, axis) in of_node for of_node in there for axis in axes)}
+        chosen: list[list[RemotePdo]] = []
+        for pdos in usable:
+            chosen.append([])
+            left = {(entry, axis) for entry in carried for axis in axes}
+            for pdo in sorted(pdos, key=lambda one: -len(one.members)):
+                members = tuple(member for member in pdo.members if (member.entry, member.axis) in left)
+                if members:
+                    left -= {(member.entry, member.axis) for member in members}
+                    chosen[-1].append(pdo if direction is INTO_DRIVE else pdo._replace(members=members))
+        return carried, chosen
