@@ -33,8 +33,11 @@ Integers = NDArray[np.int64]
 SCALE_FIELD = "position_scaler"  # increments of a revolution
 RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit; of drives that have such
 PEAK_FIELD = "peak_current"  # of the motor [A]; of drives that tell torques in its parts
+NOMINAL_FIELD = "nominal_motor_current"  # [A]; likewise, in its thousandths
 PROFILE_FIELD = "profile_bits"  # of drives whose profile generator counts in increments of its own
-SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, PEAK_FIELD, PROFILE_FIELD})
+# What `units.Context` has besides the increments of a revolution, of drives that have a ratio.
+CONTEXT_FIELDS = (RATIO_FIELD, PEAK_FIELD, NOMINAL_FIELD, PROFILE_FIELD)
+SCALES = frozenset({SCALE_FIELD, *CONTEXT_FIELDS})
 
 
 class PreparedObject(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drive_env.devices import Device
-from drive_env.devices.image_rows import TYPES, FixedImage, fixed_images
+from drive_env.devices.image_rows import TYPES, FixedImage
 from drive_env.dictionary.entries import ObjectDictionary, written_objects
 from drive_env.node.process_image import SYNC_MANAGER_TYPES, SYNCHRONISATION
 
@@ -38,8 +38,7 @@ def ethercat_objects(device: Device) -> dict[int, ODArray | ODRecord]:
     """Return the objects that a device has on EtherCAT besides those of its EDS, or in place of them, by index."""
     assert device.ethercat is not None, "it is asked for devices with EtherCAT"
     dictionary = device.new_dictionary()
-    images = fixed_images(device.presets.parent)
-    found = {index: _image(index, image, dictionary) for index, image in images.items()}
+    found = {index: _image(index, image, dictionary) for index, image in device.images.items()}
     found |= written_objects(device.eds, device.ethercat.writable)
     if not dictionary.has(SYNC_MANAGER_TYPES):
         found[SYNC_MANAGER_TYPES] = _object(
