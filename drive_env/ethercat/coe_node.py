@@ -202,6 +202,7 @@ class CoeNode:
         """Refuse clocks that the device cannot be synchronised by."""
         if new is AlState.SAFE_OP and old is AlState.PRE_OP:
             self._take_cycle()
+            self._times.clear()
             self._measure(Role.SYNC_TIME, now)  # 0, until pulses come
             self._times.clear()
             return self._synchronisation.begin(clock)

@@ -103,7 +103,7 @@ class EtherCatWorld:
         self.begin_cycle()
         due = self._began + _nanoseconds(self.cycle_time)
         for k, drives in enumerate(self.drives):
-            end = self._passed.get(k, self._began) + _nanoseconds(drives.device.cycle)
+            end = self._passed.setdefault(k, self._began) + _nanoseconds(drives.device.cycle)
             if end <= due:
                 drives.advance(drives.device.cycle)
                 self._passed[k] = end
