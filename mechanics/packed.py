@@ -202,6 +202,14 @@ class PackedLoad:
         for values in (plant.bristle, plant.carried, plant.diverged, plant.load_torque, plant.clock):
             values[where] = 0
 
+    def set_step(self, h: float, weigh_every: int) -> None:
+        """Let physics steps be `h` [s] long from now on; arguments as of `__init__`. Motion goes on as it is."""
+        if self.staggered:  # positions stand in the middle of a step
+            self.data.qpos[:] -= 0.5 * (h - self.h) * self.data.qvel
+        self.h = self.model.opt.timestep = h
+        self.plant.replace(weigh_every=weigh_every)
+        self._apply()
+
     def place(self, joint: int, position: Floats, where: Mask) -> None:
         """Put a joint of the copies where the mask is true to a position [rad or m], shape (copies,), at rest."""
         if self._elastic:

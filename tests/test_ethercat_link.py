@@ -474,14 +474,14 @@ def test_a_clock_is_bit_2_of_the_features(features, has):
 ])  # fmt: skip
 def test_sync0_starts_at_a_multiple_of_its_cycle_that_is_to_come(lockstep, now, start):
     found = Registers(now=now)
-    start_sync0(found, [3, 4], 0.002, lockstep)
+    start_sync0(found, [3, 4], Sync0(0.002, lockstep))
     rows = [[(k, 0x0990, start, 8), (k, 0x09A0, 2_000_000, 4), (k, 0x0981, 3, 1)] for k in (3, 4)]
     assert found.writes == [(3, 0x0981, 0, 1), (4, 0x0981, 0, 1), *rows[0], *rows[1]]
 
 
 def test_a_start_that_was_too_late_is_tried_again_twice_as_far_ahead():
     found = Registers(late=4)
-    start_sync0(found, [5], 0.001, False)
+    start_sync0(found, [5], Sync0(0.001, False))
     assert [value for _, address, value, _ in found.writes if address == 0x0990] == [
         101_000_000, 201_000_000, 401_000_000, 801_000_000, 1_601_000_000
     ]  # fmt: skip
@@ -491,7 +491,7 @@ def test_a_start_that_was_too_late_is_tried_again_twice_as_far_ahead():
 def test_sync0_that_does_not_start_is_told(lockstep, starts):
     found = Registers(late=100)
     with pytest.raises(BusError, match=r"^SYNC0 of position 5 does not start; this computer or the cable is too slow$"):
-        start_sync0(found, [3, 5], 0.001, lockstep)
+        start_sync0(found, [3, 5], Sync0(0.001, lockstep))
     assert sum(address == 0x0990 and k == 5 for k, address, _, _ in found.writes) == starts
 
 
@@ -501,7 +501,7 @@ def test_clocks_of_slaves_that_do_not_answer_are_told():
         set_offsets(found, 2)
     found.found[0, 0x0910] = None
     with pytest.raises(NoAnswerError, match=r"^position 0 does not answer; check cable and power$"):
-        start_sync0(found, [3], 0.001, True)
+        start_sync0(found, [3], Sync0(0.001, True))
 
 
 def test_offsets_by_the_times_at_which_a_frame_came():

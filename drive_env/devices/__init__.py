@@ -14,6 +14,7 @@ from drive_env import cia402
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
+from drive_env.devices.image_rows import FixedImage, fixed_images
 from drive_env.devices.own_folder import BINDINGS, bindings_of, check_scale, is_own_folder, naming, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
 from drive_env.devices.variants import (
@@ -186,6 +187,7 @@ class Device(NamedTuple):
     gains: GainSet
     firmware_name: str
     variant_of: str = ""
+    images: Mapping[int, FixedImage] = MappingProxyType({})  # ready-made process images of EtherCAT, by number
     quirks: DriveQuirks = DriveQuirks()
     rated_current: float = math.nan  # [A] of peak i_q, the base of thousandths of the rated current or torque
     commissioning: str = ""  # "standard": presets follow from the motor's data by the rule of any CiA 402 drive
@@ -427,6 +429,7 @@ def _device(
         gains=gains,
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
+        images=fixed_images(folder) | fixed_images(FOLDER / data["name"]),
         quirks=drive_quirks_of(data),
         rated_current=data["current"].get("rated", data["current"]["nominal"]),
         commissioning=data.get("commissioning", ""),

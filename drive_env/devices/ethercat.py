@@ -29,7 +29,7 @@ class ClockMode(NamedTuple):
     Attributes:
         name: Its name.
         title: What a person reads.
-        activation: Value of 0980h: 0 without clocks, 0300h with SYNC0.
+        activation: Value of 0980h: 0 without clocks, 0300h with SYNC0, 0700h with SYNC1, too.
         cycle0: Cycle of SYNC0; 0: the factor's share of the master's cycle.
         factor0: That share; 0: none is said.
         shift0: By how much SYNC0 is late.
@@ -60,6 +60,7 @@ CLOCKS = (
     ClockMode("FreeRun", "Free run or synchronous with sync manager", 0x0000),
     ClockMode("DC", "Distributed clocks, SYNC0", 0x0300),
 )
+SYNC1_ON = 0x0400  # of a mode's activation
 CONTROLS = (0x26, 0x22, 0x64, 0x20)  # of sync managers 0 to 3
 # What a CoE server may have, as ETG.2000 names it. PdoConfig is of devices whose mapping objects can be written.
 COE_ATTRIBUTES = ("SdoInfo", "PdoAssign", "PdoConfig", "PdoUpload", "CompleteAccess", "SegmentedSdo")
@@ -111,6 +112,11 @@ class EtherCatBehaviour(NamedTuple):
     has_foe: bool = True
     clocks: tuple[ClockMode, ...] = CLOCKS
     pdos: Mapping[int, PdoRule] = MappingProxyType({})
+
+    @property
+    def uses_sync1(self) -> bool:
+        """Whether SYNC1 is what outputs take effect with, where the master makes it."""
+        return any(mode.activation & SYNC1_ON for mode in self.clocks)
 
     def has(self, index: int, name: str) -> bool:
         """Return whether an object is there on EtherCAT."""

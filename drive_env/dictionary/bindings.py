@@ -9,7 +9,8 @@ from dataclasses import dataclass
 class Binding:
     """A row of a device's table of bindings.
 
-    `event` names what a write sets off in the firmware: "controlword", "mode", "set_point" or nothing. `part` chooses
+    `event` names what a write sets off in the firmware: "controlword", "mode", "set_point", "whole_set_point" (of a
+    position by all of its bits) or nothing. `part` chooses
     in a deep field. An object that `shows` a field is not the one whose stored value a restart puts there.
     """
 

@@ -32,12 +32,13 @@ class EnteredUnit(NamedTuple):
 class AxisScale(NamedTuple):
     """The scales of an axis' units, each None if it is not known.
 
-    These are position increments of a revolution, rpm of a velocity unit, and the motor's peak current [A].
+    These are position increments of a revolution, rpm of a velocity unit, and the motor's peak and nominal current [A].
     """
 
     increments: float | None = None
     rpm: float | None = None
     peak_current: float | None = None
+    nominal_current: float | None = None
 
 
 # What units of an axis follow; of most drives that is the increments of a revolution alone. None: nothing is known.
@@ -67,10 +68,14 @@ UNITS = {
     "100us": EnteredUnit("time", 1e-4),
     "us": EnteredUnit("time", 1e-6),
 }
-# Units that follow the increments of a revolution, the rpm of a velocity unit, the motor's peak current.
+# Units that follow the increments of a revolution, the rpm of a velocity unit, a current of the motor.
 _INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
 _BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s"}
-_OF_PEAK = {"1/32767 M-Ipeak": 1.0 / 32767.0}
+# Field of the scale that a current is a part of, and the part.
+_OF_CURRENT = {
+    "1/32767 M-Ipeak": ("peak_current", 1.0 / 32767.0),
+    "1/1000 of M-Inull": ("nominal_current", 1e-3),
+}
 SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "A", "voltage": "V", "time": "s"}
 CHARACTERS = "chars"  # four of a text, the first one in the lowest byte
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$")
@@ -84,8 +89,10 @@ def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
     if name in _BY_RATIO:
         unit = UNITS[_BY_RATIO[name]]
         return unit._replace(factor=known.rpm * unit.factor) if known.rpm else None
-    if name in _OF_PEAK:
-        return EnteredUnit("current", known.peak_current * _OF_PEAK[name]) if known.peak_current else None
+    if name in _OF_CURRENT:
+        field, part = _OF_CURRENT[name]
+        whole = getattr(known, field)
+        return EnteredUnit("current", whole * part) if whole else None
     if name in UNITS:
         return UNITS[name]
     number, base = split_unit(name)
@@ -95,7 +102,7 @@ def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
 
 def follows_scale(name: str) -> bool:
     """Return whether a unit follows a scale of its axis, which a drive is to be asked for then."""
-    return split_unit(name)[1] in (*_INCREMENTAL, *_BY_RATIO, *_OF_PEAK)
+    return split_unit(name)[1] in (*_INCREMENTAL, *_BY_RATIO, *_OF_CURRENT)
 
 
 def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
@@ -111,8 +118,11 @@ def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
         return list(increments)
     unknown: list[float | None] = [None] * drives.num_axes
     rpm = unknown if ratio is None else ratio.increments([drives.read(key).astype(float) for key in ratio.keys])
-    peak = unknown if Role.PEAK_CURRENT not in roles else MILLIAMPERE * drives.read(Role.PEAK_CURRENT).astype(float)
-    return [AxisScale(*one) for one in zip(increments, rpm, peak, strict=True)]
+    peak, nominal = (
+        MILLIAMPERE * drives.read(role).astype(float) if role in roles else unknown
+        for role in (Role.PEAK_CURRENT, Role.NOMINAL_CURRENT)
+    )
+    return [AxisScale(*one) for one in zip(increments, rpm, peak, nominal, strict=True)]
 
 
 def _increments_of(drives: AxisObjects, known: ObjectDictionary) -> list[float | None]:

@@ -30,6 +30,7 @@ class Context(NamedTuple):
     velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h, or 604Ch)
     set_point_ratio: Any = 1.0  # velocity units of a target velocity of vl (604Bh)
     peak_current: Any = math.nan  # of the motor [A], of which torques are parts
+    nominal_motor_current: Any = math.nan  # of the motor [A], of whose thousandths torques are on some drives
     profile_bits: Any = 16.0  # of a revolution's increments of a profile generator, as a power of two
 
 
@@ -127,6 +128,12 @@ UNITS: dict[str, Unit] = {
             "1/32767 M-Ipeak",
             "parts of the motor's peak current, of which 32767 are the whole",
             lambda c: c.peak_current / 32767.0,
+            follows_scale=True,
+        ),
+        Unit(
+            "1/1000 of M-Inull",
+            "thousandths of the motor's nominal current, as a current",
+            lambda c: 1e-3 * c.nominal_motor_current,
             follows_scale=True,
         ),
         Unit("1/2^32 rev", "increments of the position inside, 2^32 a revolution", lambda c: TWO_PI / 2.0**32),

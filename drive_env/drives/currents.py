@@ -14,7 +14,7 @@ from drive_env.dictionary.units import MILLIAMPERE
 from drive_env.drives.interface import BasicDrives, Drives
 from mechanics.arrays import Floats, Integers, Mask
 
-_OF_PEAK = "1/32767 M-Ipeak"
+_OF_PEAK, _OF_NOMINAL = "1/32767 M-Ipeak", "1/1000 of M-Inull"
 _WHOLE = 32767.0
 
 
@@ -28,9 +28,9 @@ def ampere_per_count(drives: Drives) -> Floats | float:
     """
     device = drives.device
     row = None if device is None else device.bindings.get((cia402.TORQUE_ACTUAL, 0))
-    if row is None or row.unit != _OF_PEAK:
+    if row is None or row.unit not in (_OF_PEAK, _OF_NOMINAL):
         return MILLIAMPERE
-    return peak_current(drives) / _WHOLE
+    return peak_current(drives) / _WHOLE if row.unit == _OF_PEAK else ampere_per_limit(drives)
 
 
 def counts_per_ampere(drives: Drives) -> Floats | float:
@@ -47,7 +47,7 @@ def peak_current(drives: BasicDrives) -> Floats:
 def highest_current(drives: Drives) -> Floats | float:
     """Return the current that no limit lets pass [A], one or (num_axes,): the motor's peak current, if it is known."""
     per_count = ampere_per_count(drives)
-    return math.inf if isinstance(per_count, float) else per_count * _WHOLE
+    return math.inf if isinstance(per_count, float) else peak_current(drives)
 
 
 def to_counts(drives: Drives, current: Any) -> Integers:

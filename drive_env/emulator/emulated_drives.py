@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from drive_env.cores import usable_cores
 from drive_env.default_device import DEFAULT_DEVICE
-from drive_env.devices import Device, find_device
+from drive_env.devices import find_device
 from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quantity
@@ -25,7 +25,7 @@ from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.enabled_check import EnabledCheck
 from drive_env.drives.interface import Drives, machine_of
 from drive_env.drives.trace import Trace
-from drive_env.emulator.group import call_of, channels
+from drive_env.emulator.group import call_of, channels, with_cycle
 from drive_env.emulator.inertia_check import warn_of_misfits
 from drive_env.emulator.inside import Inside
 from drive_env.emulator.live_dictionary import NOTHING
@@ -122,7 +122,7 @@ class EmulatedDrives(Saved):
         friction: str = "stribeck",
     ) -> None:
         check_number_of_machines(num_machines)
-        self.device: Device = find_device(device)
+        self._rated = self.device = find_device(device)  # with the rates that it was made for
         self.motor = find_motor(self.device.default_motor if motor is None else motor)
         self.device.check_motor(self.motor)
         self.load = find_load(load)
@@ -187,7 +187,7 @@ class EmulatedDrives(Saved):
         """Return the scale of each axis' units, read again after a change."""
         if self._scale[0] != self.inside.objects.scale_changes:
             found = self.inside.objects.context()
-            every = (found.position_scaler, found.velocity_ratio, found.peak_current)
+            every = (found.position_scaler, found.velocity_ratio, found.peak_current, found.nominal_motor_current)
             rows = np.stack([np.broadcast_to(np.asarray(one, float), (self.num_axes,)) for one in every], axis=1)
             self._scale = self.inside.objects.scale_changes, [AxisScale(*row) for row in rows.tolist()]
         return self._scale[1]
@@ -196,6 +196,18 @@ class EmulatedDrives(Saved):
         """Let `duration` [s] pass, whole communication cycles of 1 ms."""
         cycles = self.inside.cycles(duration)
         self._run(cycles, self._nothing)
+
+    def set_cycle(self, cycle: float) -> None:
+        """Let a communication cycle be `cycle` [s], no longer than the device's own; time goes on from where it is.
+
+        A step of physics is no longer than before; the velocity loop has the nearest lower rate that fits the cycle.
+        """
+        device = with_cycle(self._rated, cycle)
+        if device.cycle != self.device.cycle:
+            longer = device.cycle / self.device.cycle
+            self.device = device
+            self.inside.change_rates(device)
+            self.faults.change_cycle(longer)
 
     def record(
         self,

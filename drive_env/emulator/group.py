@@ -66,6 +66,23 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
     )
 
 
+def with_cycle(device: Device, cycle: float) -> Device:
+    """Return a device with a shorter communication cycle [s]; its own, or a longer one, leaves it as it is.
+
+    The drive supervises itself once in each such cycle, and its velocity loop has the nearest lower rate that fits.
+    """
+    rate = 1.0 / cycle
+    if rate < device.communication_rate * (1.0 + 1e-9):
+        return device
+    supervision = max(device.supervision_rate, rate)
+    fitting = [
+        number * supervision
+        for number in range(1, int(device.velocity_rate / supervision + 1e-9) + 1)
+        if device.current_rate % (number * supervision) == 0
+    ]
+    return device._replace(velocity_rate=fitting[-1], supervision_rate=supervision, communication_rate=rate)
+
+
 class Group:
     """Machines `machines` of a set, their mechanics and their records."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -76,6 +78,7 @@ class Inside(Saved):
     # --- construction ---------------------------------------------------------------------------------------------
     def build_groups(self, physics_steps: int, integrator: str, friction: str) -> None:
         """Make the machines, packed in groups; arguments as `EmulatedDrives` takes them."""
+        self._longest_step = 1.0 / (self.device.velocity_rate * physics_steps)
         rates = rates_of(self.device, physics_steps)
         per_group = copies_per_model(self.load, self.num_machines)
         loads = pack(
@@ -96,6 +99,22 @@ class Inside(Saved):
             block, blocks = first * self.load.num_axes // LANES, -(-load.copies * self.load.num_axes // LANES)
             self.groups.append(Group(machines, load, self.records[block : block + blocks], rates, self.device.firmware))
             first = machines.stop
+
+    def change_rates(self, device: Device) -> None:
+        """Let time go on at the rates of a device that differs in these alone; what is scheduled keeps its times."""
+        longer = device.cycle / self.device.cycle
+        self.device = device
+        self.schedule = [
+            (self.cycle + math.ceil((due - self.cycle) / longer - 1e-9), *change) for due, *change in self.schedule
+        ]
+        # A step that is no longer than before leaves no resonance too fast for it.
+        rates = rates_of(device, math.ceil(1.0 / (device.velocity_rate * self._longest_step) - 1e-9))
+        for group in self.groups:
+            group.machinery.rates.replace(**{row.name: getattr(rates, row.name) for row in dataclasses.fields(rates)})
+            group.load.set_step(rates.window / rates.substeps, rates.windows * rates.substeps)
+        self.refresh_inertia()
+        axes, name = np.ones(self.num_axes, bool), "stage.velocity_filter"  # its coefficients are those of a rate
+        self._apply_to_records(name, np.repeat(self.parameters[name], self.load.num_axes), axes)
 
     def _set_constants(self, supply: float) -> None:
         records, device = self.records, self.device

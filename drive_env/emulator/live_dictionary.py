@@ -24,6 +24,7 @@ from drive_env.dictionary.position_scale import PositionScale, position_scale, s
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import (
+    NOMINAL_FIELD,
     PEAK_FIELD,
     PROFILE_FIELD,
     RATIO_FIELD,
@@ -39,7 +40,8 @@ from drive_env.firmware.common.modes import MODES
 from drive_env.firmware.record import get_lanes, set_lanes
 from mechanics.arrays import Floats, Integers, Mask
 
-_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
+_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT,
+           "whole_set_point": cycle.WHOLE_SET_POINT}  # fmt: skip
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 MODE_OF_OPERATION, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 ERROR_CODE = (cia402.ERROR_CODE, 0)
@@ -73,7 +75,11 @@ class LiveDictionary:
         self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
         self._single_scales = {
             field: device.roles[role]
-            for field, role in ((PEAK_FIELD, Role.PEAK_CURRENT), (PROFILE_FIELD, Role.PROFILE_BITS))
+            for field, role in (
+                (PEAK_FIELD, Role.PEAK_CURRENT),
+                (NOMINAL_FIELD, Role.NOMINAL_CURRENT),
+                (PROFILE_FIELD, Role.PROFILE_BITS),
+            )
             if role in device.roles
         }
         self.scale_keys += tuple(self._single_scales.values())
@@ -461,9 +467,12 @@ class LiveDictionary:
             self._set_value(entry, raw, where)
             return
         event = _EVENTS[self.codes[key].event]
-        if event == cycle.SET_POINT:
+        if event in (cycle.SET_POINT, cycle.WHOLE_SET_POINT):
             self._set_field(entry, raw, where)
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
+            if self.codes[key].field == "target_position":
+                whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
+                set_lanes(self._records, "target_is_whole", whole, where)
         elif event >= 0:
             self.device.firmware.write_events(self._records, event, raw, where)
         else:

@@ -234,6 +234,15 @@ class MachineFaults:
         self._forget()
         return max(following, now + 1)
 
+    def change_cycle(self, longer: float) -> None:
+        """Keep the times of all faults, in cycles that are so many times longer than before."""
+        now = self._inside.cycle
+        for fault in self._faults:
+            fault.delay, fault.length = cycles_of(fault.order, fault.row, self._inside.cycles)
+            for times in (fault.begins, fault.ends):
+                there = times < NEVER
+                times[there] = now + np.ceil((times[there] - now) / longer - 1e-9)
+
     @contextmanager
     def suspended(self) -> Iterator[None]:
         """Take all changes back while the machines as they were built are changed; then they are on top again."""

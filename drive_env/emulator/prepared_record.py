@@ -34,8 +34,9 @@ SCALE_FIELD = "position_scaler"  # increments of a revolution
 RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit; of drives that have such
 SET_POINT_FIELD = "set_point_ratio"  # velocity units of a target velocity of vl; of drives that have such
 PEAK_FIELD = "peak_current"  # of the motor [A]; of drives that tell torques in its parts
+NOMINAL_FIELD = "nominal_motor_current"  # [A]; likewise, in its thousandths
 PROFILE_FIELD = "profile_bits"  # of drives whose profile generator counts in increments of its own
-SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, SET_POINT_FIELD, PEAK_FIELD, PROFILE_FIELD})
+SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, SET_POINT_FIELD, PEAK_FIELD, NOMINAL_FIELD, PROFILE_FIELD})
 
 
 class PreparedObject(NamedTuple):

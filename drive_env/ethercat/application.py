@@ -19,7 +19,7 @@ The order of calls, all in one thread, each with the time `now` [s] of the emula
     inputs()                              the whole input image, in Safe-Op and Op, after each cycle
     watchdog_expired                      outputs stayed away in Op: the drive stops by its fault reaction; then follows
                                           state_changed(SAFE_OP, SM_WATCHDOG)
-    sync0                                 a SYNC0 pulse of the distributed clocks
+    sync0, sync1                          a pulse of the distributed clocks
 """
 
 from __future__ import annotations
@@ -105,10 +105,12 @@ class SyncManagerSetting:
 
 @dataclass(frozen=True, slots=True)
 class ClockSetting:
-    """Distributed clocks as the master has set them: SYNC0 is made, its cycle [s] (0: one shot)."""
+    """Distributed clocks as the master has set them: SYNC0 is made, its cycle [s] (0: one shot); SYNC1 likewise."""
 
     has_sync0: bool
     sync0_cycle: float
+    has_sync1: bool = False
+    sync1_cycle: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,3 +205,6 @@ class Application(Protocol):
 
     def sync0(self, now: float) -> None:
         """Learn that a SYNC0 pulse came."""
+
+    def sync1(self, now: float) -> None:
+        """Learn that a SYNC1 pulse came."""

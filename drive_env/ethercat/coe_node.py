@@ -90,6 +90,7 @@ class CoeNode:
         if behaviour is None:
             raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
         self.drives = drives
+        self._all_drives = [drives] if spare is None else [drives, spare]
         self.state = AlState.INIT
         self.layout = SlaveLayout(
             MailboxPlace(*behaviour.receive), MailboxPlace(*behaviour.send), behaviour.outputs, behaviour.inputs,
@@ -121,7 +122,7 @@ class CoeNode:
         self._sdo = CoeSdoServer(self._port, self._entries_of, self._image, behaviour.send.length)
         self._information = SdoInformation(describe(device), behaviour.send.length)
         self._sii = sii_content(device, serial)
-        self._waiting: bytes | None = None  # outputs that take effect with SYNC0
+        self._waiting: bytes | None = None  # outputs that take effect with the next pulse
         self._number = device.canopen.objects.get("node_id")  # object of the node's number
         # Objects of measured times: register of the device, and when the last event was [s].
         self._times: dict[Role, tuple[ObjectPort, float]] = {}
@@ -143,7 +144,7 @@ class CoeNode:
         return self._image.input_size
 
     def outputs(self, data: bytes, now: float) -> None:
-        """Let outputs take effect at once or, with SYNC0, at its next pulse."""
+        """Let outputs take effect at once or, with SYNC0 or SYNC1, at its next pulse."""
         self._synchronisation.outputs_came(now)
         self._measure(Role.PACKET_TIME, now)
         if self._synchronisation.has_sync0:
@@ -156,7 +157,18 @@ class CoeNode:
         return self._image.read_inputs()
 
     def sync0(self, now: float) -> None:
+        """Take a pulse of SYNC0, unless SYNC1 is what counts."""
+        if not self._synchronisation.has_sync1:
+            self._pulse(now)
+
+    def sync1(self, now: float) -> None:
+        """Take a pulse of SYNC1, if it is what counts."""
+        if self._synchronisation.has_sync1:
+            self._pulse(now)
+
+    def _pulse(self, now: float) -> None:
         """Let the outputs that came since the last pulse take effect."""
+        self._measure(Role.SYNC_TIME, now)
         data, self._waiting = self._waiting, None
         if self.state is AlState.OP:
             self._synchronisation.pulse()
@@ -189,6 +201,10 @@ class CoeNode:
     ) -> AlStatusCode:
         """Refuse clocks that the device cannot be synchronised by."""
         if new is AlState.SAFE_OP and old is AlState.PRE_OP:
+            self._take_cycle()
+            self._times.clear()
+            self._measure(Role.SYNC_TIME, now)  # 0, until pulses come
+            self._times.clear()
             return self._synchronisation.begin(clock)
         return AlStatusCode.NO_ERROR
 
@@ -284,6 +300,13 @@ class CoeNode:
         port, before = self._times.get(role, (self.dictionary.port(*key), now))
         port.write(round(1e6 * (now - before)))
         self._times[role] = (port, now)
+
+    def _take_cycle(self) -> None:
+        """Let the drives' cycle be the one that a register of the device has, if it has one."""
+        key = self._device.roles.get(Role.SET_CYCLE)
+        if key is not None:
+            for drives in self._all_drives:
+                drives.set_cycle(1e-6 * int(self.dictionary.port(*key).read()))
 
     def write_sii(self, content: bytes) -> None:
         """Store the EEPROM that the master has written."""

@@ -1,4 +1,4 @@
-"""The clock of a slave controller: local time, system time, its correction, SYNC0 (ETG.1000.4, 6.8).
+"""The clock of a slave controller: local time, system time, its correction, SYNC0 and SYNC1 (ETG.1000.4, 6.8).
 
 Every slave has an oscillator of its own. A master measures by port receive times how long frames take, writes each
 slave's offset and delay, and then lets the first slave's system time pass all others (ARMW, FRMW): each compares, and
@@ -13,7 +13,7 @@ from drive_env.ethercat import registers
 
 SLOWEST_CORRECTION = 0.1  # of a clock tick: the ET1100 makes ticks of 9, 10 or 11 ns of 10
 PHASE_SHARE, RATE_SHARE = 0.25, 0.03  # of a difference, by which time and rate are corrected at each comparison; ours
-ACTIVE, SYNC0 = 0x01, 0x02
+ACTIVE, SYNC0, SYNC1 = 0x01, 0x02, 0x04
 NOT_IN_NEAR_FUTURE = 0x04  # of the activation status: the start time has passed
 WORD = 1 << 32
 TIMES = 1 << 64  # of system time [ns], which begins anew then
@@ -42,7 +42,8 @@ class DistributedClock:
         self._correction = 0.0
         self._compared: int | None = None
         self._mean = 0.0
-        self._next_pulse: int | None = None  # system time [ns]
+        self._next_pulse: int | None = None  # of SYNC0, system time [ns]
+        self._next_sync1: int | None = None  # of SYNC1, once the SYNC0 came that it follows
         self.is_measuring = False  # receive times are latched as the frame comes back
 
     # --- times ------------------------------------------------------------------------------------------------------
@@ -96,11 +97,16 @@ class DistributedClock:
         struct.pack_into("<I", self._memory, registers.TIME_DIFFERENCE, 0)
         struct.pack_into("<h", self._memory, registers.SPEED_DIFFERENCE, 0)
 
-    # --- SYNC0 ------------------------------------------------------------------------------------------------------
+    # --- SYNC0 and SYNC1 ------------------------------------------------------------------------------------------------------
     @property
     def has_sync0(self) -> bool:
         """Whether SYNC0 is switched on."""
         return self._memory[registers.SYNC_ACTIVATION] & (ACTIVE | SYNC0) == ACTIVE | SYNC0
+
+    @property
+    def has_sync1(self) -> bool:
+        """Whether SYNC1 follows SYNC0."""
+        return self.has_sync0 and bool(self._memory[registers.SYNC_ACTIVATION] & SYNC1)
 
     @property
     def cycle(self) -> int:
@@ -108,10 +114,21 @@ class DistributedClock:
         (cycle,) = struct.unpack_from("<I", self._memory, registers.SYNC0_CYCLE)
         return int(cycle)
 
+    @property
+    def sync1_cycle(self) -> int:
+        """Time between two pulses of SYNC1 [ns]: one that comes after the next SYNC0 leaves that out; 0: one shot."""
+        return (self._delay // self.cycle + 1) * self.cycle if self.cycle else 0
+
+    @property
+    def _delay(self) -> int:
+        """Time from SYNC0 to the SYNC1 that follows it [ns]."""
+        (delay,) = struct.unpack_from("<I", self._memory, registers.SYNC1_DELAY)
+        return int(delay)
+
     def activate(self, now: int) -> None:
         """Act on 0981h: SYNC0 from its start time on. A start that has passed makes no pulse."""
         self._memory[registers.SYNC_STATUS] = 0
-        self._next_pulse = None
+        self._next_pulse = self._next_sync1 = None
         if self.has_sync0:
             (start,) = struct.unpack_from("<Q", self._memory, registers.SYNC0_START)
             if start > self.system(now):
@@ -121,24 +138,45 @@ class DistributedClock:
                 self._memory[registers.SYNC_STATUS] = NOT_IN_NEAR_FUTURE
 
     def next_pulse(self) -> int | None:
-        """Return the world time [ns] of the next pulse, None without pulses."""
-        if self._next_pulse is None:
-            return None
-        (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
-        ahead = (self._next_pulse - int(offset)) % (1 << 64) - self._anchor_local
-        return self._anchor + int(ahead / (1.0 + self._drift + self._correction)) + 1
+        """Return the world time [ns] of the next pulse of either, None without pulses."""
+        pulse = self._next_sync1 if self._sync1_is_first() else self._next_pulse
+        return None if pulse is None else self._world_time(pulse)
 
-    def take_pulse(self, now: int) -> bool:
-        """Return whether a pulse is due at `now` [ns], and go on to the next."""
+    def take_pulse(self, now: int) -> tuple[int, int] | None:
+        """Return the pulse that is due at `now` [ns], SYNC0 or SYNC1, with its world time [ns], and go on to the next."""
+        if self._sync1_is_first():
+            following = self._next_sync1
+            if following is None or (self.system(now) - following) % TIMES >= TIMES // 2:
+                return None
+            self._next_sync1 = None
+            return SYNC1, self._world_time(following)
         pulse, cycle = self._next_pulse, self.cycle
         if pulse is None:
-            return False
+            return None
         behind = (self.system(now) - pulse) % TIMES
         if behind >= TIMES // 2:
-            return False
-        if cycle:
-            passed = behind // cycle if behind > MOST_PULSES * cycle else 0
-            pulse = (pulse + (passed + 1) * cycle) % TIMES
-        self._next_pulse = pulse if cycle else None
-        struct.pack_into("<Q", self._memory, registers.SYNC0_START, pulse)
-        return True
+            return None
+        if cycle and behind > MOST_PULSES * cycle:
+            pulse = (pulse + behind // cycle * cycle) % TIMES
+        if self.has_sync1 and self._next_sync1 is None:
+            self._next_sync1 = (pulse + self._delay) % TIMES
+            struct.pack_into("<Q", self._memory, registers.SYNC1_NEXT, self._next_sync1)
+        self._next_pulse = (pulse + cycle) % TIMES if cycle else None
+        struct.pack_into(
+            "<Q", self._memory, registers.SYNC0_START, pulse if self._next_pulse is None else self._next_pulse
+        )
+        return SYNC0, self._world_time(pulse)
+
+    def _sync1_is_first(self) -> bool:
+        """Return whether a pulse of SYNC1 comes next; of two at one time SYNC0 does."""
+        if self._next_sync1 is None or self._next_pulse is None:
+            return self._next_sync1 is not None
+        return 0 < (self._next_pulse - self._next_sync1) % TIMES < TIMES // 2
+
+    def _world_time(self, system: int) -> int:
+        """Return the world time [ns] of a system time [ns]."""
+        (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
+        local = (system - int(offset)) % TIMES
+        # The anchor is near: a pulse that has just passed lies before it.
+        ahead = local - self._anchor_local
+        return self._anchor + int(ahead / (1.0 + self._drift + self._correction)) + 1

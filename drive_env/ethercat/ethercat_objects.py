@@ -9,16 +9,17 @@ from __future__ import annotations
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from drive_env.devices import Device
-from drive_env.devices.image_rows import TYPES, FixedImage, fixed_images
+from drive_env.devices.image_rows import TYPES, FixedImage
 from drive_env.dictionary.entries import ObjectDictionary, written_objects
 from drive_env.node.process_image import SYNC_MANAGER_TYPES, SYNCHRONISATION
 
 U8, U16, U32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
 USES = (1, 2, 3, 4)  # of sync managers 0 to 3: mailbox in and out, process data in and out
 NANOSECOND = 1e-9  # s
-# Synchronisation types (1C32h:01, 1C33h:01), and the bits of those supported (:04): with the sync manager, with SYNC0.
-WITH_OUTPUTS, WITH_SYNC0, INPUTS_WITH_OUTPUTS = 1, 2, 0x22
-SUPPORTED = 0x02 | 0x04
+# Synchronisation types (1C32h:01, 1C33h:01), and the bits of those supported (:04): with the sync manager, with SYNC0;
+# with SYNC1 only some are.
+WITH_OUTPUTS, WITH_SYNC0, WITH_SYNC1, INPUTS_WITH_OUTPUTS = 1, 2, 3, 0x22
+SUPPORTED, SUPPORTED_SYNC1 = 0x02 | 0x04, 0x08
 TYPE, CYCLE_TIME, SUPPORTED_TYPES, LEAST_CYCLE, CALC_TIME, MISSED, TOO_SHORT, SYNC_ERROR = 1, 2, 4, 5, 6, 11, 12, 32
 # Sub-index, name, data type, access (ETG.1020, tables 61 and 62); of those that a slave may leave out, the ones that
 # say something here.
@@ -38,8 +39,7 @@ def ethercat_objects(device: Device) -> dict[int, ODArray | ODRecord]:
     """Return the objects that a device has on EtherCAT besides those of its EDS, or in place of them, by index."""
     assert device.ethercat is not None, "it is asked for devices with EtherCAT"
     dictionary = device.new_dictionary()
-    images = fixed_images(device.presets.parent)
-    found = {index: _image(index, image, dictionary) for index, image in images.items()}
+    found = {index: _image(index, image, dictionary) for index, image in device.images.items()}
     found |= written_objects(device.eds, device.ethercat.writable)
     if not dictionary.has(SYNC_MANAGER_TYPES):
         found[SYNC_MANAGER_TYPES] = _object(
@@ -95,7 +95,7 @@ def _synchronisation(device: Device, index: int, name: str) -> ODArray | ODRecor
     defaults = {
         TYPE: WITH_OUTPUTS if is_outputs else INPUTS_WITH_OUTPUTS,
         CYCLE_TIME: round(1.0 / device.communication_rate / NANOSECOND),
-        SUPPORTED_TYPES: SUPPORTED,
+        SUPPORTED_TYPES: SUPPORTED | (SUPPORTED_SYNC1 if device.ethercat.uses_sync1 else 0),
         LEAST_CYCLE: shortest,
     }
     rows = [(sub, text, kind, access, defaults.get(sub, 0)) for sub, text, kind, access in ROWS]

@@ -34,7 +34,7 @@ RECEIVE_TIMES, SYSTEM_TIME, RECEIVE_TIME_UNIT = 0x0900, 0x0910, 0x0918
 TIME_OFFSET, TIME_DELAY, TIME_DIFFERENCE = 0x0920, 0x0928, 0x092C
 SPEED_START, SPEED_DIFFERENCE, FILTER_DEPTHS = 0x0930, 0x0932, 0x0934
 SYNC_CONTROL, SYNC_ACTIVATION, SYNC_PULSE, SYNC_STATUS = 0x0980, 0x0981, 0x0982, 0x0984
-SYNC0_START, SYNC0_CYCLE = 0x0990, 0x09A0
+SYNC0_START, SYNC1_NEXT, SYNC0_CYCLE, SYNC1_DELAY = 0x0990, 0x0998, 0x09A0, 0x09A4
 USER_RAM = 0x0F80
 
 
@@ -99,11 +99,13 @@ REGISTERS = (
     Register(SPEED_DIFFERENCE, 2, 0, 0, "Speed counter difference"),
     Register(FILTER_DEPTHS, 2, 0x0C04, 0x0F0F, "Filter depths of time difference, speed counter"),
     Register(SYNC_CONTROL, 1, 0, 0, "Cyclic unit control"),
-    Register(SYNC_ACTIVATION, 1, 0, 0x03, "Activation of the cyclic unit"),
+    Register(SYNC_ACTIVATION, 1, 0, 0x07, "Activation of the cyclic unit"),
     Register(SYNC_PULSE, 2, 0, 0, "Pulse length of SYNC signals"),
     Register(SYNC_STATUS, 1, 0, 0, "Activation status"),
     Register(SYNC0_START, 8, 0, 0xFFFFFFFF_FFFFFFFF, "Start of cyclic operation, next SYNC0"),
+    Register(SYNC1_NEXT, 8, 0, 0, "Next SYNC1"),
     Register(SYNC0_CYCLE, 4, 0, 0xFFFFFFFF, "SYNC0 cycle time"),
+    Register(SYNC1_DELAY, 4, 0, 0xFFFFFFFF, "SYNC1 cycle time: from SYNC0 to SYNC1"),
     Register(USER_RAM, 128, 0, (1 << 1024) - 1, "User RAM"),
 )
 # A write of any value to one of these sets all counters of the group to 0.

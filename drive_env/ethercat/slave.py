@@ -7,6 +7,7 @@ import math
 from drive_env.ethercat import registers
 from drive_env.ethercat.application import AlState, AlStatusCode, Application
 from drive_env.ethercat.controller import SlaveController
+from drive_env.ethercat.distributed_clock import SYNC0
 from drive_env.ethercat.mailbox import Mailbox, MailboxProtocol
 from drive_env.ethercat.state_machine import INPUTS, OUTPUTS, WITH_INPUTS, WITH_MAILBOX, StateMachine
 
@@ -102,12 +103,13 @@ class EtherCatSlave:
         )
 
     def run_until(self, now: float) -> None:
-        """Let pulses of SYNC0 and the watchdog happen that are due until `now` [s]."""
+        """Let pulses of SYNC0 and SYNC1 and the watchdog happen that are due until `now` [s]."""
         clock = self.controller.clock
-        while clock.take_pulse(round(now * 1e9)):
+        while (pulse := clock.take_pulse(round(now * 1e9))) is not None:
             self._pulsed_at = now
             if self._machine.state in WITH_INPUTS:
-                self.application.sync0(now)
+                signal, at = pulse
+                (self.application.sync0 if signal == SYNC0 else self.application.sync1)(at * 1e-9)
         if self._machine.state is S.OP and now - self._pulsed_at > LOST_PULSES * self._sync0_cycle:
             self._machine.force(S.SAFE_OP, AlStatusCode.FATAL_SYNC, now)  # outputs would never take effect
         deadline = self.controller.watchdog_deadline()

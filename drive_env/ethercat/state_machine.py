@@ -141,7 +141,7 @@ class StateMachine:
         clock = self._controller.clock
         return self._application.request_state(
             old, new, [manager.setting for manager in self._controller.managers],
-            ClockSetting(clock.has_sync0, clock.cycle * 1e-9), now,
+            ClockSetting(clock.has_sync0, clock.cycle * 1e-9, clock.has_sync1, clock.sync1_cycle * 1e-9), now,
         )  # fmt: skip
 
     def _mailboxes(self, is_bootstrap: bool = False) -> AlStatusCode:

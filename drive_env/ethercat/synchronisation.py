@@ -1,7 +1,8 @@
 """How a slave is synchronised: 1C32h of its outputs, 1C33h of its inputs (ETG.1020, 22).
 
 SYNC0 of the distributed clocks decides: switched on before Safe-Op, outputs take effect at its pulses, and both objects
-show type 2 and its cycle. Without it outputs take effect as they come.
+show type 2 and its cycle. Of a device that uses SYNC1 that decides, where the master makes it, and the type is 3. Without
+clocks outputs take effect as they come.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from drive_env.ethercat.ethercat_objects import (
     TYPE,
     WITH_OUTPUTS,
     WITH_SYNC0,
+    WITH_SYNC1,
     ethercat_objects,
 )
 from drive_env.node.axis import ObjectPort
@@ -43,12 +45,14 @@ class Synchronisation:
 
     Attributes:
         has_sync0: Outputs take effect with SYNC0.
+        has_sync1: They do with SYNC1 in its place.
     """
 
     def __init__(self, device: Device, may_change: Callable[[], bool]) -> None:
         assert device.ethercat is not None, "a device without EtherCAT is not synchronised"
         self._may_change = may_change
         self._shortest = device.ethercat.shortest_cycle
+        self._uses_sync1 = device.ethercat.uses_sync1
         self._cycles = [round(cycle / NANOSECOND) for cycle in device.ethercat.cycles]
         own = ethercat_objects(device)
         self._factory = {(index, sub): int(one.default) for index in SYNCHRONISATION for sub, one in own[index].items()}
@@ -58,7 +62,7 @@ class Synchronisation:
         """Be as after power-on."""
         self._values = dict(self._factory)
         self._shown: dict[tuple[int, int], int] = {}  # in place of what the master has set, while SYNC0 decides
-        self.has_sync0 = False
+        self.has_sync0 = self.has_sync1 = False
         self._came: float | None = None  # when outputs came last [s]
         self._is_new = False
 
@@ -84,16 +88,18 @@ class Synchronisation:
         A cycle of SYNC0 that the device cannot keep up with, or does not know, is refused; 0 means a single pulse and
         is taken.
         """
-        known = not self._cycles or round(clock.sync0_cycle / NANOSECOND) in (0, *self._cycles)
-        if clock.has_sync0 and (clock.sync0_cycle < self._shortest or not known):
+        by_sync1 = self._uses_sync1 and clock.has_sync1
+        cycle = round((clock.sync1_cycle if by_sync1 else clock.sync0_cycle) / NANOSECOND)
+        known = not self._cycles or cycle in (0, *self._cycles)
+        if clock.has_sync0 and (cycle * NANOSECOND < self._shortest - 0.5 * NANOSECOND or not known):
             return AlStatusCode.DC_CYCLE_TIME
-        if not clock.has_sync0 and WITH_SYNC0 in (self._values[index, TYPE] for index in SYNCHRONISATION):
+        chosen = {self._values[index, TYPE] for index in SYNCHRONISATION}
+        if (WITH_SYNC0 in chosen and not clock.has_sync0) or (WITH_SYNC1 in chosen and not by_sync1):
             return AlStatusCode.DC_SYNC_CONFIGURATION
-        self.has_sync0 = clock.has_sync0
+        self.has_sync0, self.has_sync1 = clock.has_sync0, by_sync1
         self._shown = {}
         if clock.has_sync0:
-            cycle = round(clock.sync0_cycle / NANOSECOND)
-            self._shown = {(index, TYPE): WITH_SYNC0 for index in SYNCHRONISATION}
+            self._shown = {(index, TYPE): WITH_SYNC1 if by_sync1 else WITH_SYNC0 for index in SYNCHRONISATION}
             self._shown |= {(index, CYCLE_TIME): cycle for index in SYNCHRONISATION}
         for index in SYNCHRONISATION:
             for sub in (MISSED, TOO_SHORT, SYNC_ERROR):
@@ -112,7 +118,7 @@ class Synchronisation:
         self._came, self._is_new = now, True
 
     def pulse(self) -> None:
-        """Count a pulse of SYNC0 in Op without new outputs since the one before."""
+        """Count a pulse in Op without new outputs since the one before."""
         missed = self._came is not None and not self._is_new  # the first outputs have begun it
         if missed:
             self._count(MISSED)
@@ -129,8 +135,9 @@ class Synchronisation:
         check_limits(entry, raw)
         if not self._may_change():
             raise ObjectAccessError(WRONG_STATE, f"{entry.label} can only be written in pre-operational")
-        if entry.sub == TYPE and raw not in TYPES[entry.index]:
-            known = " and ".join(map(str, TYPES[entry.index]))
+        types = (*TYPES[entry.index], WITH_SYNC1) if self._uses_sync1 else TYPES[entry.index]
+        if entry.sub == TYPE and raw not in types:
+            known = " and ".join(map(str, types))
             raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw}; this slave knows {known}")
         if entry.sub == CYCLE_TIME and raw * NANOSECOND < self._shortest - 0.5 * NANOSECOND:
             raise ObjectAccessError(

@@ -11,6 +11,11 @@ from drive_env.ethercat.segment import Segment
 from drive_env.ethercat.slave import EtherCatSlave
 
 CYCLE = 0.001  # s: the communication cycle
+NANOSECONDS = 1e9  # of a second
+
+
+def _nanoseconds(duration: float) -> int:
+    return round(duration * NANOSECONDS)
 
 
 class EtherCatWorld:
@@ -25,20 +30,21 @@ class EtherCatWorld:
         drives: All emulated drives.
         time: Time since the world began [s].
         cycles: Communication cycles that have passed.
-        cycle_time: Length of one [s].
 
     Args:
         lockstep: Time advances by process data.
-        cycle_time: Length of a communication cycle [s], a whole multiple of the drives' supervision.
+        cycle_time: Length of a communication cycle [s] without drives of its own.
     """
 
     def __init__(self, *, lockstep: bool = True, cycle_time: float = CYCLE) -> None:
         self.lockstep = lockstep
-        self.cycle_time = cycle_time
+        self._cycle_time = cycle_time
         self.segment = Segment()
         self.drives: list[EmulatedDrives] = []
         self.time = 0.0
         self.cycles = 0
+        self._began = 0  # when the present cycle began [ns]
+        self._passed: dict[int, int] = {}  # to when each of the drives is [ns]
 
     def add(self, slave: EtherCatSlave, drives: EmulatedDrives | None = None) -> None:
         """Put a slave at the end of the line; `drives` are new ones that advance with the world."""
@@ -79,9 +85,14 @@ class EtherCatWorld:
             slave.run_until(self.time)
 
     @property
+    def cycle_time(self) -> float:
+        """Length of a communication cycle [s]: of its drives the shortest one."""
+        return min((drives.device.cycle for drives in self.drives), default=self._cycle_time)
+
+    @property
     def next_cycle(self) -> float:
         """When the next communication cycle ends [s]."""
-        return (self.cycles + 1) * self.cycle_time
+        return (self._began + _nanoseconds(self.cycle_time)) / NANOSECONDS
 
     def next_event(self) -> float:
         """Return when `run_until` has something to do next [s]."""
@@ -90,8 +101,12 @@ class EtherCatWorld:
     def cycle(self) -> None:
         """Let one communication cycle pass."""
         self.begin_cycle()
-        for drives in self.drives:
-            drives.advance(self.cycle_time)
+        due = self._began + _nanoseconds(self.cycle_time)
+        for k, drives in enumerate(self.drives):
+            end = self._passed.setdefault(k, self._began) + _nanoseconds(drives.device.cycle)
+            if end <= due:
+                drives.advance(drives.device.cycle)
+                self._passed[k] = end
         self.end_cycle()
 
     def begin_cycle(self) -> None:
@@ -102,7 +117,8 @@ class EtherCatWorld:
     def end_cycle(self) -> None:
         """Run everything due after the drives have advanced."""
         self.cycles += 1
-        self.time = max(self.time, self.cycles * self.cycle_time)
+        self._began += _nanoseconds(self.cycle_time)
+        self.time = max(self.time, self._began / NANOSECONDS)
         for slave in self.segment.slaves:
             slave.run_until(self.time)
             slave.after_cycle(self.time)

@@ -27,7 +27,7 @@ from mechanics.compiled import cached, inlined, stage
 from mechanics.plant import PackedPlant
 
 # How a played or written value acts on a field.
-REAL, INTEGER, CONTROLWORD, MODE, SET_POINT = 0, 1, 2, 3, 4
+REAL, INTEGER, CONTROLWORD, MODE, SET_POINT, WHOLE_SET_POINT = 0, 1, 2, 3, 4, 5
 
 # Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
 ACTIVITY_TIME = 0.02
@@ -62,7 +62,7 @@ class Call(Bundle):
     """
 
     values: Cube  # (cycles, objects, all axes)
-    kinds: Numbers  # REAL, INTEGER, CONTROLWORD, MODE or SET_POINT, (objects,)
+    kinds: Numbers  # REAL, INTEGER, CONTROLWORD, MODE, SET_POINT or WHOLE_SET_POINT, (objects,)
     offsets: Numbers  # index of lane 0 in `reals` or `integers`, (objects,)
     samples: Cube  # written, (rows, objects, all axes)
     sample_kinds: Numbers  # REAL or INTEGER
@@ -400,7 +400,7 @@ def _supervise(stages: FirmwareStages, protect: Stage, tell_state: Stage) -> Sta
     return supervise
 
 
-def _play_row(events: _Events) -> Stage:
+def _play_row(events: _Events, target: int) -> Stage:
     write_controlword, write_mode = events.write_controlword, events.write_mode
 
     @stage
@@ -412,9 +412,11 @@ def _play_row(events: _Events) -> Stage:
                 value = values[row, k, first_axis + axis]
                 if kinds[k] == REAL:
                     reals[block, offsets[k] + lane] = value
-                elif kinds[k] == SET_POINT:
+                elif kinds[k] == SET_POINT or kinds[k] == WHOLE_SET_POINT:
                     reals[block, offsets[k] + lane] = value
                     records[block].set_point_fresh[lane] = 1
+                    if offsets[k] == target:
+                        records[block].target_is_whole[lane] = 1 if kinds[k] == WHOLE_SET_POINT else 0
                 elif kinds[k] == INTEGER:
                     integers[block, offsets[k] + lane] = int(value)
                 elif kinds[k] == CONTROLWORD:
@@ -613,7 +615,11 @@ def compose(stages: FirmwareStages, source: str) -> Firmware:
         layout=layout,
         causes=tuple(stages.causes),
         machinery=machinery,
-        run=_run(source, reader(machinery), _run_group(_play_row(events), supervise, window, leave_diverged)),
+        run=_run(
+            source,
+            reader(machinery),
+            _run_group(_play_row(events, layout.place("target_position")[1]), supervise, window, leave_diverged),
+        ),
         run_drives_alone=_run_drives_alone(source, supervise, window),
         write_events=_write_events(source, events),
         power_on=_power_on(source, stages, events.tell_state),

@@ -78,7 +78,7 @@ class Axis:
         self._count = self._place("emergency_count")[1]
         self._queue = [self._place("emergency", k)[1] for k in range(EMERGENCY_QUEUE)]
         self._fsa = self._place("fsa")[1]
-        self._fresh = self._place("set_point_fresh")[1]
+        self._fresh, self._whole = (self._place(name)[1] for name in ("set_point_fresh", "target_is_whole"))
         self._scaler = self._place(SCALE_FIELD)[1]
         self._other_scales = {name: self._place(name)[1] for name in objects.other_scales}
         self._error_register = self._place("error_register")[1]
@@ -268,12 +268,15 @@ class Axis:
             assert code.unit == "raw", "whole numbers of the record are bound as they are"
             return lambda raw: memory.__setitem__(place, raw)
         factor = self._factor_now(code)
-        fresh = code.event == "set_point"
+        fresh, is_whole = code.event in ("set_point", "whole_set_point"), int(code.event == "whole_set_point")
+        is_target = fresh and code.field == "target_position"
 
         def write(raw: int) -> None:
             memory[place] = decode_one(code, raw, factor())
             if fresh:
                 self._integers[self._fresh] = 1
+            if is_target:
+                self._integers[self._whole] = is_whole
 
         return write
 

@@ -16,7 +16,6 @@ from functools import partial
 import numpy as np
 
 from drive_env.devices import Device
-from drive_env.devices.image_rows import fixed_images
 from drive_env.dictionary.aborts import (
     SUB_INDEX_ZERO_IN_USE,
     VALUE_RANGE,
@@ -69,7 +68,7 @@ class ImageObjects:
             for index in indices
             if not entries.has(index - 0x200)
         }
-        self._fixed = fixed_images(device.presets.parent)
+        self._fixed = device.images
         owned = {SYNC_MANAGER_TYPES, *ASSIGNMENTS, *SYNCHRONISATION, *self._mappings}
         self._factory = {(entry.index, entry.sub): _number(entry) for entry in entries if entry.index in owned}
         self._values = dict(self._factory)

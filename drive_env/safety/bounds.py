@@ -257,9 +257,10 @@ def _ampere(drives: WatchedDrives) -> Floats:
     known, device = drives.description, drives.device
     if device is None or CURRENT not in device.bindings or not known.has(CURRENT):
         return np.zeros(drives.num_axes)
-    key = known.role(Role.PEAK_CURRENT)
-    peak = np.full(drives.num_axes, np.nan) if key is None else read_own(drives, key, 0) * 1e-3
-    context = Context(np.nan, np.nan, peak_current=peak)
+    keys = known.role(Role.PEAK_CURRENT), known.role(Role.NOMINAL_CURRENT)
+    unknown = np.full(drives.num_axes, np.nan)
+    peak, nominal = (unknown if key is None else read_own(drives, key, 0) * 1e-3 for key in keys)
+    context = Context(np.nan, np.nan, peak_current=peak, nominal_motor_current=nominal)
     factor = np.asarray(find_unit(device.bindings[CURRENT].unit).factor(context), float)
     return np.asarray(np.nan_to_num(np.broadcast_to(factor, (drives.num_axes,))), float)
 

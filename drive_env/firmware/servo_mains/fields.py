@@ -99,6 +99,7 @@ STATE = (
     Field("masters_torque", "f8", "A", "6071h meanwhile"),
     Field("masters_velocity", "f8", "rad/s", "60FFh meanwhile"),
     Field("masters_position", "f8", "rad", "607Ah meanwhile"),
+    Field("masters_is_whole", "i4", "", "target_is_whole meanwhile"),
     Field("profile_taken", "f8", "rad", "destination that the profile was planned to"),
     Field("torque_feed_forward", "f8", "A", "what csp and ip add to the set-point of the current"),
     Field("disconnected", "i4", "", "1: the D-Mode does not fit, the master is ignored"),

@@ -1,7 +1,8 @@
 """Commands that are not CiA 402's: control of the native image, and K-Command of the service modes.
 
 The native image's control (bit 0 clear errors, bit 1 enable the power stage) acts at its edges, as the same commands do
-of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation.
+of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation. Where csv
+needs D-Mode 10, that makes it 9, and the image's set-points are speeds as long as its control enables.
 
 K-Command (bits 1 and 0 are 01: enable; bit 3: clear errors) is that of the maker's service program. It acts while the
 master is disconnected or has no mode (6060h is 0), in the modes of the D-Mode: K-I, K-V or K-P_Angle and K-P_Revol are
@@ -21,6 +22,7 @@ from drive_env.firmware.servo_mains.d_mode import QUICK_STOP
 from mechanics.compiled import stage
 
 CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, SPEED_PROFILE, POSITION_PROFILE = 1, 2, 3, 6, 7  # D-Mode
+FIELDBUS_SPEED = 10  # of firmware whose csv needs it
 CLEAR, ENABLE = 0x01, 0x02  # bits of the native image's control
 SERVICE_MASK, SERVICE_ENABLE, SERVICE_CLEAR = 0x03, 0x01, 0x08  # of K-Command
 SHUTDOWN, SWITCH_ON, OPERATE = (
@@ -48,6 +50,15 @@ def step_up(drive, lane):
 
 
 @stage
+def native_mode(drive, lane):
+    """Return the mode of operation that a D-Mode is to the native image; 0: none."""
+    if drive.d_mode[lane] == POSITION_MODE:
+        return CSP
+    speed = drive.d_mode[lane] == FIELDBUS_SPEED and drive.d_mode_needed[CSV, lane] == FIELDBUS_SPEED
+    return CSV if speed else 0
+
+
+@stage
 def obey_native_control(drive, lane, dt):
     """Act on the edges of the native image's control."""
     control = int(drive.native_control[lane]) & (CLEAR | ENABLE)
@@ -57,9 +68,13 @@ def obey_native_control(drive, lane, dt):
         clear_errors(drive, lane)
     if control & ~before & ENABLE:
         drive.native_wants[lane] = 1
-        if drive.d_mode[lane] == POSITION_MODE and drive.mode[lane] != CSP:
-            modes.request_mode(drive, lane, CSP)
+        mode = native_mode(drive, lane)
+        if mode != 0 and drive.mode[lane] != mode:
+            modes.request_mode(drive, lane, mode)
             drive.disconnected[lane] = 0
+    if control & ENABLE and drive.mode[lane] == CSV and native_mode(drive, lane) == CSV:
+        # 2^32 of the set-point are 1 rpm, where they are a revolution of a position.
+        drive.target_velocity[lane] = drive.target_position[lane] / 60.0
     if before & ~control & ENABLE:
         drive.native_wants[lane] = 0
         drive.controlword[lane] = SHUTDOWN
@@ -129,8 +144,10 @@ def lead(drive, lane, mode):
     drive.masters_torque[lane] = drive.target_torque[lane]
     drive.masters_velocity[lane] = drive.target_velocity[lane]
     drive.masters_position[lane] = drive.target_position[lane]
+    drive.masters_is_whole[lane] = drive.target_is_whole[lane]
     drive.leads[lane] = 1
     drive.mode[lane] = mode
+    drive.target_is_whole[lane] = 1
     drive.target_torque[lane] = drive.service_current[lane] - drive.torque_offset[lane] if mode == CST else 0.0
     if mode == CSV:
         drive.target_velocity[lane] = drive.service_velocity[lane]
@@ -157,6 +174,7 @@ def give_back(drive, lane):
         drive.target_torque[lane] = drive.masters_torque[lane]
         drive.target_velocity[lane] = drive.masters_velocity[lane]
         drive.target_position[lane] = drive.masters_position[lane]
+        drive.target_is_whole[lane] = drive.masters_is_whole[lane]
 
 
 @stage

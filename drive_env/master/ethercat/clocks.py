@@ -13,12 +13,12 @@ from collections.abc import Sequence
 
 from drive_env.ethercat import registers
 from drive_env.fieldbus.errors import BusError, NoAnswerError
-from drive_env.master.ethercat.ethercat_master import EtherCatMaster
+from drive_env.master.ethercat.ethercat_master import EtherCatMaster, Sync0
 
 NANOSECOND = 1e-9  # s
 HAS_CLOCKS = 0x04  # of the features, 0008h
 FEATURES = 0x0008
-OFF, SYNC0_ON = 0x00, 0x03  # of the activation, 0981h
+OFF, SYNC0_ON, SYNC1_ON = 0x00, 0x03, 0x04  # of the activation, 0981h
 TOO_LATE = 0x04  # of the activation's status, 0984h: the start time had passed
 AHEAD = 0.1  # s from the look at the reference's time to the first pulse, as SOEM has it
 LATEST_START = 3.0  # s
@@ -65,20 +65,20 @@ def set_offsets(master: EtherCatMaster, count: int) -> None:
         master.write_register(position, registers.TIME_DELAY, struct.pack("<I", delay))
 
 
-def start_sync0(master: EtherCatMaster, positions: Sequence[int], cycle: float, is_lockstep: bool) -> None:
+def start_sync0(master: EtherCatMaster, positions: Sequence[int], clock: Sync0) -> None:
     """Start SYNC0 of slaves at the same whole multiple of its cycle [s].
 
     Args:
         master: Of the segment.
         positions: Slaves, which are in Pre-Op.
-        cycle: Of SYNC0 [s].
-        is_lockstep: Time stands still meanwhile, and the first pulse is that of the next cycle.
+        clock: Cycle; in lockstep time stands still meanwhile, and the first pulse is that of the next cycle.
 
     Raises:
         BusError: If a slave's clock does not start.
     """
-    length = round(cycle / NANOSECOND)
-    ahead = 0.0 if is_lockstep else AHEAD
+    length = round(clock.cycle / NANOSECOND)
+    activation = SYNC0_ON | (SYNC1_ON if clock.sync1 else 0)
+    ahead = 0.0 if clock.is_lockstep else AHEAD
     while True:
         for position in positions:
             master.write_register(position, registers.SYNC_ACTIVATION, bytes((OFF,)))
@@ -89,7 +89,9 @@ def start_sync0(master: EtherCatMaster, positions: Sequence[int], cycle: float, 
         for position in positions:
             master.write_register(position, registers.SYNC0_START, struct.pack("<Q", start % TURN))
             master.write_register(position, registers.SYNC0_CYCLE, struct.pack("<I", length))
-            master.write_register(position, registers.SYNC_ACTIVATION, bytes((SYNC0_ON,)))
+            if clock.sync1:
+                master.write_register(position, registers.SYNC1_DELAY, bytes(4))
+            master.write_register(position, registers.SYNC_ACTIVATION, bytes((activation,)))
         late = [k for k in positions if (master.register(k, registers.SYNC_STATUS, 1) or b"\0")[0] & TOO_LATE]
         if not late:
             return

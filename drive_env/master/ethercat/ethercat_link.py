@@ -52,7 +52,8 @@ class EtherCatLink:
         nodes: Positions of the slaves.
         description: What device they are.
         lockstep: Time passes by frames with process data alone.
-        sync0: Outputs take effect with SYNC0 of the distributed clocks, once in each of the description's cycles.
+        sync0: Outputs take effect with SYNC0 of the distributed clocks, once in each of the description's cycles; with
+            SYNC1, at the same times, of devices that use it.
 
     Raises:
         BusError: If there are no slaves, or fewer than named.
@@ -76,7 +77,9 @@ class EtherCatLink:
         self._alive: Callable[[], None] = lambda: None
         self._restarted: Callable[[int], None] = lambda node: None
         self._frame = description.answer_timeout if lockstep else FRAME
-        master.clock = Sync0(description.cycle, lockstep) if sync0 else None
+        known = None if description.device is None else description.device.ethercat
+        both = known is not None and known.uses_sync1
+        master.clock = Sync0(description.cycle, lockstep, both) if sync0 else None
         try:
             count = master.begin()
             beyond = [position for position in self.nodes if position >= count]

@@ -53,10 +53,14 @@ class ImageSizes(NamedTuple):
 
 
 class Sync0(NamedTuple):
-    """Cycle of SYNC0 [s]; whether time passes by frames alone, so that its first pulse is that of the next cycle."""
+    """Cycle of SYNC0 [s]; whether time passes by frames alone, so that its first pulse is that of the next cycle.
+
+    With `sync1`, SYNC1 comes at the same times.
+    """
 
     cycle: float
     is_lockstep: bool
+    sync1: bool = False
 
 
 class EtherCatMaster(Protocol):

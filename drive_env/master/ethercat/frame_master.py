@@ -295,7 +295,7 @@ class FrameMaster:
         check_clocks(self, range(len(self._places)))
         self._surely(C.BWR, 0, registers.RECEIVE_TIMES, bytes(4), "the clocks")
         set_offsets(self, len(self._places))
-        start_sync0(self, positions, clock.cycle, clock.is_lockstep)
+        start_sync0(self, positions, clock)
 
     def _place(self, position: int, address: int, size: ImageSizes) -> None:
         """Give the images of one slave their places in its memory and in the logical one; take it to Safe-Op."""

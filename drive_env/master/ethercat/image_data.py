@@ -236,6 +236,7 @@ class EtherCatProcessData:
         """Give the slaves that are in Pre-Op their images, filled with their objects' values, and go to Safe-Op."""
         layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
         for k in self.missing:
+            self._slaves[k].set_cycle(self._description.cycle)
             for direction, layout in layouts.items():
                 self._slaves[k].change(direction, layout)
             self.images[k] = self._as_it_is(k, layouts[OUTPUTS])

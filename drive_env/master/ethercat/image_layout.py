@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.devices.image_rows import TYPES, fixed_images
+from drive_env.devices.image_rows import TYPES
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.fieldbus.description import Description
@@ -70,7 +70,7 @@ class ImagePlanner:
         self._by_key = {(entry.index, entry.sub): (entry, 0) for entry in known} | {
             key: (entry, axis) for key, (entry, axis) in description.of_further_axes().items()
         }
-        images = {} if description.device is None else fixed_images(description.device.presets.parent)
+        images = {} if description.device is None else description.device.images
         self._ready_made: dict[int, list[ImageLayout]] = {OUTPUTS: [], INPUTS: []}
         for pdo, image in images.items():
             fields = [(None if one.is_name else one.key, TYPES[one.type][1]) for one in image.fields]

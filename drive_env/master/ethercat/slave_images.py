@@ -6,6 +6,7 @@ import struct
 from functools import partial
 
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.roles import Role
 from drive_env.fieldbus.description import Description
 from drive_env.fieldbus.link import ObjectClient
 from drive_env.fieldbus.tidying import Tidying
@@ -23,6 +24,10 @@ class SlaveImages:
     def __init__(self, sdo: ObjectClient, description: Description) -> None:
         self._sdo = sdo
         self._timeout = description.answer_timeout
+        self._cycle_key = description.role(Role.SET_CYCLE)
+        values = {} if description.device is None else description.device.allowed_values
+        self._cycles = values.get(self._cycle_key, ()) if self._cycle_key else ()  # us
+        self._cycle_before: int | None = None  # us
         # Direction -> (assigned objects, mapping object -> its entries), as they were found.
         self._before: dict[int, tuple[list[int], dict[int, list[int]]]] = {}
 
@@ -47,10 +52,23 @@ class SlaveImages:
             self._write_list(layout.pdo, layout.mapped, 4)
         self._write_list(direction, wanted, 2)
 
+    def set_cycle(self, cycle: float) -> None:
+        """Tell the slave the cycle of process data [s], if it has a register for it, and knows this one."""
+        wanted = round(1e6 * cycle)
+        if self._cycle_key is None or wanted not in self._cycles:
+            return
+        before = self._read(*self._cycle_key)
+        if before != wanted:
+            self._write(*self._cycle_key, 4, wanted)
+            self._cycle_before = before
+
     def restore(self) -> None:
-        """Put assignments and mappings back as they were found; BusError if not all of it could be."""
+        """Put assignments, mappings and cycle back as they were found; BusError if not all of it could be."""
         before, self._before = self._before, {}
         tidying = Tidying()
+        if self._cycle_key is not None and self._cycle_before is not None:
+            tidying.step(partial(self._write, *self._cycle_key, 4, self._cycle_before))
+            self._cycle_before = None
         for direction, (assigned, mappings) in before.items():
             tidying.step(partial(self._write, direction, 0, 1, 0))
             for pdo, mapped in mappings.items():
@@ -61,6 +79,7 @@ class SlaveImages:
     def forget(self) -> None:
         """Forget the images found: the slave has restarted."""
         self._before.clear()
+        self._cycle_before = None
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _read(self, index: int, sub: int) -> int:

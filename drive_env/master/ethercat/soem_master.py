@@ -187,7 +187,7 @@ class SoemMaster:
                 check_clocks(self, range(len(self._mailboxes)))
                 self._master.config_dc()
                 waiting = [k for k in sizes if self.status(k).state == AlState.PRE_OP]
-                start_sync0(self, waiting, self.clock.cycle, self.clock.is_lockstep)
+                start_sync0(self, waiting, self.clock)
             for position in sizes:
                 self._give_the_mailbox_back(position)
             try:

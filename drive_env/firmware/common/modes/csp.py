@@ -15,7 +15,7 @@ def generate(drive, lane, dt):
     target = drive.target_position[lane] + drive.position_offset[lane]
     if drive.cyclic_wraps[lane] == 1:
         target = profiles.nearest(target, drive.position_demand[lane], drive.position_scaler[lane])
-    else:
+    elif drive.target_is_whole[lane] == 0:
         target = profiles.unwrapped(target, drive.position_demand[lane], drive.position_scaler[lane])
     low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
     drive.internal_limit[lane] = 1 if target > high + ROUNDING or target < low - ROUNDING else 0

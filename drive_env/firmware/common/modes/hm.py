@@ -1,4 +1,4 @@
-"""Homing mode (CiA 402-2): methods 1 to 14, 17 to 30, 33 to 35 and 37; 0 does nothing.
+"""Homing mode (CiA 402-2): methods 1 to 14, 17 to 30, 33 to 35 and 37, -1 to -4 of makers; 0 does nothing.
 
 A switch is searched fast; once it is touched the axis brakes, and looks for the edge slowly, always in the same
 direction, until the switch changes; that edge is home. Then the axis returns to the edge and rests there. Search and
@@ -14,6 +14,8 @@ edge as the methods have them:
     1 to 14  as 17 to 30; from the edge on, the same way, to the encoder's next index, which is home
     33, 34  to the next index, left or right, slowly
     35, 37  here
+    -1, -2  right or left, fast, until a mechanical stop holds the axis; its position stays as it was counted
+    -3, -4  likewise, and the position is 0 there
 
 A limit switch turns the search for a home switch round. The edge where a switch becomes active is found from the same
 edge where it was left: slowly off it, and back.
@@ -33,7 +35,9 @@ from mechanics.compiled import stage
 LEFT, RIGHT, HOME = 0, 1, 2
 
 # States of a homing run.
-IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_INDEX, BACK_ON = range(12)
+(
+    IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_INDEX, BACK_ON, TO_STOP,
+) = range(13)  # fmt: skip
 
 BY_SWITCH = 16  # from a method with an index to the one that ends at the switch's edge
 INDEX_LEFT, INDEX_RIGHT = 33, 34
@@ -41,6 +45,8 @@ SEARCH_LEFT = (17, 21, 22, 27, 28, 29, 30)  # the others of 17 to 30 search to t
 RIGHT_EDGE = (17, 21, 22, 25, 26, 27, 28)  # the others end at the left one
 WHERE_ACTIVE = (20, 22, 24, 25, 28, 29)  # the others end where the switch becomes inactive
 HERE = (35, 37)  # CiA 402 has 35 as the older number of 37
+STOPS_RIGHT, SETS_ZERO = (-1, -3), (-3, -4)  # of the methods on a stop
+STALL_TIME, STALL_SHARE = 0.1, 0.1  # s, of the speed: below it so long, a stop holds the axis; decided by us
 INDEX_WAY = 1.05 * TWO_PI  # rad in which an index must come
 
 
@@ -94,7 +100,7 @@ def _edge_side(method):
 def is_running(drive, lane):
     """Return whether a homing run is under way."""
     state = drive.homing_state[lane]
-    return SEARCH <= state <= RETURN or state in (TO_INDEX, BACK_ON)
+    return SEARCH <= state <= RETURN or state in (TO_INDEX, BACK_ON, TO_STOP)
 
 
 @stage
@@ -124,14 +130,17 @@ def start_or_stop(drive, lane, word_before):
             drive.homing_attained[lane] = 1
             drive.target_reached[lane] = 1
         elif drive.fsa[lane] == fsa.ENABLED:
-            alone = _looks_for_index_alone(method)
+            alone, to_stop = _looks_for_index_alone(method), -5 < method < 0
             unable = (
                 (drive.homing_fast[lane] <= 0.0 and not alone)
-                or drive.homing_slow[lane] <= 0.0
+                or (drive.homing_slow[lane] <= 0.0 and not to_stop)
                 or drive.homing_acceleration[lane] <= 0.0
-                or not (alone or _has_switch(drive, lane, method))
+                or not (alone or to_stop or _has_switch(drive, lane, method))
             )
             drive.homing_state[lane] = FAILED if method == 0 or unable else SEARCH
+            if to_stop and not unable:
+                drive.homing_state[lane] = TO_STOP
+                drive.homing_stall[lane] = 0.0
             if alone and not unable:
                 drive.homing_state[lane] = _look_for_index(drive, lane, 1.0 if method == INDEX_RIGHT else -1.0)
             drive.target_reached[lane] = 1 if drive.homing_state[lane] == FAILED else 0
@@ -253,6 +262,26 @@ def _go_to_index(drive, lane, dt):
 
 
 @stage
+def _go_to_stop(drive, lane, dt):
+    """Move until the axis stands although its speed is asked for; return the state after it."""
+    method, fast = drive.homing_method[lane], drive.homing_fast[lane]
+    sign = 1.0 if method in STOPS_RIGHT else -1.0
+    _run(drive, lane, sign * fast, dt)
+    is_held = drive.velocity_demand[lane] == sign * fast and abs(drive.omega_slow[lane]) < STALL_SHARE * fast
+    drive.homing_stall[lane] = drive.homing_stall[lane] + dt if is_held else 0.0
+    if drive.homing_stall[lane] < STALL_TIME:
+        return TO_STOP
+    drive.velocity_demand[lane] = 0.0
+    drive.position_demand[lane] = drive.theta_meas[lane]
+    drive.velocity_sum[lane] = 0.0  # or the axis would press on
+    if method in SETS_ZERO:
+        set_home(drive, lane, drive.theta_meas[lane], 0.0)
+    drive.homing_attained[lane] = 1
+    drive.target_reached[lane] = 1
+    return DONE
+
+
+@stage
 def _return_to_edge(drive, lane, dt):
     """Return to the edge and rest there; return the state after it."""
     edge, acceleration = drive.homing_edge[lane], drive.homing_acceleration[lane]
@@ -294,6 +323,8 @@ def generate(drive, lane, dt):
         state = _enter_switch(drive, lane, edge, active, dt)
     elif state == TO_INDEX:
         state = _go_to_index(drive, lane, dt)
+    elif state == TO_STOP:
+        state = _go_to_stop(drive, lane, dt)
     elif state == RETURN:
         state = _return_to_edge(drive, lane, dt)
     elif state in (STOPPED, FAILED):

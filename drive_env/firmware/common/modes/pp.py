@@ -94,7 +94,7 @@ def _take(drive, lane, target, word):
             target += drive.position_demand[lane]
         else:
             target += drive.theta_meas[lane]
-    else:
+    elif drive.target_is_whole[lane] == 0:
         target = profiles.unwrapped(target, drive.position_demand[lane], drive.position_scaler[lane])
     low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
     drive.internal_limit[lane] = 1 if target > high + ROUNDING or target < low - ROUNDING else 0
