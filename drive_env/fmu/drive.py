@@ -118,10 +118,13 @@ class FmuDrive(Saved):
         """
         drives, cycle = self.drives, self.drives.device.cycle
         if not size > 0.999 * cycle:
-            raise ValueError(f"a step of {size:g} s is shorter than a communication cycle; use {cycle:g} s or a multiple")
+            raise ValueError(
+                f"a step of {size:g} s is shorter than a communication cycle; use {cycle:g} s or a multiple"
+            )
         cycles = whole_cycles(size, cycle)
         drives.record((), cycle, play=self._process_data())
-        drives.advance((cycles - 1) * cycle)
+        if cycles > 1:
+            drives.advance((cycles - 1) * cycle)
         for message in drives.emergencies():
             self._emergencies["code"][message.axis] = message.code
             self._emergencies["count"][message.axis] += 1

@@ -12,9 +12,12 @@ import uuid
 from pathlib import Path
 
 from drive_env import __version__
-from drive_env.fmu.drive import SETTINGS
+from drive_env.devices import device_names
+from drive_env.fmu.drive import NO_LOAD, SETTINGS
 from drive_env.fmu.slave import STANDARDS, Standard
+from drive_env.motors import MOTORS
 from drive_env.whole_file import write_whole
+from mechanics.loads import LOADS
 
 # What an importer finds in an FMU; the library looks for the line of the class.
 SCRIPT = '''"""A drive of drive-env {version} as an FMU."""
@@ -55,16 +58,17 @@ def export_fmu(file: Path, device: str, load: str, motor: str | None = None, *, 
     standard = _standard(fmi)
     name = file.stem
     if file.suffix != ".fmu" or re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) is None or keyword.iskeyword(name):
-        raise ValueError(f"{file.name} must be letters, digits and _, a letter first, then .fmu: the model has that name")
+        raise ValueError(
+            f"{file.name} must be letters, digits and _, a letter first, then .fmu: the model has that name"
+        )
     settings = {"device": device, "load": load, "motor": motor}
-    own = {key: Path(given) for key, given in settings.items() if given is not None and Path(given).exists()}
+    known = {*device_names(), *LOADS, NO_LOAD, *MOTORS, None}
+    own = {key: Path(given) for key, given in settings.items() if given not in known and Path(given).exists()}
     with tempfile.TemporaryDirectory() as folder:
         # A module of its own name: several FMUs may be loaded by one program, whose modules have their names once.
         script, packed = Path(folder) / f"drive_{uuid.uuid4().hex}.py", Path(folder) / "packed"
         script.write_text(
-            SCRIPT.format(
-                version=__version__, library=standard.library, slave=standard.slave, name=name, standard=fmi
-            ),
+            SCRIPT.format(version=__version__, library=standard.library, slave=standard.slave, name=name, standard=fmi),
             encoding="utf-8",
         )
         data = Path(folder) / SETTINGS

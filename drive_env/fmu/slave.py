@@ -117,7 +117,10 @@ class DriveSlave:
             found.set(name, "true")
         if self.STANDARD == 3:
             found.set("fixedInternalStepSize", f"{self._drive.drives.device.cycle:g}")
-        else:  # the library leaves out which outputs are computed as the simulation begins: all of them
+        else:
+            # A second instance in one program was seen to end it: in the library, before it calls this class.
+            found.set("canBeInstantiatedOnlyOncePerProcess", "true")
+            # The library leaves out which outputs are computed as the simulation begins: all of them.
             structure = root.find("ModelStructure")
             assert structure is not None, "the library writes it"
             SubElement(structure, "InitialUnknowns").extend(structure.findall("Outputs/Unknown"))
