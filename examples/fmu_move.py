@@ -10,6 +10,7 @@ import argparse
 import csv
 import math
 import shutil
+from pathlib import Path
 
 import fmpy
 import matplotlib
@@ -102,7 +103,7 @@ def main() -> None:
         servo.step(target_position=2 * TURN + round(TURN * math.sin(2 * math.pi * k * CYCLE) ** 2))
     print(f"csp: {servo.rows[-1]['position_actual_value']} inc, statusword {servo.rows[-1]['statusword']:04X}h")
     servo.close()
-    with open(f"{options.out}.csv", "w", newline="", encoding="utf-8") as file:
+    with Path(f"{options.out}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, servo.rows[0])
         writer.writeheader()
         writer.writerows(servo.rows)

@@ -83,7 +83,7 @@ def test_the_file_is_valid_and_says_what_it_can(servo):
     about = fmpy.read_model_description(str(servo))
     assert (about.modelName, about.fmiVersion) == ("servo", "3.0")
     assert about.coSimulation.canGetAndSetFMUstate and about.coSimulation.canSerializeFMUstate
-    assert about.coSimulation.fixedInternalStepSize == pytest.approx(MS)
+    assert float(about.coSimulation.fixedInternalStepSize) == MS
     kinds = {one.name: (one.causality, one.type, one.unit) for one in about.modelVariables}
     assert kinds["controlword"] == ("input", "Int32", None)
     assert kinds["load_torque"] == ("input", "Float64", "N*m")
@@ -213,7 +213,7 @@ def test_a_state_from_outside_is_data_alone():
     ("tmcm1636", "two_mass", ["statusword", "load_torque", "load.inertia", "'Profile velocity'"], ["shaft_torque"]),
     ("tgz_d", "gantry", ["axis1.statusword", "axis1.drive_mode", "load_torque", "supply_voltage"], ["statusword"]),
     ("tgz_d", "none", ["axis1.shaft_torque", "axis0.load.inertia", "supply_voltage"], ["load_torque"]),
-    ("tmcm3313", "portal", ["axis2.left_switch", "axis2.'Profile velocity'", "axis1.supply_voltage"], ["axis3.statusword"]),
+    ("tmcm3313", "portal", ["axis2.left_switch", "axis2.'Profile velocity'"], ["axis3.statusword"]),
     ("tmcm6212", "inertia", ["axis5.position_demand_value", "axis5.load_torque"], ["axis0.torque_actual_value"]),
     ("tmcm1636", "gantry", ["axis1.statusword", "load_torque"], ["axis2.statusword"]),  # two drives of one axis
 ])  # fmt: skip

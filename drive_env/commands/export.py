@@ -44,7 +44,7 @@ export_app = typer.Typer(cls=ExportGroup, no_args_is_help=True, rich_markup_mode
 
 @export_app.callback()
 def export() -> None:
-    """Files by which other masters and tools know a drive, EDS and DCF of CANopen, ESI of EtherCAT; or simulate it: FMU."""
+    """Files by which others know a drive, EDS and DCF of CANopen, ESI of EtherCAT; or simulate it: FMU."""
 
 
 @dataclass(frozen=True, kw_only=True)

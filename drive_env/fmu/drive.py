@@ -16,7 +16,17 @@ from drive_env.dictionary.access import check_in_range
 from drive_env.drives.arguments import whole_cycles
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.fmu.variables import (
-    BOOLEAN, EMERGENCIES, INPUT, INTEGER, LARGE, MACHINE, OUTPUT, PARAMETER, SWITCHES, WRITTEN, FmuVariable,
+    BOOLEAN,
+    EMERGENCIES,
+    INPUT,
+    INTEGER,
+    LARGE,
+    MACHINE,
+    OUTPUT,
+    PARAMETER,
+    SWITCHES,
+    WRITTEN,
+    FmuVariable,
     variables_of,
 )  # fmt: skip
 from drive_env.saved_state import Saved

@@ -131,7 +131,7 @@ class DriveSlave:
         self._drive.begin()
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Let a step pass; False, with the reason in the importer's log, for one that is refused and changed nothing."""
+        """Let a step pass; False, with the reason in the importer's log, for one that is refused."""
         try:
             self._drive.step(step_size)
         except (ValueError, ObjectAccessError) as error:

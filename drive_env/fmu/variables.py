@@ -56,7 +56,7 @@ def _object(name: str, causality: str, source: int | Role, meaning: str) -> Row:
     return Row(name, causality, INTEGER, (source, 0) if isinstance(source, int) else source, "", meaning)
 
 
-# Objects that a drive lacks are left out. Inputs act in this order: targets are there before the controlword takes them.
+# Objects that a drive lacks are left out. Inputs act in this order: targets are there when the controlword takes them.
 ROWS = (
     _object("drive_mode", INPUT, Role.MODE_GATE, "the drive's own mode, which a mode of operation needs"),
     _object("mode_of_operation", INPUT, cia402.MODE, "mode of operation"),
@@ -64,7 +64,7 @@ ROWS = (
     _object("target_velocity", INPUT, cia402.TARGET_VELOCITY, "target velocity"),
     _object("target_torque", INPUT, cia402.TARGET_TORQUE, "target torque"),
     _object("controlword", INPUT, cia402.CONTROLWORD, "controlword"),
-    Row("load_torque", INPUT, REAL, "load_torque", "", "from outside on the load, in the direction of turning", MACHINE),
+    Row("load_torque", INPUT, REAL, "load_torque", "", "on the load, in the direction of turning", MACHINE),
     Row("supply_voltage", INPUT, REAL, "supply", "V", "open-circuit voltage of the supply", SUPPLY),
     Row("enable_input", INPUT, BOOLEAN, "enable_input", "", "the drive's enable input is closed"),
     Row("left_switch", INPUT, BOOLEAN, "left", "", "left limit switch is held pressed, wherever the load is"),
