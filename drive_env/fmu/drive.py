@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +32,7 @@ from drive_env.saved_state import Saved
 from mechanics.arrays import Floats, Integers
 from mechanics.load import Load, Switch
 from mechanics.loads import BARE_SHAFT, find_load
+from mechanics.untrusted import read_json
 
 SETTINGS = "drive.json"  # of an FMU, among its resources
 NO_LOAD = "none"
@@ -44,7 +44,7 @@ def read_settings(resources: Path) -> dict[str, str | None]:
     Raises:
         ValueError: For an FMU of another version of drive-env, whose variables may have other references.
     """
-    settings = json.loads((resources / SETTINGS).read_text(encoding="utf-8"))
+    settings = read_json(resources / SETTINGS)
     made_by = settings.pop("drive_env")
     if made_by != drive_env.__version__:
         raise ValueError(

@@ -18,6 +18,7 @@ from drive_env.fmu.slave import STANDARDS, Standard
 from drive_env.motors import MOTORS
 from drive_env.whole_file import write_whole
 from mechanics.loads import LOADS
+from mechanics.untrusted import read_bytes
 
 # What an importer finds in an FMU; the library looks for the line of the class.
 SCRIPT = '''"""A drive of drive-env {version} as an FMU."""
@@ -62,8 +63,12 @@ def export_fmu(file: Path, device: str, load: str, motor: str | None = None, *, 
             f"{file.name} must be letters, digits and _, a letter first, then .fmu: the model has that name"
         )
     settings = {"device": device, "load": load, "motor": motor}
-    known = {*device_names(), *LOADS, NO_LOAD, *MOTORS, None}
-    own = {key: Path(given) for key, given in settings.items() if given not in known and Path(given).exists()}
+    known = {*device_names(), *LOADS, NO_LOAD, *MOTORS}
+    own = {
+        key: Path(given)
+        for key, given in settings.items()
+        if given is not None and given not in known and Path(given).exists()
+    }
     with tempfile.TemporaryDirectory() as folder:
         # A module of its own name: several FMUs may be loaded by one program, whose modules have their names once.
         script, packed = Path(folder) / f"drive_{uuid.uuid4().hex}.py", Path(folder) / "packed"
@@ -80,7 +85,7 @@ def export_fmu(file: Path, device: str, load: str, motor: str | None = None, *, 
         finally:
             sys.path[:] = before  # the library leaves its folder there
             sys.modules.pop(script.stem, None)
-        write_whole(file, made.read_bytes())
+        write_whole(file, read_bytes(made))
 
 
 def _standard(fmi: int) -> Standard:

@@ -73,6 +73,7 @@ class DriveSlave:
     STANDARD: int
     resources: str
     log: Any
+    register_units: Any
     register_variable: Any
 
     def __init__(self, **given: Any) -> None:

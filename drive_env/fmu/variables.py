@@ -21,7 +21,7 @@ FIRST_OF_DEVICE = 0x2000  # objects below say how a node talks
 _IDENTIFIER = re.compile(r"[A-Za-z_]\w*")
 
 
-class Row(NamedTuple):
+class VariableRow(NamedTuple):
     """What variables of one kind are.
 
     Attributes:
@@ -48,12 +48,12 @@ class FmuVariable(NamedTuple):
     """A variable: its name, its row, and the axes that it is of."""
 
     name: str
-    row: Row
+    row: VariableRow
     axes: tuple[int, ...]
 
 
-def _object(name: str, causality: str, source: int | Role, meaning: str) -> Row:
-    return Row(name, causality, INTEGER, (source, 0) if isinstance(source, int) else source, "", meaning)
+def _object(name: str, causality: str, source: int | Role, meaning: str) -> VariableRow:
+    return VariableRow(name, causality, INTEGER, (source, 0) if isinstance(source, int) else source, "", meaning)
 
 
 # Objects that a drive lacks are left out. Inputs act in this order: targets are there when the controlword takes them.
@@ -64,12 +64,12 @@ ROWS = (
     _object("target_velocity", INPUT, cia402.TARGET_VELOCITY, "target velocity"),
     _object("target_torque", INPUT, cia402.TARGET_TORQUE, "target torque"),
     _object("controlword", INPUT, cia402.CONTROLWORD, "controlword"),
-    Row("load_torque", INPUT, REAL, "load_torque", "", "on the load, in the direction of turning", MACHINE),
-    Row("supply_voltage", INPUT, REAL, "supply", "V", "open-circuit voltage of the supply", SUPPLY),
-    Row("enable_input", INPUT, BOOLEAN, "enable_input", "", "the drive's enable input is closed"),
-    Row("left_switch", INPUT, BOOLEAN, "left", "", "left limit switch is held pressed, wherever the load is"),
-    Row("right_switch", INPUT, BOOLEAN, "right", "", "right limit switch is held pressed, wherever the load is"),
-    Row("home_switch", INPUT, BOOLEAN, "home", "", "home switch is held pressed, wherever the load is"),
+    VariableRow("load_torque", INPUT, REAL, "load_torque", "", "on the load, in the direction of turning", MACHINE),
+    VariableRow("supply_voltage", INPUT, REAL, "supply", "V", "open-circuit voltage of the supply", SUPPLY),
+    VariableRow("enable_input", INPUT, BOOLEAN, "enable_input", "", "the drive's enable input is closed"),
+    VariableRow("left_switch", INPUT, BOOLEAN, "left", "", "left limit switch is held pressed, wherever the load is"),
+    VariableRow("right_switch", INPUT, BOOLEAN, "right", "", "right limit switch is held pressed, wherever the load is"),
+    VariableRow("home_switch", INPUT, BOOLEAN, "home", "", "home switch is held pressed, wherever the load is"),
     _object("statusword", OUTPUT, cia402.STATUSWORD, "statusword"),
     _object("mode_display", OUTPUT, cia402.MODE_DISPLAY, "mode of operation that is active"),
     _object("position_actual_value", OUTPUT, cia402.POSITION_ACTUAL, "measured position"),
@@ -79,11 +79,11 @@ ROWS = (
     _object("torque_actual_value", OUTPUT, cia402.TORQUE_ACTUAL, "measured current or torque"),
     _object("torque_demand_value", OUTPUT, cia402.TORQUE_DEMAND, "demanded current or torque"),
     _object("digital_inputs", OUTPUT, cia402.DIGITAL_INPUTS, "levels of the inputs"),
-    Row("rotor_angle", OUTPUT, REAL, "rotor_angle", "rad", "true angle of the rotor"),
-    Row("rotor_speed", OUTPUT, REAL, "rotor_speed", "rad/s", "true speed of the rotor"),
-    Row("motor_torque", OUTPUT, REAL, "motor_torque", "N*m", "true torque of the motor on its rotor"),
-    Row("emergency_code", OUTPUT, INTEGER, "code", "", "code of the last emergency message, 0 before the first"),
-    Row("emergency_count", OUTPUT, INTEGER, "count", "", "emergency messages so far"),
+    VariableRow("rotor_angle", OUTPUT, REAL, "rotor_angle", "rad", "true angle of the rotor"),
+    VariableRow("rotor_speed", OUTPUT, REAL, "rotor_speed", "rad/s", "true speed of the rotor"),
+    VariableRow("motor_torque", OUTPUT, REAL, "motor_torque", "N*m", "true torque of the motor on its rotor"),
+    VariableRow("emergency_code", OUTPUT, INTEGER, "code", "", "code of the last emergency message, 0: none"),
+    VariableRow("emergency_count", OUTPUT, INTEGER, "count", "", "emergency messages so far"),
 )  # fmt: skip
 SWITCHES = ("left", "right", "home")
 WRITTEN = ("drive_mode", "mode_of_operation")  # when they change: an RPDO that repeats a mode is ignored
@@ -137,7 +137,7 @@ def _groups(drives: EmulatedDrives) -> Mapping[str, list[tuple[int, ...]]]:
     }
 
 
-def _of_entry(row: Row, entry: Entry) -> Row:
+def _of_entry(row: VariableRow, entry: Entry) -> VariableRow:
     """Return a row with what the dictionary says of its object."""
     assert entry.low is not None and entry.high is not None, "numbers alone are variables"
     fits = entry.low in INT32 and (entry.high in INT32 or row.causality == OUTPUT)
@@ -146,7 +146,7 @@ def _of_entry(row: Row, entry: Entry) -> Row:
     )
 
 
-def _parameters(drives: EmulatedDrives) -> Iterator[Row]:
+def _parameters(drives: EmulatedDrives) -> Iterator[VariableRow]:
     """Yield what is set before the simulation begins: parameters of the drive that act here, and those of the load."""
     device, objects = drives.device, drives.inside.objects
     for entry in device.new_dictionary():
@@ -155,12 +155,12 @@ def _parameters(drives: EmulatedDrives) -> Iterator[Row]:
         acts = key in drives.codes or key in objects.scale_keys
         is_parameter = entry.access in ("rw", "rwr", "rww") and not command(base, device.master)
         if axis == 0 and acts and is_parameter and entry.index >= FIRST_OF_DEVICE and entry.bits is not None:
-            row = Row(_quoted(entry.name), PARAMETER, INTEGER, key, "", "parameter of the drive")
+            row = VariableRow(_quoted(entry.name), PARAMETER, INTEGER, key, "", "parameter of the drive")
             yield _of_entry(row._replace(of=NODE if device.is_shared(entry.index) else AXIS), entry)
     for name, parameter in drives.machine.parameter_rows.items():
         if name.startswith("load."):
             meaning = next(one.meaning for one in drives.load.parameters if f"load.{one.name}" == name)
-            yield Row(name, PARAMETER, REAL, name, parameter.unit, f"of the load: {meaning}", MACHINE)
+            yield VariableRow(name, PARAMETER, REAL, name, parameter.unit, f"of the load: {meaning}", MACHINE)
 
 
 def _quoted(name: str) -> str:
