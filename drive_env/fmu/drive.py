@@ -94,7 +94,7 @@ class FmuDrive(Saved):
         self._applied = dict(self._given)
 
     def get(self, variable: FmuVariable) -> Any:
-        """Return a variable: what an input or parameter was set to, what an output is now."""
+        """Return the value that an input or a parameter was set to, or that an output has now."""
         return self._given[variable.name] if variable.name in self._given else self._present(variable)
 
     def set(self, variable: FmuVariable, value: float) -> None:
@@ -141,7 +141,7 @@ class FmuDrive(Saved):
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _present(self, one: FmuVariable) -> Any:
-        """Return what a variable is on the drives."""
+        """Read the present value of a variable."""
         row, machine, axis = one.row, self.drives.machine, one.axes[0]
         number = axis // self.drives.load.num_axes
         if not isinstance(row.source, str):

@@ -57,7 +57,7 @@ class PlainData(pickle.Unpickler):
     KNOWN = (("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype"))
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what makes an array; UnpicklingError for anything else."""
+        """Return a class or function of arrays; UnpicklingError for anything else."""
         if (module, name) not in self.KNOWN:
             raise pickle.UnpicklingError(f"the state holds {module}.{name}, which is no data; it is of no drive")
         return super().find_class(module, name)
