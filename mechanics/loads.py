@@ -333,6 +333,16 @@ _ROWS = (
 )
 
 LOADS: dict[str, Load] = {row.name: row for row in _ROWS}
+# No load: for mechanics that are elsewhere and give the torque at the shaft.
+BARE_SHAFT = Load(
+    MODELS / "bare_shaft.xml",
+    joints=("shaft",),
+    name="none",
+    disturbance={"shaft": 1.0},
+    parameters=(Parameter("inertia", "kg*m^2", "body_inertia", "hub", 1.0, 1.0, "what is rigid on the shaft: a hub"),),
+    meaning="a rotor alone",
+    energy_bound=1e-4,
+)
 
 
 def find_load(load: str | Path | Load) -> Load:

@@ -24,7 +24,7 @@ ROOMS = (
     "drive_env.fieldbus", "drive_env.drives", "drive_env.faults", "drive_env.emulator", "drive_env.node",
     "drive_env.canopen", "drive_env.bus", "drive_env.ethercat", "drive_env.safety", "drive_env.master",
     "drive_env.loops", "drive_env.randomisation", "drive_env.trials", "drive_env.pictures", "drive_env.envs",
-    "drive_env", "drive_env.studio", "drive_env.commands",
+    "drive_env", "drive_env.fmu", "drive_env.studio", "drive_env.commands",
     "tuning", "tuning.bootstrap", "tuning.estimate", "tuning.fallback_gains", "tuning.lateness",
     "tuning.linked_axes", "tuning.move_counter", "tuning.oscillation_watch", "tuning.stop_causes", "tuning.toml_tables",
     "tuning.runs", "tuning.target", "tuning.drive_audit", "tuning.link_energy", "tuning.outcome", "tuning.rules",

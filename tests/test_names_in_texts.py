@@ -22,6 +22,7 @@ ELSEWHERE = {
     "firmware_update", "minimal_example", "read_eeprom", "read_sdo_info", "write_foe", "ecat", "ecat_mailbox", "tshark",
     "setcap", "meshes", "null", "velocity_axis0.csv", "bias_0", "mjpython", "peak_usb", "kvaser_usb", "gs_usb",
     "dialout", "Sm", "Fixed", "Mandatory", "Exclude", "PdoConfig", "InitCmd", "Slots",
+    "axis0.statusword", "Int32", "Int64", "fmi3GetFMUState", "fmi3SerializeFMUState", "libpython3.11.so", "fatal",
 }  # fmt: skip
 IN_BACKTICKS = re.compile(r"`([^`\s]+)`")
 FILE_IN_PACKAGE = re.compile(rf"(?<![\w/.`-])(?:{'|'.join(PACKAGES)}|docs|tests)/[\w/-]+(?:{'|'.join(SUFFIXES)})\b")

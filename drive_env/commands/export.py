@@ -1,4 +1,4 @@
-"""`drive-env export`: files by which other programs know a drive, EDS and DCF of CANopen and ESI of EtherCAT."""
+"""`drive-env export`: files by which other programs know a drive, EDS, DCF and ESI, or simulate it, FMU."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from drive_env.commands.options import (
 )
 from drive_env.commands.program import answer_old_name
 from drive_env.commands.tables import print_text
+from drive_env.default_device import DEFAULT_DEVICE
 
 KBIT = 1000  # bit/s
 
@@ -43,7 +44,7 @@ export_app = typer.Typer(cls=ExportGroup, no_args_is_help=True, rich_markup_mode
 
 @export_app.callback()
 def export() -> None:
-    """Files by which other masters and tools know a drive: EDS and DCF of CANopen, ESI of EtherCAT."""
+    """Files by which others know a drive, EDS and DCF of CANopen, ESI of EtherCAT; or simulate it: FMU."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +100,31 @@ def export_esi(file: File, device: DeviceName) -> None:
     with errors_as_exit_codes():
         _check_name(file, ".xml")
         _write(file, esi_text(find_device(device)), f"ESI of {device}")
+
+
+@export_app.command("fmu")
+def export_drive(
+    device: Annotated[str, typer.Argument(help="Device by name, or your own by its path.")] = DEFAULT_DEVICE,
+    load: Annotated[
+        str, typer.Option(help="Load by name, or the path of an MJCF; none: other mechanics are on the shaft.")
+    ] = "two_mass",
+    motor: Annotated[
+        str | None, typer.Option(help="Motor, a name or a TOML file; the device's usual one by default.")
+    ] = None,
+    fmi: Annotated[int, typer.Option(help="Version of FMI, 2 or 3.")] = 3,
+    *,
+    out: Annotated[Path, typer.Option(help="New file, NAME.fmu; the model has that name.")],
+) -> None:
+    """Write an FMU for co-simulation: an emulated drive with its motor and its load, commissioned.
+
+    The program that loads it needs drive-env in its Python. Inputs and outputs are in docs/how-to/fmu.md.
+    """
+    from drive_env.fmu.export import export_fmu
+
+    with errors_as_exit_codes():
+        check_free(out)
+        export_fmu(out, device, load, motor, fmi=fmi)
+        print(f"{out}: {device} with load {load}, an FMU of FMI {fmi}")
 
 
 def _write_commissioned(context: typer.Context, file: Path, drive: CommissionedOptions, node_id: int | None) -> None:

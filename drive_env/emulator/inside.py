@@ -123,13 +123,8 @@ class Inside(Saved):
         records["standstill"] = device.standstill
         records["warning_temperature"] = device.warning_temperature
         records["error_temperature"] = device.error_temperature
-        for switch in self.load.switches:
-            kind = SWITCHES.index(switch.kind)
-            axes = np.tile(np.arange(self.load.num_axes) == switch.axis, self.num_machines)
-            set_lanes(records, "switch_low", np.full(self.num_axes, switch.low), axes, kind)
-            set_lanes(records, "switch_high", np.full(self.num_axes, switch.high), axes, kind)
-            wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
-            set_lanes(records, "wired", wired | (1 << kind), axes)
+        for kind in SWITCHES:
+            self.set_switches(kind, np.zeros(self.num_axes, bool))
         records["supply_voltage"] = supply
         records["mode_delay"] = device.quirks.mode_display_delay
         records["mode_needs_halt"] = device.quirks.mode_change_needs_halt
@@ -198,6 +193,17 @@ class Inside(Saved):
         if self._kind.connect is not None and self.load.num_axes == 1:
             axes = np.arange(self.num_axes)
             self._kind.connect(self.records, self.device, (axes >= first) & (axes < first + number))
+
+    def set_switches(self, kind: str, held: Mask) -> None:
+        """Wire the switches of a kind: the load presses them where its row says, or everywhere those that are held."""
+        for switch in self.load.switches:
+            if switch.kind == kind:
+                axes = np.tile(np.arange(self.load.num_axes) == switch.axis, self.num_machines)
+                number = SWITCHES.index(kind)
+                set_lanes(self.records, "switch_low", np.where(held, -np.inf, switch.low), axes, number)
+                set_lanes(self.records, "switch_high", np.where(held, np.inf, switch.high), axes, number)
+                wired = get_lanes(self.records, "wired", self.num_axes).astype(np.int32)
+                set_lanes(self.records, "wired", wired | (1 << number), axes)
 
     def set_noise(self, axes: Mask) -> None:
         """Let the noise of axes begin anew, where their firmware has any."""

@@ -277,6 +277,27 @@ class Machines:
         """Inputs as the load presses them, bits of 60FDh, shape (num_axes,)."""
         return self._axis_field("inputs").astype(np.int64)
 
+    def press(self, kind: str, held: ArrayLike) -> None:
+        """Hold switches pressed from outside, wherever the load is; those that are let go are the load's again.
+
+        Args:
+            kind: "left", "right" or "home".
+            held: One value or one per axis.
+
+        Raises:
+            ValueError: For a kind of switch that an axis which it is held on does not have.
+        """
+        inside = self.inside
+        pressed = np.broadcast_to(np.asarray(held, bool), (inside.num_axes,))
+        there = {switch.axis for switch in inside.load.switches if switch.kind == kind}
+        missing = [int(axis) for axis in np.flatnonzero(pressed) if axis % inside.load.num_axes not in there]
+        if missing:
+            raise ValueError(
+                f"axis {missing[0]} has no {kind} switch to press: load {inside.load.name!r} has "
+                f"{', '.join(f'{one.kind} (axis {one.axis})' for one in inside.load.switches) or 'none'}"
+            )
+        inside.set_switches(kind, pressed)
+
     @property
     def enable_input(self) -> Mask:
         """Whether the enable input is closed, shape (num_axes,); set it to a value or one per axis."""

@@ -1,0 +1,192 @@
+"""The drive inside an FMU: emulated drives whose variables an importer sets and gets, and whose time it lets pass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import drive_env
+from drive_env.devices import find_device
+from drive_env.dictionary.access import check_in_range
+from drive_env.drives.arguments import whole_cycles
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.fmu.variables import (
+    BOOLEAN,
+    EMERGENCIES,
+    INPUT,
+    INTEGER,
+    LARGE,
+    MACHINE,
+    OUTPUT,
+    PARAMETER,
+    SWITCHES,
+    WRITTEN,
+    FmuVariable,
+    variables_of,
+)  # fmt: skip
+from drive_env.saved_state import Saved
+from mechanics.arrays import Floats, Integers
+from mechanics.load import Load, Switch
+from mechanics.loads import BARE_SHAFT, find_load
+from mechanics.untrusted import read_json
+
+SETTINGS = "drive.json"  # of an FMU, among its resources
+NO_LOAD = "none"
+
+
+def read_settings(resources: Path) -> dict[str, str | None]:
+    """Return which drive an FMU has: device, load and motor, each a name or the path of a file among its resources.
+
+    Raises:
+        ValueError: For an FMU of another version of drive-env, whose variables may have other references.
+    """
+    settings = read_json(resources / SETTINGS)
+    made_by = settings.pop("drive_env")
+    if made_by != drive_env.__version__:
+        raise ValueError(
+            f"the FMU was made by drive-env {made_by} and this is drive-env {drive_env.__version__}; install that "
+            "version, or export the FMU anew"
+        )
+    return {
+        name: str(resources / given) if given is not None and (resources / given).exists() else given
+        for name, given in settings.items()
+    }
+
+
+def with_switches(load: Load) -> Load:
+    """Return a load whose every axis has limit and home switches; those that it lacks it never presses by itself."""
+    there = {(switch.kind, switch.axis) for switch in load.switches}
+    others = (
+        Switch(kind, axis, math.inf, -math.inf)
+        for axis in range(load.num_axes)
+        for kind in SWITCHES
+        if (kind, axis) not in there
+    )
+    return replace(load, switches=(*load.switches, *others))
+
+
+class FmuDrive(Saved):
+    """A drive with its motor and its load, one of the table or a model, or `none`.
+
+    Every axis of the device turns a load; a load with more axes than the device has takes several of them.
+
+    Attributes:
+        drives: The emulated drives.
+        variables: What can be set and got, in the order of their value references.
+    """
+
+    STATE = ("drives", "_given", "_applied", "_emergencies")
+
+    def __init__(self, device: str, load: str, motor: str | None = None) -> None:
+        known, is_bare = find_device(device), load == NO_LOAD
+        row = with_switches(find_load(BARE_SHAFT if is_bare else load))
+        machines = max(1, known.num_axes // row.num_axes)
+        self.drives = EmulatedDrives(device, row, motor, num_machines=machines, num_threads=1)
+        if known.num_axes <= self.drives.num_axes:
+            self.drives.inside.connect_axes(0, known.num_axes)
+        self.variables = variables_of(self.drives, is_bare=is_bare)
+        self._emergencies = {name: np.zeros(self.drives.num_axes, np.int64) for name in EMERGENCIES}
+        self._given = {one.name: self._present(one) for one in self.variables if one.row.causality != OUTPUT}
+        self._applied = dict(self._given)
+
+    def get(self, variable: FmuVariable) -> Any:
+        """Return the value that an input or a parameter was set to, or that an output has now."""
+        return self._given[variable.name] if variable.name in self._given else self._present(variable)
+
+    def set(self, variable: FmuVariable, value: float) -> None:
+        """Set an input or a parameter; it is checked when it acts: in the next step, or as the simulation begins."""
+        whole = variable.row.kind in (INTEGER, LARGE) and float(value).is_integer()
+        self._given[variable.name] = int(value) if whole else bool(value) if variable.row.kind == BOOLEAN else value
+
+    def begin(self) -> None:
+        """Write the parameters that were set, in the dictionary's order.
+
+        Raises:
+            ObjectAccessError: For an object that does not take its value.
+            ValueError: For a number that the load cannot have.
+        """
+        for one in self._changed(PARAMETER):
+            value, where = self._given[one.name], np.isin(np.arange(self.drives.num_axes), one.axes)
+            if isinstance(one.row.source, str):
+                self.drives.machine.set(one.row.source, value, where[:: self.drives.load.num_axes])
+            else:
+                self.drives.write(one.row.source, value, where)
+            self._applied[one.name] = value
+
+    def step(self, size: float) -> None:
+        """Let inputs act and whole communication cycles pass [s]; a refused step changes nothing.
+
+        Inputs are a master's process data: they arrive once, as the step begins.
+
+        Raises:
+            ValueError: For another step, and an input that the machine cannot have.
+            ObjectAccessError: For an input that the drive's object does not take.
+        """
+        drives, cycle = self.drives, self.drives.device.cycle
+        if not size > 0.999 * cycle:
+            raise ValueError(
+                f"a step of {size:g} s is shorter than a communication cycle; use {cycle:g} s or a multiple"
+            )
+        cycles = whole_cycles(size, cycle)
+        drives.record((), cycle, play=self._process_data())
+        if cycles > 1:
+            drives.advance((cycles - 1) * cycle)
+        for message in drives.emergencies():
+            self._emergencies["code"][message.axis] = message.code
+            self._emergencies["count"][message.axis] += 1
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _present(self, one: FmuVariable) -> Any:
+        """Read the present value of a variable."""
+        row, machine, axis = one.row, self.drives.machine, one.axes[0]
+        number = axis // self.drives.load.num_axes
+        if not isinstance(row.source, str):
+            return int(self.drives.read(row.source)[axis])
+        if row.source in SWITCHES:
+            return False
+        if row.source in EMERGENCIES:
+            return int(self._emergencies[row.source][axis])
+        if row.causality == PARAMETER:
+            return float(machine.parameters[row.source][number])
+        value = getattr(machine, row.source)[number if row.of == MACHINE else axis]
+        return bool(value) if row.kind == BOOLEAN else float(value)
+
+    def _changed(self, causality: str) -> list[FmuVariable]:
+        return [
+            one
+            for one in self.variables
+            if one.row.causality == causality and self._given[one.name] != self._applied[one.name]
+        ]
+
+    def _process_data(self) -> dict[Any, Integers]:
+        """Let the inputs act that are no set-points, and return those that are: object -> a row of integers.
+
+        Nothing acts if an object cannot have its value.
+        """
+        drives, values, known = self.drives, dict[str, Floats](), self.drives.inside.objects.entries
+        rows = {one.row.name: one.row for one in self.variables if one.row.causality == INPUT}
+        for one in self.variables:
+            if one.row.causality == INPUT:
+                values.setdefault(one.row.name, np.zeros(drives.num_axes))[list(one.axes)] = self._given[one.name]
+        played = {
+            name: np.asarray(values[name], np.int64) for name, row in rows.items() if not isinstance(row.source, str)
+        }
+        for name, integers in played.items():
+            check_in_range(known.find(rows[name].source), integers)
+        changed = {one.row.name: one.row for one in self._changed(INPUT)}
+        for name, row in changed.items():
+            if name in WRITTEN:
+                before = np.array([self._applied[one.name] for one in self.variables if one.row.name == name])
+                drives.write(row.source, played[name], played[name] != before)
+            elif row.source in SWITCHES:
+                drives.machine.press(row.source, values[name] > 0.0)
+            elif row.source == "load_torque":
+                drives.machine.load_torque = values[name][:: drives.load.num_axes]
+            elif isinstance(row.source, str):
+                setattr(drives.machine, row.source, values[name])
+        self._applied |= {one.name: self._given[one.name] for one in self._changed(INPUT)}
+        return {rows[name].source: integers[None] for name, integers in played.items() if name not in WRITTEN}
