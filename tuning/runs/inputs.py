@@ -239,7 +239,7 @@ def is_path(what: str, name: str) -> bool:
         from drive_env.devices.own_folder import is_own_folder
 
         return name.endswith(".toml") or is_own_folder(name)
-    return name.endswith((".xml", ".mjcf") if what == "load" else ".toml")
+    return name.endswith(MODEL_ENDINGS if what == "load" else ".toml")
 
 
 def is_shipped(what: str, name: str) -> bool:
