@@ -87,27 +87,27 @@ def joint_loads(load: Load, joints: Collection[str] = ()) -> list[JointLoad]:
             raise ValueError(
                 f"load {load.name!r} has no joint {name!r}{did_you_mean(name, names)}; it has {', '.join(names)}"
             )
-    asked = set(joints) or {name for name in actuators_of(model) if name in names}
+    asked = set(joints) or (set(actuators_of(model)) if model.nu else set(names))
     followers = _followers(model, asked)
     refusals = _refusals(load, model, asked, is_chosen=bool(joints), followers=followers)
     found = [JointLoad(name, KINDS[int(model.jnt_type[k])], _travel(model, k)) for k, name in enumerate(names)]
-    driven = [k for k, name in enumerate(names) if not refusals.get(name)]
+    driven = [k for k in range(model.njnt) if k not in refusals]
     extremes = _extremes(_statics(model, driven, followers), *_limits(model), len(driven))
     for k, (inertia, holding) in zip(driven, extremes, strict=True):
         if inertia.low <= _NOTHING * (1.0 + 1e3 * float(model.dof_armature[model.jnt_dofadr[k]])):
-            refusals[names[k]] = "what it turns has no inertia about it: give the bodies behind it mass and inertia"
+            refusals[k] = "what it turns has no inertia about it: give the bodies behind it mass and inertia"
             continue
         dof = int(model.jnt_dofadr[k])
         loss, damping = float(model.dof_frictionloss[dof]), float(model.dof_damping[dof])
         found[k] = found[k]._replace(inertia=inertia, holding=holding, friction=loss, damping=damping)
-    return [row._replace(refusal=refusals.get(row.name, "")) for row in found]
+    return [row._replace(refusal=refusals.get(k, "")) for k, row in enumerate(found)]
 
 
 # --- which joints -----------------------------------------------------------------------------------------------------
 def _refusals(
     load: Load, model: mujoco.MjModel, asked: Collection[str], is_chosen: bool, followers: Mapping[int, _Follower]
-) -> dict[str, str]:
-    """Return why joints can have no drive, with the remedy, by name."""
+) -> dict[int, str]:
+    """Return why joints can have no drive, with the remedy, by the joint's number."""
     tendons, loops, held = _tendon_driven(model), _in_loops(model), held_joints(model)
     still = joints_without_travel(load.mjcf)
     found = {}
@@ -123,18 +123,18 @@ def _refusals(
             f"its range is {low:g} to {high:g}, where nothing turns: give it a range, or take the joint out":
                 name in still or (not model.jnt_limited[k] and low == high != 0.0),
             f"{held.get(name)} holds it where it is: give that a term of another joint, or take it out": name in held,
-            f"it follows {str(model.joint(followers[k].leader).name)!r} by {followers[k].equality}: the drive is there"
-            if k in followers else "": k in followers,
+            f"it follows {str(model.joint(followers[k].leader).name)!r} by {followers[k].equality}: a drive on that one "
+            "moves both" if k in followers else "": k in followers,
             f"its body is in a loop that {loops.get(k)} closes, so that its inertia is not its own: name it in a Load "
             "of your own, with a gear": k in loops,
             f"{tendons.get(name)} pulls it, and how its joints share the motion is not known: name a fixed tendon in a "
-            "Load of your own, with a gear, or choose the joint": name in tendons and not (is_chosen and name in asked),
-            "no actuator of the file turns it, so that it stays without a drive: choose it if it is to have one":
-                bool(asked) and name not in asked,
+            "Load of your own, with a gear, or name the joint (--joint)": name in tendons and not (is_chosen and name in asked),
+            "no actuator of the file turns it: name it (--joint, or joints= of a Load) if it is to have a drive":
+                name not in asked,
         }  # fmt: skip
         reason = next((text for text, is_so in reasons.items() if is_so), "")
         if reason:
-            found[name] = reason
+            found[k] = reason
     return found
 
 

@@ -37,6 +37,10 @@ _MEMORY_PER_CONSTRAINED_COPY = 400_000
 _MEMORY_FIXED = 65536
 _MOST_KEPT = 8  # models of others that are kept as they were compiled, each alone
 JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_REMEDIES = {  # of what MuJoCo says
+    "mjMINVAL": "give it an <inertial>, or geoms with a mass",
+    "package:/": "MuJoCo knows no packages: write where the file lies from the folder of the model",
+}
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
@@ -155,7 +159,9 @@ def _without_zeros(load: Load, model: mujoco.MjModel, there: str) -> Load:
             if name not in _joint_names(model):
                 raise ValueError(f"load {load.name!r}: its {what} names the joint {name!r}; {there}")
             if not np.isfinite(coefficient):
-                raise ValueError(f"load {load.name!r}: its {what} has {coefficient:g} of {name!r}; give a finite number")
+                raise ValueError(
+                    f"load {load.name!r}: its {what} has {coefficient:g} of {name!r}; give a finite number"
+                )
         found = {name: coefficient for name, coefficient in motion.items() if coefficient != 0.0}
         if motion and not found:
             raise ValueError(
@@ -219,9 +225,10 @@ def with_motors(load: Load, gears: Mapping[str, float]) -> str:
     Raises:
         ValueError: As `read_model`.
     """
+    if _is_ours(load.mjcf):
+        return _write_with_motors(load, gears).decode()
     _hash_of(load.mjcf)
-    text = call_limited(f"the model {load.mjcf}", _write_with_motors, load, dict(gears)).decode()
-    return text
+    return call_limited(f"the model {load.mjcf}", _write_with_motors, load, dict(gears)).decode()
 
 
 def check_model(mjcf: Path) -> None:
@@ -469,7 +476,7 @@ def _compiled(load: Load, spec: mujoco.MjSpec) -> mujoco.MjModel:
         return spec.compile()
     except ValueError as error:
         told = " ".join(str(error).split())
-        remedy = "; give it an <inertial>, or geoms with a mass" if "mjMINVAL" in told else ""
+        remedy = next((f"; {text}" for words, text in _REMEDIES.items() if words in told), "")
         raise ValueError(f"MuJoCo cannot compile load {load.name!r}: {told}{remedy}") from error
 
 
@@ -507,7 +514,9 @@ def _motion(model: mujoco.MjModel, name: str) -> Combination:
         return {name: 1.0}
     tendon = model.tendon(name).id
     first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-    wrapped = [(model.joint(int(model.wrap_objid[k])).name, float(model.wrap_prm[k])) for k in range(first, first + count)]
+    wrapped = [
+        (model.joint(int(model.wrap_objid[k])).name, float(model.wrap_prm[k])) for k in range(first, first + count)
+    ]
     return {joint: coefficient for joint, coefficient in wrapped if coefficient != 0.0}
 
 

@@ -136,6 +136,7 @@ def _found(root: Path, mjcf: Path, bases: set[Path], folders: dict[str, None], n
                 "elsewhere are not read; copy it into that folder, or move the model to a folder that holds both"
             )
         found.append(place)
-    if not found:
+    # A URDF names what is only seen, too, which MuJoCo leaves out; what it lacks it tells.
+    if not found and mjcf.suffix != ".urdf":
         raise UntrustedFileError(f"{mjcf} takes in {name!r}, and there is no such file in {root}")
     return found

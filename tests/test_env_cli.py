@@ -251,7 +251,11 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
         (["scope", "--duration", "0.01", "--out", "was"], "was.csv", "choose another --out"),
         (["scope", "--duration", "0.01", "--out", "was"], "was.png", "choose another --out"),
         (["render", "--load", "inertia", "--out", "was.gif"], "was.gif", "choose another --out"),
-        (["model", "two_mass", "--log", "log.csv", "--fit", "load.inertia", "--out", "was.toml"], "was.toml", "choose another --out"),
+        (
+            ["model", "two_mass", "--log", "log.csv", "--fit", "load.inertia", "--out", "was.toml"],
+            "was.toml",
+            "choose another --out",
+        ),
     ],
 )
 def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name, remedy):

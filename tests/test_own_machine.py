@@ -147,17 +147,23 @@ def test_zeros_are_refused_where_nothing_would_turn_and_ignored_where_others_do(
     path = file(two('<motor joint="x" gear="0"/>'))
     with pytest.raises(ValueError, match=r"the gear of the actuator of 'x' is 0, and its rotor would turn nothing"):
         find_load(path)
-    partly = file(TWO.replace("ACTUATORS", '<actuator><motor tendon="belt"/></actuator>').replace('coef="0.1"', 'coef="0"'))
+    partly = file(
+        TWO.replace("ACTUATORS", '<actuator><motor tendon="belt"/></actuator>').replace('coef="0.1"', 'coef="0"')
+    )
     with EmulatedDrives(load=partly, ideal=True) as drives:
         assert drives.load.disturbance == {"x": 1.0}
         drives.advance(0.002)
     none = file(TWO.replace("ACTUATORS", "").replace('coef="0.1"', 'coef="0"').replace('coef="1"', 'coef="0"'))
-    with pytest.raises(ValueError, match=r"every coef of the fixed tendon 'belt' is 0, and its rotor would turn nothing"):
+    with pytest.raises(
+        ValueError, match=r"every coef of the fixed tendon 'belt' is 0, and its rotor would turn nothing"
+    ):
         find_load(Load(none, joints="belt"))
     for other in ('joint2="turn"', ""):
         held = file(two().replace("<tendon>", f'<equality><joint name="lock" joint1="x" {other} polycoef="0.1 0 0 0 0"/>'
                                   "</equality><tendon>"))  # fmt: skip
-        with pytest.raises(ValueError, match=r"the equality 'lock' with polycoef 0\.1 0 0 0 0 holds 'x' where it is, .*term"):
+        with pytest.raises(
+            ValueError, match=r"the equality 'lock' with polycoef 0\.1 0 0 0 0 holds 'x' where it is, .*term"
+        ):
             find_load(Load(held, joints="x"))
         assert find_load(Load(held, joints="turn")).joints == ("turn",)
         # Of a tendon's joints one still turns.
@@ -180,8 +186,10 @@ THERE = r"the model has the joints x, turn and the fixed tendons belt"
         ({"joints": ("x", "turn"), "gear": (1.0, 0.0)}, r"the gear of 'turn' is 0, and its rotor would turn nothing"),
         ({"joints": "x", "gear": 0.0}, r"the gear of 'x' is 0, .*give a finite number"),
         ({"joints": "x", "gear": float("inf")}, r"the gear of 'x' is inf, "),
-        ({"joints": "x", "contacts": (Contact("stop", {"x": 0.0}, -1.0, 1.0, 1e4, 1.0),)},
-         r"its contact 'stop' has 0 of 'x', which is no motion; give a joint a coefficient"),
+        (
+            {"joints": "x", "contacts": (Contact("stop", {"x": 0.0}, -1.0, 1.0, 1e4, 1.0),)},
+            r"its contact 'stop' has 0 of 'x', which is no motion; give a joint a coefficient",
+        ),
         ({"joints": "x", "positions": ({"x": float("nan")},)}, r"its position has nan of 'x'; give a finite number"),
         ({"joints": "x", "disturbance": {"z": 1.0}}, rf"its disturbance names the joint 'z'; {THERE}"),
         ({"joints": "x", "start": {"z": 1.0}}, rf"its start names the joint 'z'; {THERE}"),

@@ -30,7 +30,10 @@ def model(
     joint: Annotated[
         list[str] | None,
         typer.Option(
-            "--joint", "-j", help="Joint to drive; may be repeated.", show_default="those of the file's actuators, or all"
+            "--joint",
+            "-j",
+            help="Joint to drive; may be repeated.",
+            show_default="those of the file's actuators, or all",
         ),
     ] = None,
     move_time: Annotated[
@@ -127,7 +130,9 @@ def model(
 def _of_log_alone(**options: object) -> None:
     for name, value in options.items():
         if value is not None:
-            raise ValueError(f"--{name} is for the comparison with a log; name the log with --log, or leave --{name} out")
+            raise ValueError(
+                f"--{name} is for the comparison with a log; name the log with --log, or leave --{name} out"
+            )
 
 
 def _propose(

@@ -122,7 +122,11 @@ def print_proposal(
         ))  # fmt: skip
     print_table(COLUMNS, rows)
     print_lines(f"{row.name or '(no name)'}: no drive: {row.refusal}" for row in found if row.refusal)
-    says = "the smallest that moves" if proposal.fits else f"and no motor has a margin of {MARGIN:g}: it lacks least of all"
+    says = (
+        "the smallest that moves"
+        if proposal.fits
+        else f"and no motor has a margin of {MARGIN:g}: it lacks least of all"
+    )
     print_lines([
         f"motor {motor.name} ({motor.title}) on {device.name}, {says} every joint over its range, a turn or 1 m at "
         f"most, in {move_time:g} s",

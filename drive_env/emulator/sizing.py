@@ -83,9 +83,7 @@ def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, m
     )
 
 
-def propose_drives(
-    joints: Sequence[JointLoad], device: Device, motors: Iterable[Motor], move_time: float
-) -> Proposal:
+def propose_drives(joints: Sequence[JointLoad], device: Device, motors: Iterable[Motor], move_time: float) -> Proposal:
     """Return the motor of least rated power whose margins suffice at every joint; without one, that which lacks least.
 
     Args:
