@@ -123,12 +123,13 @@ def _refusals(
             f"its range is {low:g} to {high:g}, where nothing turns: give it a range, or take the joint out":
                 name in still or (not model.jnt_limited[k] and low == high != 0.0),
             f"{held.get(name)} holds it where it is: give that a term of another joint, or take it out": name in held,
-            f"it follows {str(model.joint(followers[k].leader).name)!r} by {followers[k].equality}: a drive on that one "
-            "moves both" if k in followers else "": k in followers,
+            f"it follows {str(model.joint(followers[k].leader).name)!r} by {followers[k].equality}: a drive on "
+            "that one moves both" if k in followers else "": k in followers,
             f"its body is in a loop that {loops.get(k)} closes, so that its inertia is not its own: name it in a Load "
             "of your own, with a gear": k in loops,
             f"{tendons.get(name)} pulls it, and how its joints share the motion is not known: name a fixed tendon in a "
-            "Load of your own, with a gear, or name the joint (--joint)": name in tendons and not (is_chosen and name in asked),
+            "Load of your own, with a gear, or name the joint (--joint)":
+                name in tendons and not (is_chosen and name in asked),
             "no actuator of the file turns it: name it (--joint, or joints= of a Load) if it is to have a drive":
                 name not in asked,
         }  # fmt: skip

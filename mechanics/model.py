@@ -487,8 +487,8 @@ def _with_driven_kinds(load: Load, model: mujoco.MjModel) -> mujoco.MjModel:
         names = ", ".join(repr(model.joint(int(k)).name) for k in np.flatnonzero(wrong))
         raise ValueError(
             f"load {load.name!r} has free or ball joints ({names}); drives turn hinge and slide joints, and a copy's "
-            "coordinates must be its degrees of freedom: take a free joint out, so that its body stands still, and give a "
-            "ball joint's body three hinges"
+            "coordinates must be its degrees of freedom: take a free joint out, so that its body stands still, and "
+            "give a ball joint's body three hinges"
         )
     if model.nv == 0:
         raise ValueError(f"load {load.name!r} has no joint, so there is nothing that a drive could turn")

@@ -79,7 +79,9 @@ def joints_without_travel(mjcf: Path) -> set[str]:
 
     Of an MJCF a joint's `range`, of a URDF the `limit` of a revolute or prismatic joint.
     """
-    found, joint, ends = set(), {}, {}
+    found: set[str] = set()
+    joint: dict[str, str] = {}
+    ends: dict[str, str] = {}
     for element, attribute, value in _attributes(read_bytes(mjcf).decode("utf-8", "replace")):
         if not attribute and element == "joint":
             joint, ends = {}, {}

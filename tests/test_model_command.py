@@ -10,8 +10,8 @@ from rigs.recorded_moves import CURRENT, POSITION, TARGET, TORQUE, TRUTH, VELOCI
 from typer.testing import CliRunner
 
 from drive_env import motion
-from drive_env.commands.model import _print
 from drive_env.commands.cli import app
+from drive_env.commands.model import _print
 from drive_env.randomisation.random_machines import Distributions
 from drive_env.trials.replay import Log, LogDifference
 

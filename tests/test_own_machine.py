@@ -159,8 +159,8 @@ def test_zeros_are_refused_where_nothing_would_turn_and_ignored_where_others_do(
     ):
         find_load(Load(none, joints="belt"))
     for other in ('joint2="turn"', ""):
-        held = file(two().replace("<tendon>", f'<equality><joint name="lock" joint1="x" {other} polycoef="0.1 0 0 0 0"/>'
-                                  "</equality><tendon>"))  # fmt: skip
+        held = file(two().replace("<tendon>", f'<equality><joint name="lock" joint1="x" {other} '
+                                  'polycoef="0.1 0 0 0 0"/></equality><tendon>'))  # fmt: skip
         with pytest.raises(
             ValueError, match=r"the equality 'lock' with polycoef 0\.1 0 0 0 0 holds 'x' where it is, .*term"
         ):

@@ -193,7 +193,7 @@ def arm(folder, limits=""):
     return Load(folder / "arm.xml")
 
 
-def test_inertia_and_holding_torque_of_a_two_link_arm_are_those_of_the_closed_form(ours):
+def test_inertia_and_holding_torque_of_a_two_link_arm_are_the_closed_form_s(ours):
     """M_11 = I_1 + m_1 c_1^2 + I_2 + m_2 (l^2 + c_2^2 + 2 l c_2 cos q_2); gravity at the shoulder when stretched out."""
     shoulder, elbow = joint_loads(arm(ours))
     (m1, c1, l1, i1), (m2, c2, _, i2) = ONE, TWO
@@ -230,19 +230,14 @@ def test_the_inertia_at_the_rotor_is_what_the_plant_has_there(ours):
 
 def test_what_an_equality_moves_counts_at_the_joint_that_moves_it(ours):
     """Two slides of 2 kg and 0.5 kg, the second 3 times as fast: 2 + 9 x 0.5 kg and 2 g + 3 x 0.5 g."""
-    (ours / "pair.xml").write_text(
+    text = (
         '<mujoco><worldbody><body><joint name="a" type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body>'
         '<body><joint name="b" type="slide" axis="0 0 1"/><geom size=".1" mass="0.5"/></body></worldbody>'
-        '<equality><joint joint1="{0}" joint2="{1}" polycoef="0 {2} 0 0 0"/></equality>'
-        '<actuator><motor joint="a"/></actuator></mujoco>'.format("b", "a", 3)
+        '<equality><joint joint1="{}" joint2="{}" polycoef="0 {!r} 0 0 0"/></equality>'
+        '<actuator><motor joint="a"/></actuator></mujoco>'
     )
     for names in (("b", "a", 3.0), ("a", "b", 1.0 / 3.0)):
-        text = (ours / "pair.xml").read_text()
-        (ours / "way.xml").write_text(
-            text.replace(
-                'joint1="b" joint2="a" polycoef="0 3 ', 'joint1="{}" joint2="{}" polycoef="0 {!r} '.format(*names)
-            )
-        )
+        (ours / "way.xml").write_text(text.format(*names))
         a, b = joint_loads(Load(ours / "way.xml"))
         assert a.inertia == pytest.approx((6.5, 6.5)) and a.holding == pytest.approx((3.5 * G, 3.5 * G))
         assert b.refusal.startswith("it follows 'a' by the equality 0")
@@ -284,7 +279,10 @@ def test_the_smallest_motor_that_suffices_is_proposed():
 
 
 # --- other joints that no drive can turn ------------------------------------------------------------------------------
-BODY = '<body name="{name}"><joint name="{name}" axis="0 0 1" {of}/><inertial pos="0 0 0" mass="1" diaginertia="{i} {i} {i}"/></body>'
+BODY = (
+    '<body name="{name}"><joint name="{name}" axis="0 0 1" {of}/>'
+    '<inertial pos="0 0 0" mass="1" diaginertia="{i} {i} {i}"/></body>'
+)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +330,7 @@ def test_joints_without_a_name_are_each_refused(ours):
         ([LAYOUTS / "ur.xml", "--joint", "pam"], "has no joint 'pam'; did you mean 'pan'"),
         ([LAYOUTS / "mobile_base.xml", "--joint", "root"], "root: a free joint moves in six directions"),
         ([LAYOUTS / "ur.xml", "--move-time", "0"], "--move-time 0 s must be above 0 s"),
-        ([LAYOUTS / "ur.xml", "--fit", "load.mass"], "--fit is for the comparison with a log; name the log with --log"),
+        ([LAYOUTS / "ur.xml", "--fit", "load.mass"], "--fit is for the comparison with a log; name it with --log"),
         ([LAYOUTS / "ur.xml", "--out", LAYOUTS], "exists already, and is not overwritten; choose another folder"),
         ([LAYOUTS / "ur.xml", "--motor", "class_20w", "--out", "made"], "no motor of tmcm1636 moves every joint of"),
         ([LAYOUTS / "ur.xml", "--motor", "qsh4218_51"], "tmcm1636 turns"),

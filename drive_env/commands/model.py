@@ -37,7 +37,7 @@ def model(
         ),
     ] = None,
     move_time: Annotated[
-        float, typer.Option(help="Time in which each joint is to move over its range, a turn or 1 m at most [s].")
+        float, typer.Option(help="Time for a move of each joint over its range, a turn or 1 m at most [s].")
     ] = MOVE_TIME,
     device: DeviceName = DEFAULT_DEVICE,
     motor: Annotated[
@@ -72,7 +72,7 @@ def model(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="New folder for the model with its motors and gears, to serve; with --fit, new file for the fitted set "
+            help="New folder for the model with its gears, to serve; with --fit, new file for the fitted set "
             "of distributions (TOML)."
         ),
     ] = None,
@@ -130,9 +130,7 @@ def model(
 def _of_log_alone(**options: object) -> None:
     for name, value in options.items():
         if value is not None:
-            raise ValueError(
-                f"--{name} is for the comparison with a log; name the log with --log, or leave --{name} out"
-            )
+            raise ValueError(f"--{name} is for the comparison with a log; name it with --log, or leave --{name} out")
 
 
 def _propose(

@@ -63,8 +63,8 @@ def propose(
         if not proposal.fits:
             raise ValueError(
                 f"no motor of {device.name} moves every joint of {load.mjcf} with a margin of {MARGIN:g}: "
-                f"{proposal.motor.name} has {_margins(worst[0])} at {worst[1].name}; give a longer --move-time, another "
-                "--device or --motor, or fewer joints with --joint"
+                f"{proposal.motor.name} has {_margins(worst[0])} at {worst[1].name}; give a longer --move-time, "
+                "another --device or --motor, or fewer joints with --joint"
             )
         write_model(load, {row.name: axis.gear for row, axis in zip(driven, proposal.axes, strict=True)}, out)
     return found, proposal
@@ -122,14 +122,10 @@ def print_proposal(
         ))  # fmt: skip
     print_table(COLUMNS, rows)
     print_lines(f"{row.name or '(no name)'}: no drive: {row.refusal}" for row in found if row.refusal)
-    says = (
-        "the smallest that moves"
-        if proposal.fits
-        else f"and no motor has a margin of {MARGIN:g}: it lacks least of all"
-    )
+    says = "the smallest that moves" if proposal.fits else f"which lacks least of a margin of {MARGIN:g} to move"
     print_lines([
-        f"motor {motor.name} ({motor.title}) on {device.name}, {says} every joint over its range, a turn or 1 m at "
-        f"most, in {move_time:g} s",
+        f"motor {motor.name} ({motor.title}) on {device.name}, {says} every joint over its range, a turn or 1 m "
+        f"at most, in {move_time:g} s",
         "inertia: at the joint, the others held, without armature; holding: against gravity and springs; both least...most "
         "over the poses; friction: at the speed of the move",
     ])  # fmt: skip
@@ -157,7 +153,8 @@ def print_proposal_json(found: Sequence[JointLoad], proposal: Proposal, out: Pat
             "holding": list(row.holding), "friction": row.friction, "damping": row.damping, **next(axes)._asdict(),
         })  # fmt: skip
     print_json({
-        "motor": proposal.motor.name, "fits": proposal.fits, "joints": told, "folder": None if out is None else str(out),
+        "motor": proposal.motor.name, "fits": proposal.fits, "joints": told,
+        "folder": None if out is None else str(out),
     })  # fmt: skip
 
 
