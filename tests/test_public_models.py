@@ -194,7 +194,7 @@ def arm(folder, limits=""):
 
 
 def test_inertia_and_holding_torque_of_a_two_link_arm_are_the_closed_form_s(ours):
-    """M_11 = I_1 + m_1 c_1^2 + I_2 + m_2 (l^2 + c_2^2 + 2 l c_2 cos q_2); gravity at the shoulder when stretched out."""
+    """M_11 = I_1 + m_1 c_1^2 + I_2 + m_2 (l^2 + c_2^2 + 2 l c_2 cos q_2); gravity is most when stretched out."""
     shoulder, elbow = joint_loads(arm(ours))
     (m1, c1, l1, i1), (m2, c2, _, i2) = ONE, TWO
     constant, swing = i1 + m1 * c1**2 + i2 + m2 * (l1**2 + c2**2), 2.0 * m2 * l1 * c2

@@ -14,7 +14,7 @@ from drive_env.commands.tables import Column, print_lines, print_table
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.emulator.sizing import Proposal
+    from drive_env.emulator.sizing import DriveProposal
     from drive_env.motors import Motor
     from mechanics.joint_loads import JointLoad
     from mechanics.load import Load
@@ -36,8 +36,8 @@ COLUMNS = (
 
 def propose(
     load: Load, device: Device, motors: Iterable[Motor], joints: Sequence[str], move_time: float, out: Path | None
-) -> tuple[list[JointLoad], Proposal]:
-    """Return what is known of a file's joints, and the drives that are proposed; write them if a folder is given.
+) -> tuple[list[JointLoad], DriveProposal]:
+    """Return the loads of a file's joints and the drives proposed for them; write these if a folder is given.
 
     Raises:
         ValueError: As `joint_loads` and `write_model`, if no joint can have a drive, or for a folder that exists.
@@ -98,7 +98,7 @@ def write_model(load: Load, gears: dict[str, float], out: Path) -> Path:
 
 
 def print_proposal(
-    load: Load, device: Device, found: Sequence[JointLoad], proposal: Proposal, move_time: float, out: Path | None
+    load: Load, device: Device, found: Sequence[JointLoad], proposal: DriveProposal, move_time: float, out: Path | None
 ) -> None:
     """Print the proposal as a table, with what no drive turns and why, and how to run what was written."""
     from drive_env.emulator.sizing import MARGIN, demand
@@ -126,8 +126,8 @@ def print_proposal(
     print_lines([
         f"motor {motor.name} ({motor.title}) on {device.name}, {says} every joint over its range, a turn or 1 m "
         f"at most, in {move_time:g} s",
-        "inertia: at the joint, the others held, without armature; holding: against gravity and springs; both least...most "
-        "over the poses; friction: at the speed of the move",
+        "inertia: at the joint, the others held, without armature; holding: against gravity and springs; both "
+        "least...most over the poses; friction: at the speed of the move",
     ])  # fmt: skip
     if out is not None:
         nodes = " ".join(f"-n {k + 1}" for k in range(-(-len(driven) // device.num_axes)))
@@ -138,7 +138,7 @@ def print_proposal(
         ])  # fmt: skip
 
 
-def print_proposal_json(found: Sequence[JointLoad], proposal: Proposal, out: Path | None) -> None:
+def print_proposal_json(found: Sequence[JointLoad], proposal: DriveProposal, out: Path | None) -> None:
     """Print the same as JSON, SI."""
     axes = iter(proposal.axes)
     told: list[dict[str, Any]] = []

@@ -11,7 +11,7 @@ from drive_env.emulator.inertia_check import MAX_INERTIA_RATIO
 from drive_env.motors import Motor
 from mechanics.joint_loads import JointLoad
 
-# Usual ratios of planetary gearheads of one and two stages and of strain-wave gears; 1 is none.
+# Usual ratios of planetary gearheads of one and two stages and of strain-wave gears; 1: without.
 RATIOS = (1, 3, 4, 5, 7, 8, 10, 12, 15, 16, 20, 25, 30, 35, 40, 50, 60, 70, 80, 100, 120, 160)
 # Usual travel of a slide per turn of its ball screw or toothed-belt pulley [mm].
 LEADS = (200, 160, 120, 100, 80, 60, 50, 40, 32, 25, 20, 16, 10, 5, 4, 2.5, 2)
@@ -49,7 +49,7 @@ class AxisProposal(NamedTuple):
         return min(self.torque_margin, self.speed_margin, MARGIN * MAX_INERTIA_RATIO / self.inertia_ratio)
 
 
-class Proposal(NamedTuple):
+class DriveProposal(NamedTuple):
     """A motor, the same for all joints of a machine, and the gear of each."""
 
     motor: Motor
@@ -62,13 +62,13 @@ class Proposal(NamedTuple):
 
 
 def demand(joint: JointLoad, move_time: float) -> Demand:
-    """Return what a move over the range of a joint, or over `SPAN` where that is longer, takes in a time [s]."""
+    """Return speed and acceleration of a move over the range of a joint, or the part of it in `SPAN`, in a time [s]."""
     way = min(joint.travel.high - joint.travel.low, SPAN[joint.kind])
     return Demand(1.5 * way / move_time, 4.5 * way / move_time**2)
 
 
 def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, move_time: float) -> AxisProposal:
-    """Return what a gear between a motor and a joint leaves in a move over the joint's range.
+    """Return the margins of a gear between a motor and a joint in a move over the joint's range.
 
     Torque at the rotor: ((J a + holding + dry friction + d w) / gear) + J_rotor gear a, each at its most.
     """
@@ -83,7 +83,9 @@ def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, m
     )
 
 
-def propose_drives(joints: Sequence[JointLoad], device: Device, motors: Iterable[Motor], move_time: float) -> Proposal:
+def propose_drives(
+    joints: Sequence[JointLoad], device: Device, motors: Iterable[Motor], move_time: float
+) -> DriveProposal:
     """Return the motor of least rated power whose margins suffice at every joint; without one, that which lacks least.
 
     Args:
@@ -92,14 +94,14 @@ def propose_drives(joints: Sequence[JointLoad], device: Device, motors: Iterable
         motors: To choose from, one or more.
         move_time: In which each joint moves over its range [s].
     """
-    best: Proposal | None = None
+    best: DriveProposal | None = None
     for motor in sorted(motors, key=lambda one: one.rated_torque * one.rated_speed):
         axes = []
         for joint in joints:
             gears = RATIOS if joint.kind == "hinge" else [2.0 * math.pi / (1e-3 * lead) for lead in LEADS]
             choice = [axis_proposal(joint, device, motor, float(gear), move_time) for gear in gears]
             axes.append(max(choice, key=lambda axis: axis.least_margin))
-        found = Proposal(motor, tuple(axes))
+        found = DriveProposal(motor, tuple(axes))
         if found.fits:
             return found
         if best is None or min(a.least_margin for a in axes) > min(a.least_margin for a in best.axes):
