@@ -332,6 +332,7 @@ _ROWS = (
     ),
 )
 
+MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")  # of the path of your own model
 LOADS: dict[str, Load] = {row.name: row for row in _ROWS}
 # No load: for mechanics that are elsewhere and give the torque at the shaft.
 BARE_SHAFT = Load(
@@ -355,10 +356,10 @@ def find_load(load: str | Path | Load) -> Load:
         return resolve(load)
     if isinstance(load, str) and load in LOADS:
         return _resolved_row(load)
-    if isinstance(load, Path) or str(load).endswith((".xml", ".mjcf")):
+    if isinstance(load, Path) or str(load).endswith(MODEL_ENDINGS):
         return resolve(Load(Path(load)))
     raise ValueError(
-        f"no load is named {load!r}; there are {', '.join(sorted(LOADS))}, or give the path of an MJCF (.xml)"
+        f"no load is named {load!r}; there are {', '.join(sorted(LOADS))}, or give the path of an MJCF (.xml) or URDF"
         f"{did_you_mean(load, LOADS)}"
     )
 

@@ -9,11 +9,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from mechanics.arrays import Floats
 from mechanics.limited_child import call_limited
 from mechanics.load import Combination, Friction, Load
 from mechanics.model_files import hash_of_model
@@ -33,6 +36,11 @@ _MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were seen to use 194 each
 _MEMORY_PER_CONSTRAINED_COPY = 400_000
 _MEMORY_FIXED = 65536
 _MOST_KEPT = 8  # models of others that are kept as they were compiled, each alone
+JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_REMEDIES = {  # of what MuJoCo says
+    "mjMINVAL": "give it an <inertial>, or geoms with a mass",
+    "package:/": "MuJoCo knows no packages: write where the file lies from the folder of the model",
+}
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
@@ -40,11 +48,20 @@ def read_model(load: Load) -> mujoco.MjModel:
     """Return the load's model alone, as its file has it.
 
     Raises:
-        ValueError: If there is no such file, it takes in files from elsewhere, it exceeds a limit, MuJoCo cannot read
-            it, or it has other joints than hinges and slides.
+        ValueError: As `read_any_model`, or if it has other joints than hinges and slides.
+    """
+    return _with_driven_kinds(load, read_any_model(load))
+
+
+def read_any_model(load: Load) -> mujoco.MjModel:
+    """Return the same whatever its joints are: one with others can be looked at, and is no load.
+
+    Raises:
+        ValueError: If there is no such file, it takes in files from elsewhere, it exceeds a limit, or MuJoCo cannot
+            read it.
     """
     if _is_ours(load.mjcf):
-        return _checked(load, _spec(load).compile)
+        return _compiled(load, _spec(load))
     key = load.name, _hash_of(load.mjcf)
     kept = _kept.pop(key, None)
     _kept[key] = kept = _compiled_elsewhere(load, None) if kept is None else kept
@@ -60,7 +77,7 @@ def resolve(load: Load) -> Load:
         ValueError: With the joints and tendons that there are.
     """
     model = read_model(load)
-    joints = load.joints or tuple(_actuators(model)) or (_joint_names(model) if model.njnt == 1 else ())
+    joints = load.joints or tuple(actuators_of(model)) or (_joint_names(model) if model.njnt == 1 else ())
     there = (
         f"the model has the joints {', '.join(_joint_names(model)) or '(none)'} and the fixed tendons "
         f"{', '.join(_fixed_tendons(model)) or '(none)'}"
@@ -72,23 +89,10 @@ def resolve(load: Load) -> Load:
             raise ValueError(f"load {load.name!r} has no joint or fixed tendon {name!r}; {there}")
     if len(set(joints)) < len(joints):
         raise ValueError(f"load {load.name!r} names a joint twice: {', '.join(joints)}; a joint takes one drive")
-    if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
-        raise ValueError(f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears")
-    gears = load.gear if isinstance(load.gear, tuple) else (float(load.gear),) * len(joints)
-    if not load.joints and load.gear == 1.0:
-        # MuJoCo's gear of an actuator is what ours is: the rotor's angle per unit of its joint.
-        gears = tuple(_actuators(model).get(name, 1.0) for name in joints)
-    if not all(np.isfinite(gear) and gear != 0.0 for gear in gears):
-        raise ValueError(f"load {load.name!r}: a gear must be finite and not 0, not {load.gear}")
-    named: list[tuple[str, Combination]] = [("disturbance", load.disturbance), ("start", load.start)]
-    named += [(f"friction {row.name!r}", row.motion) for row in load.frictions]
-    named += [(f"contact {row.name!r}", row.motion) for row in load.contacts]
-    named += [(f"roll {row.name!r}", {row.joint: 1.0}) for row in load.rolls]
-    named += [("position", motion) for motion in load.positions]
-    for what, motion in named:
-        for name in motion:
-            if name not in _joint_names(model):
-                raise ValueError(f"load {load.name!r}: its {what} names the joint {name!r}; {there}")
+    gears = _gears(load, model, joints)
+    for name in joints:
+        _check_turnable(load, model, name)
+    load = _without_zeros(load, model, there)
     contacts = [row.name for row in load.contacts]
     for row in load.frictions:
         if row.carries and row.carries not in contacts:
@@ -111,6 +115,86 @@ def resolve(load: Load) -> Load:
     )
 
 
+def _gears(load: Load, model: mujoco.MjModel, joints: tuple[str, ...]) -> tuple[float, ...]:
+    """Return the gear of each axis; ValueError for one that turns nothing, with where it stands."""
+    if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
+        raise ValueError(f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears")
+    gears = load.gear if isinstance(load.gear, tuple) else (float(load.gear),) * len(joints)
+    of_actuators = not load.joints and load.gear == 1.0
+    if of_actuators:
+        # MuJoCo's gear of an actuator is what ours is: the rotor's angle per unit of its joint.
+        gears = tuple(actuators_of(model).get(name, 1.0) for name in joints)
+    for name, gear in zip(joints, gears, strict=True):
+        if not np.isfinite(gear) or gear == 0.0:
+            where = "the gear of the actuator of" if of_actuators else "the gear of"
+            raise ValueError(
+                f"load {load.name!r}: {where} {name!r} is {gear:g}, and its rotor would turn nothing; give a finite "
+                "number that is not 0, the rotor's angle per unit of the joint"
+            )
+    return gears
+
+
+def _check_turnable(load: Load, model: mujoco.MjModel, name: str) -> None:
+    """Raise ValueError for a driven joint or tendon that does not follow its rotor, whatever that does."""
+    motion = _motion(model, name)
+    if not motion:
+        raise ValueError(
+            f"load {load.name!r}: every coef of the fixed tendon {name!r} is 0, and its rotor would turn nothing; give "
+            "its joints a coef, or name a joint in its place"
+        )
+    held = held_joints(model)
+    if all(joint in held for joint in motion):
+        joint = next(iter(motion))
+        raise ValueError(
+            f"load {load.name!r}: {held[joint]} holds {joint!r} where it is, and no drive can turn it; give its "
+            "polycoef a term of the other joint, as in 0 1 0 0 0, or take it out"
+        )
+
+
+def _without_zeros(load: Load, model: mujoco.MjModel, there: str) -> Load:
+    """Return the load with motions of joints that take part; ValueError for one of none, or of what is no joint."""
+
+    def moving(what: str, motion: Combination) -> Combination:
+        for name, coefficient in motion.items():
+            if name not in _joint_names(model):
+                raise ValueError(f"load {load.name!r}: its {what} names the joint {name!r}; {there}")
+            if not np.isfinite(coefficient):
+                raise ValueError(
+                    f"load {load.name!r}: its {what} has {coefficient:g} of {name!r}; give a finite number"
+                )
+        found = {name: coefficient for name, coefficient in motion.items() if coefficient != 0.0}
+        if motion and not found:
+            raise ValueError(
+                f"load {load.name!r}: its {what} has 0 of {', '.join(map(repr, motion))}, which is no motion; give a "
+                "joint a coefficient that is not 0"
+            )
+        return found
+
+    for name in load.start:
+        moving("start", {name: 1.0})
+    for roll in load.rolls:
+        moving(f"roll {roll.name!r}", {roll.joint: 1.0})
+    return dataclasses.replace(
+        load,
+        disturbance=moving("disturbance", load.disturbance),
+        frictions=tuple(r._replace(motion=moving(f"friction {r.name!r}", r.motion)) for r in load.frictions),
+        contacts=tuple(r._replace(motion=moving(f"contact {r.name!r}", r.motion)) for r in load.contacts),
+        positions=tuple(moving("position", motion) for motion in load.positions),
+    )
+
+
+def held_joints(model: mujoco.MjModel) -> dict[str, str]:
+    """Return the joints that an equality in force holds where they are, each with that equality in words."""
+    found = {}
+    for k in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 != 0)):
+        terms = model.eq_data[k, :5]
+        if model.eq_obj2id[k] < 0 or not np.any(terms[1:]):
+            name = model.joint(int(model.eq_obj1id[k])).name
+            polycoef = " ".join(f"{term:g}" for term in terms)
+            found[name] = f"the equality {model.equality(int(k)).name or int(k)!r} with polycoef {polycoef}"
+    return found
+
+
 def copies_per_model(load: Load, machines: int = 1) -> int:
     """Return how many machines of a set one model holds; that of a load without constraints changes no digit."""
     model = read_model(load)
@@ -129,6 +213,24 @@ def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
     return _compiled_elsewhere(load, copies)
 
 
+def with_motors(load: Load, gears: Mapping[str, float]) -> str:
+    """Return the text of an MJCF of a load's model that drives turn through gears, in place of its actuators.
+
+    It takes in the files of the load's model where they are relative to that; files that are MJCF are in the text.
+
+    Args:
+        load: Any model.
+        gears: Joint -> rotor angle per unit of it, in the order of the axes.
+
+    Raises:
+        ValueError: As `read_model`.
+    """
+    if _is_ours(load.mjcf):
+        return _write_with_motors(load, gears).decode()
+    _hash_of(load.mjcf)
+    return call_limited(f"the model {load.mjcf}", _write_with_motors, load, dict(gears)).decode()
+
+
 def check_model(mjcf: Path) -> None:
     """Raise ValueError unless a model may be compiled in this process: it is ours, or was within the limits elsewhere.
 
@@ -143,7 +245,9 @@ def check_model(mjcf: Path) -> None:
 
 
 def _packed(load: Load, copies: int) -> mujoco.MjModel:
-    single = _checked(load, _spec(load).compile)
+    alone = _spec(load)
+    single = _with_driven_kinds(load, _compiled(load, alone))
+    inertias = _inertias(alone, single) if _must_be_told(alone) else []
     packed = mujoco.MjSpec()
     constrained = is_constrained(single)
     packed.memory = _MEMORY_FIXED + (_MEMORY_PER_CONSTRAINED_COPY if constrained else _MEMORY_PER_COPY) * copies
@@ -157,10 +261,10 @@ def _packed(load: Load, copies: int) -> mujoco.MjModel:
         ten = mujoco.MjSpec() if tens else packed
         ten.option, ten.compiler.discardvisual = packed.option, packed.compiler.discardvisual
         for k in range(10 * tens, min(10 * tens + 10, copies)):
-            ten.attach(_copy(load, k * bits), prefix=f"{k % 10}/", frame=ten.worldbody.add_frame())
+            ten.attach(_copy(load, k * bits, inertias), prefix=f"{k % 10}/", frame=ten.worldbody.add_frame())
         if tens:
             packed.attach(ten, prefix=str(tens), frame=packed.worldbody.add_frame())
-    return _checked(load, packed.compile)
+    return _compiled(load, packed)
 
 
 def is_constrained(model: mujoco.MjModel) -> bool:
@@ -187,6 +291,18 @@ def is_constant(model: mujoco.MjModel) -> bool:
     Found by looking at random positions and speeds.
     """
     return not _changes(model, 1e-9, 1.0)
+
+
+def actuators_of(model: mujoco.MjModel) -> dict[str, float]:
+    """Return the joints and tendons that actuators turn, each with the actuator's gear."""
+    tendon = int(mujoco.mjtTrn.mjTRN_TENDON)
+    gears: dict[str, float] = {}
+    for k in range(model.nu):
+        target = int(model.actuator_trnid[k, 0])
+        if model.actuator_trntype[k] in (*JOINT_TRANSMISSIONS, tendon):
+            turned = model.tendon(target) if model.actuator_trntype[k] == tendon else model.joint(target)
+            gears.setdefault(turned.name, float(model.actuator_gear[k, 0]))
+    return gears
 
 
 def motion_of(model: mujoco.MjModel, name: str, prefix: str = "") -> Combination:
@@ -221,9 +337,37 @@ def _changes(model: mujoco.MjModel, tolerance: float, speed: float) -> bool:
     return bool(np.any(np.ptp(np.array(seen), axis=0) > tolerance * scale + 1e-12))
 
 
-def _copy(load: Load, shift: int) -> mujoco.MjSpec:
-    """Return what a packed model has of a copy whose contact bits are shifted."""
+def _inertias(alone: mujoco.MjSpec, single: mujoco.MjModel) -> list[_Inertia]:
+    """Return what each body of a specification has in the model that was compiled of it, the world's first."""
+    arrays = single.body_mass, single.body_inertia, single.body_ipos, single.body_iquat
+    return [_Inertia(*(array[body.id].copy() for array in arrays)) for body in alone.bodies]
+
+
+def _must_be_told(alone: mujoco.MjSpec) -> bool:
+    """Return whether copies must be told their inertias, which they else find themselves, to the last digit.
+
+    What is only seen is left out of copies, and MuJoCo then writes its inertia down, but not where a file says that
+    inertia is that of shapes whatever else it says. The total of the masses that a file may ask for is not a copy's.
+    """
+    is_of_shapes = alone.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    return bool(is_of_shapes or alone.compiler.settotalmass > 0.0)
+
+
+def _tell(spec: mujoco.MjSpec, inertias: list[_Inertia]) -> None:
+    """Write inertias down in a specification, so that they are no longer found from its shapes."""
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    spec.compiler.settotalmass = -1.0
+    for body, known in list(zip(spec.bodies, inertias, strict=True))[1:]:
+        body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
+        body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        body.mass, body.inertia, body.ipos, body.iquat = known
+
+
+def _copy(load: Load, shift: int, inertias: list[_Inertia]) -> mujoco.MjSpec:
+    """Return what a packed model has of a copy whose contact bits are shifted; inertias to be told, if any."""
     child = _spec(load)
+    if inertias:
+        _tell(child, inertias)
     for actuator in list(child.actuators):
         child.delete(actuator)
     for key in list(child.keys):
@@ -242,6 +386,15 @@ def _copy(load: Load, shift: int) -> mujoco.MjSpec:
         geom.contype = _signed(geom.contype << shift)
         geom.conaffinity = _signed(geom.conaffinity << shift)
     return child
+
+
+class _Inertia(NamedTuple):
+    """Of a body, as compiled: mass [kg], principal inertias [kg*m^2], where and how its frame of inertia lies [m]."""
+
+    mass: float
+    inertia: Floats
+    ipos: Floats
+    iquat: Floats
 
 
 _kept: OrderedDict[tuple[str, str], mujoco.MjModel] = OrderedDict()
@@ -269,11 +422,34 @@ def _compiled_elsewhere(load: Load, copies: int | None) -> mujoco.MjModel:
 
 
 def _compile_to_bytes(load: Load, copies: int | None) -> bytes:
-    model = _checked(load, _spec(load).compile) if copies is None else _packed(load, copies)
+    model = _compiled(load, _spec(load)) if copies is None else _packed(load, copies)
     mujoco.MjData(model)  # a file may ask for memory here, too
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return content.tobytes()
+
+
+def _write_with_motors(load: Load, gears: Mapping[str, float]) -> bytes:
+    spec = _spec(load)
+    single = _with_driven_kinds(load, _compiled(load, spec))
+    # What a file says of finding inertias from shapes is not written; neither is that a shape does not count.
+    _tell(spec, _inertias(spec, single))
+    for body in spec.bodies[1:]:
+        for geom in body.geoms if not body.mass else ():
+            geom.mass = 0.0
+    for sensor in list(spec.sensors):
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR:
+            spec.delete(sensor)
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for key in spec.keys:
+        key.ctrl = []  # of actuators that are no longer there
+    for joint, gear in gears.items():
+        motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+        motor.gear = [gear, 0.0, 0.0, 0.0, 0.0, 0.0]
+    _compiled(load, spec)
+    return str(spec.to_xml()).encode()
 
 
 def _compile_alone(mjcf: Path) -> bytes:
@@ -288,22 +464,31 @@ def _spec(load: Load) -> mujoco.MjSpec:
     if not Path(load.mjcf).is_file():
         raise ValueError(f"there is no model file {str(load.mjcf)!r}")
     try:
-        return mujoco.MjSpec.from_file(str(load.mjcf))
+        spec = mujoco.MjSpec.from_file(str(load.mjcf))
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot read {str(load.mjcf)!r}: {' '.join(str(error).split())}") from error
+    spec.compiler.fusestatic = False  # of URDF: a copy would not be fused
+    return spec
 
 
-def _checked(load: Load, compile_: object) -> mujoco.MjModel:
+def _compiled(load: Load, spec: mujoco.MjSpec) -> mujoco.MjModel:
     try:
-        model = compile_()  # type: ignore[operator]
+        return spec.compile()
     except ValueError as error:
-        raise ValueError(f"MuJoCo cannot compile load {load.name!r}: {' '.join(str(error).split())}") from error
+        told = " ".join(str(error).split())
+        remedy = next((f"; {text}" for words, text in _REMEDIES.items() if words in told), "")
+        raise ValueError(f"MuJoCo cannot compile load {load.name!r}: {told}{remedy}") from error
+
+
+def _with_driven_kinds(load: Load, model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model; ValueError where it has joints that no drive turns and no copy can have, or none at all."""
     wrong = ~np.isin(model.jnt_type, (_SLIDE, _HINGE))
     if np.any(wrong):
         names = ", ".join(repr(model.joint(int(k)).name) for k in np.flatnonzero(wrong))
         raise ValueError(
             f"load {load.name!r} has free or ball joints ({names}); drives turn hinge and slide joints, and a copy's "
-            "coordinates must be its degrees of freedom: weld such a body or give it three hinges"
+            "coordinates must be its degrees of freedom: take a free joint out, so that its body stands still, and "
+            "give a ball joint's body three hinges"
         )
     if model.nv == 0:
         raise ValueError(f"load {load.name!r} has no joint, so there is nothing that a drive could turn")
@@ -329,19 +514,10 @@ def _motion(model: mujoco.MjModel, name: str) -> Combination:
         return {name: 1.0}
     tendon = model.tendon(name).id
     first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-    return {model.joint(int(model.wrap_objid[k])).name: float(model.wrap_prm[k]) for k in range(first, first + count)}
-
-
-def _actuators(model: mujoco.MjModel) -> dict[str, float]:
-    """Return the joints and tendons that actuators turn, each with the actuator's gear."""
-    joint, tendon = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)
-    gears: dict[str, float] = {}
-    for k in range(model.nu):
-        target = int(model.actuator_trnid[k, 0])
-        if model.actuator_trntype[k] in (joint, tendon):
-            turned = model.joint(target) if model.actuator_trntype[k] == joint else model.tendon(target)
-            gears.setdefault(turned.name, float(model.actuator_gear[k, 0]))
-    return gears
+    wrapped = [
+        (model.joint(int(model.wrap_objid[k])).name, float(model.wrap_prm[k])) for k in range(first, first + count)
+    ]
+    return {joint: coefficient for joint, coefficient in wrapped if coefficient != 0.0}
 
 
 def _joint_friction(model: mujoco.MjModel) -> tuple[Friction, ...]:

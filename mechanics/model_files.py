@@ -26,7 +26,16 @@ _ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
 
 
 def hash_of_model(mjcf: Path) -> str:
-    """Return a hash of all files that a model takes in, itself among them.
+    """Return a hash of all files that a model takes in, itself among them; errors as `files_of_model`."""
+    digest = hashlib.sha256()
+    for path in files_of_model(mjcf):
+        content = read_bytes(path, MOST_RECORDING)
+        digest.update(f"{path} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
+
+
+def files_of_model(mjcf: Path) -> list[Path]:
+    """Return all files that a model takes in, itself first.
 
     Raises:
         ValueError: If one is not in the model's folder, is not a regular file, or is too large; if there are too many,
@@ -34,7 +43,6 @@ def hash_of_model(mjcf: Path) -> str:
         OSError: If the model itself cannot be read.
     """
     root = mjcf.parent.resolve()
-    digest = hashlib.sha256()
     seen: dict[Path, None] = {}
     waiting = [mjcf]
     folders: dict[str, None] = {"": None}
@@ -63,10 +71,29 @@ def hash_of_model(mjcf: Path) -> str:
     for (folder, name), is_xml in named.items():
         if not is_xml:
             seen |= dict.fromkeys(_found(root, mjcf, {folder, mjcf.parent}, folders, name))
-    for path in seen:
-        content = read_bytes(path, MOST_RECORDING)
-        digest.update(f"{path} {len(content)}\n".encode() + content)
-    return digest.hexdigest()
+    return list(seen)
+
+
+def joints_without_travel(mjcf: Path) -> set[str]:
+    """Return the joints whose range in the file itself has no width, which MuJoCo takes as none given: it would turn.
+
+    Of an MJCF a joint's `range`, of a URDF the `limit` of a revolute or prismatic joint.
+    """
+    found: set[str] = set()
+    joint: dict[str, str] = {}
+    ends: dict[str, str] = {}
+    for element, attribute, value in _attributes(read_bytes(mjcf).decode("utf-8", "replace")):
+        if not attribute and element == "joint":
+            joint, ends = {}, {}
+        if element == "joint":
+            joint[attribute] = value
+            if len(set(joint.get("range", "0 1").split())) == 1 and "name" in joint:
+                found.add(joint["name"])
+        elif element == "limit" and joint.get("type") in ("revolute", "prismatic"):
+            ends[attribute] = value
+            if {"lower", "upper"} <= set(ends) and ends["lower"] == ends["upper"]:
+                found.add(joint.get("name", ""))
+    return found
 
 
 def _attributes(text: str) -> Iterator[tuple[str, str, str]]:
@@ -111,6 +138,7 @@ def _found(root: Path, mjcf: Path, bases: set[Path], folders: dict[str, None], n
                 "elsewhere are not read; copy it into that folder, or move the model to a folder that holds both"
             )
         found.append(place)
-    if not found:
+    # A URDF names what is only seen, too, which MuJoCo leaves out; what it lacks it tells.
+    if not found and mjcf.suffix != ".urdf":
         raise UntrustedFileError(f"{mjcf} takes in {name!r}, and there is no such file in {root}")
     return found

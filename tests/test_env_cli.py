@@ -251,7 +251,11 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
         (["scope", "--duration", "0.01", "--out", "was"], "was.csv", "choose another --out"),
         (["scope", "--duration", "0.01", "--out", "was"], "was.png", "choose another --out"),
         (["render", "--load", "inertia", "--out", "was.gif"], "was.gif", "choose another --out"),
-        (["check-model", "log.csv", "--fit", "load.inertia", "--out", "was.toml"], "was.toml", "choose another --out"),
+        (
+            ["model", "two_mass", "--log", "log.csv", "--fit", "load.inertia", "--out", "was.toml"],
+            "was.toml",
+            "choose another --out",
+        ),
     ],
 )
 def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name, remedy):
@@ -268,7 +272,7 @@ def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name,
 def test_a_picture_is_no_log_to_compare_with(run, tmp_path):
     path = tmp_path / "scope.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n")
-    code, _, error = run("check-model", path)
+    code, _, error = run("model", "two_mass", "--log", path)
     assert (code, error) == (
         USER_ERROR, f"drive-env: {path} is not a text file; give the CSV that drive-env scope writes\n",
     )  # fmt: skip

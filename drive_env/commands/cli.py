@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.ethercat import ethercat_app
 from drive_env.commands.export import export_app
@@ -11,6 +10,7 @@ from drive_env.commands.frames import frames_app
 from drive_env.commands.get import get, set_object
 from drive_env.commands.jog import jog
 from drive_env.commands.lss import lss_app
+from drive_env.commands.model import model
 from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
@@ -41,7 +41,7 @@ PANELS = {
         ("new", new_from_eds),
         ("compile", compile_kernels),
     ),
-    "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
+    "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("model", model)),
 }
 GROUPS = {
     "Drives on a bus": (("parameters", parameters_app), ("frames", frames_app), ("lss", lss_app)),
@@ -56,6 +56,7 @@ for panel, groups in GROUPS.items():
         app.add_typer(group, name=name, rich_help_panel=panel)
 app.moved({old: f"drive-env parameters {old}" for old in ("backup", "diff", "restore", "commission")})
 app.moved({old: f"drive-env frames {old}" for old in ("log", "replay")})
+app.moved({"check-model": "drive-env model LOAD --log LOG"})
 app.moved({old: f"drive-env export {old} FILE --device DEVICE" for old in ("eds", "esi")})
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
 
-# Response and commands of the usual modes: what `drive-env check-model` needs.
+# Response and commands of the usual modes: what `drive-env model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
 LISTENED = 0.3  # how long other masters are listened for before anything is sent [s]
 CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]

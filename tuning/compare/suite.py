@@ -24,7 +24,7 @@ from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import find_motor
 from drive_env.randomisation.random_machines import laws_of, shipped
-from mechanics.loads import find_load
+from mechanics.loads import MODEL_ENDINGS, find_load
 from mechanics.shaft import one, way
 from mechanics.untrusted import read_toml
 from tuning.linked_axes import are_linked
@@ -216,7 +216,7 @@ def _named(what: str, name: str, folder: Path) -> str:
 
 def _stem(load: str, motor: str) -> str:
     """Return load and motor for a machine's name, from which it draws: of paths the files' names, wherever they lie."""
-    return "-".join(Path(name).stem if name.endswith((".toml", ".xml", ".mjcf")) else name for name in (load, motor))
+    return "-".join(Path(name).stem if name.endswith((".toml", *MODEL_ENDINGS)) else name for name in (load, motor))
 
 
 def _group(where: str, device: str, row: dict[str, Any], folder: Path) -> list[SuiteMachine]:

@@ -239,7 +239,11 @@ def is_path(what: str, name: str) -> bool:
         from drive_env.devices.own_folder import is_own_folder
 
         return name.endswith(".toml") or is_own_folder(name)
-    return name.endswith((".xml", ".mjcf") if what == "load" else ".toml")
+    if what == "load":
+        from mechanics.loads import MODEL_ENDINGS
+
+        return name.endswith(MODEL_ENDINGS)
+    return name.endswith(".toml")
 
 
 def is_shipped(what: str, name: str) -> bool:

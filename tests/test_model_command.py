@@ -1,4 +1,4 @@
-"""The command `drive-env check-model`: what it says of a log, what it fits, and how it ends."""
+"""The command `drive-env model` with a log: what it says of it, what it fits, and how it ends."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from rigs.recorded_moves import CURRENT, POSITION, TARGET, TORQUE, TRUTH, VELOCI
 from typer.testing import CliRunner
 
 from drive_env import motion
-from drive_env.commands.check_model import _print
 from drive_env.commands.cli import app
+from drive_env.commands.model import _print
 from drive_env.randomisation.random_machines import Distributions
 from drive_env.trials.replay import Log, LogDifference
 
@@ -26,8 +26,8 @@ def log(tmp_path_factory):
     return path
 
 
-def run(*arguments):
-    result = CliRunner().invoke(app, ["check-model", *(str(argument) for argument in arguments)])
+def run(log, *arguments, load="two_mass"):
+    result = CliRunner().invoke(app, ["model", load, "--log", *(str(argument) for argument in (log, *arguments))])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.stdout, result.stderr
 
@@ -59,9 +59,9 @@ def test_a_fit_finds_the_machine_and_writes_laws_that_environments_take(log, tmp
 
 
 def test_what_can_be_fitted_is_listed(log):
-    code, text, _ = run(log, "--load", "two_mass", "--fit", "?")
+    code, text, _ = run(log, "--fit", "?")
     assert code == 0 and text.startswith("two_mass has ") and "load.inertia" in text and "load.stiffness" in text
-    code, text, _ = run(log, "--load", "two_mass", "--fit", "?", "--json")
+    code, text, _ = run(log, "--fit", "?", "--json")
     names = json.loads(text)["parameters"]
     assert code == 0 and "load.stiffness" in names and "load" not in names
     code, _, error = run(log, "--fit", "load.inertai")
@@ -110,8 +110,7 @@ def test_late_and_early_are_told(capsys, shift, says):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--load", "crane"], "no load is named 'crane'; there are arm"),
-        (["--load", "gantry"], "the log is of 1 axes, a machine of load 'gantry' has 2"),
+        (["--joint", "motor"], "--joint motor is for a proposal; leave it out, or --log"),
         (["--motor", "big"], "qbl4208"),
         (["--fit", "load.weight"], "'load.weight' cannot be fitted"),
         (["--fit", "load.inertia", "--machines", "4"], "--machines 4 is too few for a fit; give 16 or more"),
@@ -124,6 +123,19 @@ def test_late_and_early_are_told(capsys, shift, says):
 )
 def test_a_mistake_is_one_line(log, options, says):
     code, out, err = run(log, *options)
+    assert (code, out) == (USER_ERROR, "")
+    assert says in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("load", "says"),
+    [
+        ("crane", "no load is named 'crane'; there are arm"),
+        ("gantry", "the log is of 1 axes, a machine of load 'gantry' has 2"),
+    ],
+)
+def test_a_load_that_does_not_fit_the_log_is_one_line(log, load, says):
+    code, out, err = run(log, load=load)
     assert (code, out) == (USER_ERROR, "")
     assert says in err and err.count("\n") == 1
 

@@ -1,8 +1,8 @@
-"""`drive-env check-model`: compare a recorded move with emulated machines, and fit machines to it."""
+"""`drive-env model`: drives for the joints of a model, or how far a model is from a log, and machines that fit it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,18 +17,36 @@ if TYPE_CHECKING:
     from drive_env.trials.replay import LogDifference, LogFit
 
 LEAST = 16  # machines that a fit needs
+MOVE_TIME = 2.0  # s
 
 
-def check_model(
-    log: Annotated[Path, typer.Argument(help="Log of a move from rest, as `scope` writes it (CSV).")],
+def model(
+    load: Annotated[
+        str, typer.Argument(help="Model: the path of an MJCF or URDF file; with --log also the name of a load.")
+    ],
+    log: Annotated[
+        Path | None, typer.Option(help="Log of a move from rest, as `scope` writes it (CSV), to compare with.")
+    ] = None,
+    joint: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--joint",
+            "-j",
+            help="Joint to drive; may be repeated.",
+            show_default="those of the file's actuators, or all",
+        ),
+    ] = None,
+    move_time: Annotated[
+        float, typer.Option(help="Time for a move of each joint over its range, a turn or 1 m at most [s].")
+    ] = MOVE_TIME,
     device: DeviceName = DEFAULT_DEVICE,
     motor: Annotated[
         str | None,
         typer.Option(
-            help="Motor: a name of the catalogue, or the path of a TOML file.", show_default="the device's usual one"
+            help="Motor: a name of the catalogue, or the path of a TOML file.",
+            show_default="the smallest that suffices; with --log the device's usual one",
         ),
     ] = None,
-    load: Annotated[str, typer.Option(help="Load: a name, or the path of an MJCF file.")] = "two_mass",
     settings: Annotated[
         Path | None, typer.Option(help="Parameters of the real drive, as `parameters backup` writes them (TOML).")
     ] = None,
@@ -51,15 +69,31 @@ def check_model(
     machines: Annotated[int, typer.Option(help=f"Number of machines in a round of a fit, {LEAST} or more.")] = 64,
     rounds: Annotated[int, typer.Option(help="Rounds of a fit.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of a fit, and of the machines' noise.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="New file for the fitted set of distributions (TOML).")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="New folder for the model with its gears, to serve; with --fit, new file for the fitted set "
+            "of distributions (TOML)."
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Repeat a recorded move on the emulated machine and print the deviation of its response from the log.
+    """Print which joints of a model drives can turn, and with which motor and gears; or compare a model with a log.
 
+    Inertia, range and holding torque of each joint, the motor and the gear with their margins, and why a joint can have
+    no drive. --out writes the model with these gears, for `serve`, `drive-tune auto` and environments.
+
+    With --log, repeat the recorded move on the emulated machine and print the deviation of its response from the log.
     With --fit the parameters are drawn from their distributions until machines respond like the log; --out writes their
     range as a set of distributions for environments.
     """
     with errors_as_exit_codes():
+        if log is None:
+            _of_log_alone(settings=settings, fit=fit, distributions=distributions)
+            _propose(load, device, motor, joint or [], move_time, out, json)
+            return
+        if joint:
+            raise ValueError(f"--joint {joint[0]} is for a proposal; leave it out, or --log {log}")
         _check(fit, machines, rounds, out)
         from drive_env.trials.replay import read_log
 
@@ -91,6 +125,37 @@ def check_model(
             print_json(_as_json(report, dictionary, found, out))
         else:
             _print(report, dictionary, found, out)
+
+
+def _of_log_alone(**options: object) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(f"--{name} is for the comparison with a log; name it with --log, or leave --{name} out")
+
+
+def _propose(
+    load: str, device: str, motor: str | None, joints: Sequence[str], move_time: float, out: Path | None, json: bool
+) -> None:
+    from drive_env.commands.model_proposal import print_proposal, print_proposal_json, propose
+    from drive_env.devices import find_device
+    from drive_env.motors import find_motor
+    from mechanics.load import Load
+    from mechanics.loads import LOADS, MODEL_ENDINGS
+
+    if load in LOADS:
+        raise ValueError(f"{load} has its joints and gears; give the file of a model, or a log of its move with --log")
+    if not load.endswith(MODEL_ENDINGS):
+        raise ValueError(f"{load} is no model: give an MJCF or URDF file, which ends with {', '.join(MODEL_ENDINGS)}")
+    of_drive, row = find_device(device), Load(Path(load))
+    motors = list(of_drive.motors.values())
+    if motor is not None:
+        motors = [find_motor(motor)]
+        of_drive.check_motor(motors[0])
+    found, proposal = propose(row, of_drive, motors, joints, move_time, out)
+    if json:
+        print_proposal_json(found, proposal, out)
+    else:
+        print_proposal(row, of_drive, found, proposal, move_time, out)
 
 
 def _check(fit: list[str] | None, machines: int, rounds: int, out: Path | None) -> None:
