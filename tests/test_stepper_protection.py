@@ -136,13 +136,13 @@ def test_a_short_is_at_a_bridge_that_there_is():
 
 
 def test_too_much_amplitude_of_the_voltage_pwm_is_an_overcurrent():
-    """24 V over 0.5 ohm: nothing but the winding limits the current of voltage PWM."""
+    """24 V over 0.5 ohm and the stage's 0.05: nothing but they limit the current of voltage PWM."""
     with build("qsh4218_47", parameters=SMOOTH) as drives:
         drives.write(0x20B0, 10**6)
         drives.write(0x20B1, 1)
         drives.write(0x20B2, 40)
         hold(drives)
-        assert lane(drives, "i_a")[0] == pytest.approx(24.0 * 40 / 255 / 0.5, rel=0.02)
+        assert lane(drives, "i_a")[0] == pytest.approx(24.0 * 40 / 255 / 0.55, rel=0.02)
         drives.write(0x20B2, 250)
         drives.advance(0.02)
         assert (0x2312, 0) in told(drives)
