@@ -1,4 +1,4 @@
-"""The two sequences of the TGZ's maker, each put to the drive by our frame master and by SOEM: Op, and both axes move."""
+"""The two sequences of the TGZ's maker, by our frame master and by SOEM: Op, and both axes move."""
 
 from __future__ import annotations
 

@@ -471,8 +471,8 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
             if self.codes[key].field == "target_position":
-                whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
-                set_lanes(self._records, "target_is_whole", whole, where)
+                is_whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
+                set_lanes(self._records, "target_is_whole", is_whole, where)
         elif event >= 0:
             self.device.firmware.write_events(self._records, event, raw, where)
         else:
