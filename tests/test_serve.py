@@ -1,12 +1,16 @@
 """`drive-env serve` as a user meets it: what it prints, how it ends, what it says to mistakes; the TOML of a bus."""
 
 import errno
+import json
 import re
 import signal
 import socket
+import stat
 import subprocess
 import sys
+import time
 import tomllib
+from contextlib import contextmanager
 
 import can
 import pytest
@@ -15,6 +19,7 @@ from rigs.served_drives import ROOT, command, environment, served
 from typer.testing import CliRunner
 
 from drive_env.bus.config import Bus, BusConfigError, Machine, build_world, load_bus
+from drive_env.bus.fault_control import ask
 from drive_env.bus.faults import Faults
 from drive_env.bus.hub import Hub
 from drive_env.canopen.frames import Frame
@@ -22,6 +27,7 @@ from drive_env.commands.serve import serve
 from drive_env.fieldbus.errors import OpenError
 from drive_env.master.can.port import open_bus
 from drive_env.master.can_drives import CanDrives
+from drive_env.master.open_drives import open_drives
 from drive_env.motors import MOTORS
 
 EXAMPLE = ROOT / "examples" / "bus.toml"
@@ -310,3 +316,62 @@ def test_what_a_node_saves_is_there_when_it_is_served_again(tmp_path):
     assert values[0] != 777
     assert values[1] == 777
     assert [path.name for path in (tmp_path / "nodes").iterdir()] == ["node-5-tmcm1636.json"]
+
+
+# --- a file for scripts -------------------------------------------------------------------------------------------
+@contextmanager
+def served_with_ready_file(path, *arguments):
+    """A server in a process of its own; yields the process and what its file says once that is there."""
+    process = subprocess.Popen(
+        command("--ready-file", path, *arguments), env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    try:
+        while not path.exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        yield process, json.loads(path.read_text(encoding="utf-8"))
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and rights")
+def test_a_script_finds_the_drives_by_the_ready_file_alone(tmp_path):
+    path = tmp_path / "ready.json"
+    options = ["--port", 0, "--control", 0, "--token", "a-token_of_chance", "--lockstep"]
+    with served_with_ready_file(path, *options) as (process, ready):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600  # whoever reads the token may move the drives
+        assert (ready["pid"], ready["token"]) == (process.pid, "a-token_of_chance")
+        with open_bus(ready["interface"], ready["channel"], token=ready["token"]) as bus:
+            bus.send(can.Message(arbitration_id=0x000, data=b"\x82\x01", is_extended_id=False))
+            assert bus.recv(20.0).arbitration_id == 0x701
+        assert ask(ready["control"], "faults") == {"faults": []}
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_a_script_finds_slaves_on_ethercat_by_the_ready_file(tmp_path):
+    path = tmp_path / "ready.json"
+    options = ["tmcm3313", "--interface", "ethercat-udp", "--channel", 0, "--lockstep"]
+    with served_with_ready_file(path, *options) as (process, ready):
+        assert ready["interface"] == "ethercat-udp"
+        with open_drives("tmcm3313", interface=ready["interface"], channel=ready["channel"], safety=False) as drives:
+            assert int(drives.read(0x1000)[0]) & 0xFFFF == 402
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+    assert not path.exists()
+
+
+def test_a_ready_file_that_is_there_already_is_left_alone(tmp_path):
+    """It may be of a server that runs, and a script that waits for the file would take it for this one's."""
+    path = tmp_path / "ready.json"
+    path.write_text("{}")
+    done = run_serve("--port", 0, "--ready-file", path, cwd=tmp_path)
+    assert (done.returncode, path.read_text()) == (2, "{}")
+    assert "exists already" in done.stderr
+    done = run_serve("--port", 0, "--ready-file", tmp_path / "no_folder" / "ready.json", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "no folder" in done.stderr

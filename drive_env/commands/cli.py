@@ -15,6 +15,7 @@ from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
 from drive_env.commands.new import new_from_eds
+from drive_env.commands.objects import objects
 from drive_env.commands.parameters import parameters_app
 from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 from drive_env.commands.render import render
@@ -38,6 +39,7 @@ PANELS = {
     ),
     "This installation": (
         ("list", list_names),
+        ("objects", objects),
         ("new", new_from_eds),
         ("compile", compile_kernels),
     ),

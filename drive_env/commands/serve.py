@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from drive_env.commands.options import REFUSED, USER_ERROR, fail
+from drive_env.commands.options import REFUSED, USER_ERROR, check_free, fail
+from drive_env.commands.ready_file import can_address, ethercat_address, told_ready
 
 # The compiler and MuJoCo take long to import: --help should not wait for them.
 if TYPE_CHECKING:
@@ -100,6 +101,10 @@ def serve(
     pcap: Annotated[
         Path | None, typer.Option(help="Write all frames to this file, for Wireshark; on EtherCAT alone.")
     ] = None,
+    ready_file: Annotated[
+        Path | None,
+        typer.Option(help="JSON for scripts: written once the drives can be reached, removed at the end."),
+    ] = None,
 ) -> None:
     """Put emulated drives on a CAN bus for python-can, python-canopen and drive-env, or on EtherCAT for its masters."""
     server: list[Server | EtherCatServer] = []
@@ -113,9 +118,11 @@ def serve(
         bus = _bus(machine, config, bitrate, store, seed)
         if duration is not None and not duration > 0.0:
             _fail(f"--duration {duration:g} s must be above 0 s")
+        for file in (pcap, ready_file):
+            _check_new(file)
         if interface in ETHERCAT:
             theirs = {"node": node, "token": token, "bitrate": bitrate, "fault": fault, "control": control}
-            _serve_ethercat(server, bus, real_time, interface, channel, duration, pcap, stats, theirs)
+            _serve_ethercat(server, bus, real_time, interface, channel, duration, pcap, stats, ready_file, theirs)
             return
         if pcap is not None:
             _fail(f"--pcap {pcap} is for --interface ethercat; on CAN drive-env frames log writes frames")
@@ -123,10 +130,16 @@ def serve(
             token = secrets.token_urlsafe(TOKEN_BYTES)
         made = _server(bus, real_time, port, listen, token, interface, channel)
         server.append(made)
-        controls: list[Control | BesideCan] = [*_faults(made, fault or [], control), *_beside(made, bus, real_time)]
+        control_ports, beside = _faults(made, fault or [], control), _beside(made, bus, real_time)
+        controls: list[Control | BesideCan] = [*control_ports, *beside]
+        ready = can_address(made.transport, interface, channel) | {
+            "control": next((one.port for one in control_ports), None), "token": token,
+            "ethercat": next((ethercat_address(one.way, bus.ethercat_interface) for one in beside), None),
+        }  # fmt: skip
         _announce(made, bus, real_time, token, interface, channel)
         try:
-            made.run(duration)
+            with told_ready(ready_file, ready, _fail):
+                made.run(duration)
         except _can_error() as error:
             _fail(f"the interface {interface} failed: {error}", REFUSED)
         finally:
@@ -140,6 +153,18 @@ def serve(
     finally:
         for number, handler in previous:
             signal.signal(number, handler)
+
+
+def _check_new(file: Path | None) -> None:
+    """End the command where a file to be written exists already, or has no folder."""
+    if file is None:
+        return
+    try:
+        check_free(file)
+    except ValueError as error:
+        _fail(str(error))
+    if not file.absolute().parent.is_dir():
+        _fail(f"{file}: there is no folder {file.parent}; make it, or choose another file")
 
 
 def _bus(one: Mapping[str, Any], config: Path | None, bitrate: int | None, store: Path | None, seed: int | None) -> Bus:
@@ -171,10 +196,10 @@ def _serve_ethercat(
     duration: float | None,
     pcap: Path | None,
     stats: bool,
+    ready_file: Path | None,
     of_can: Mapping[str, object],
 ) -> None:
     """Serve on EtherCAT; `of_can` are options that it has not."""
-    from drive_env.commands.options import check_free
     from drive_env.commands.serve_ethercat import open_ethercat, run_ethercat
 
     if bus.has_both:
@@ -184,14 +209,10 @@ def _serve_ethercat(
     for name, value in of_can.items():
         if value is not None and value != []:
             _fail(f"--{name} is for CAN; a slave on --interface {interface} has none: leave it out")
-    if pcap is not None:
-        try:
-            check_free(pcap)
-        except ValueError as error:
-            _fail(str(error))
     made = open_ethercat(bus, real_time, interface, channel, _fail)
     server.append(made)
-    run_ethercat(made, bus, duration, pcap, stats)
+    with told_ready(ready_file, ethercat_address(made.way, interface), _fail):
+        run_ethercat(made, bus, duration, pcap, stats)
     print("drive-env: stopped", flush=True)
 
 

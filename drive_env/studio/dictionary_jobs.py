@@ -41,11 +41,6 @@ ON_AND_ON = (
     cia402.TARGET_VELOCITY, cia402.VL_TARGET_VELOCITY, cia402.TARGET_TORQUE, cia402.VELOCITY_OFFSET,
     cia402.TORQUE_OFFSET,
 )  # fmt: skip
-AREAS = {
-    "communication": ("Communication (1000h to 1FFFh)", range(0x1000, 0x2000)),
-    "manufacturer": ("Manufacturer (2000h to 5FFFh)", range(0x2000, cia402.PROFILE_AREAS.start)),
-    "profile": ("Drive profile (6000h to 9FFFh)", cia402.PROFILE_AREAS),
-}
 
 
 class ShownValue(NamedTuple):
@@ -61,22 +56,6 @@ class Checked:
 
     raw: int
     text: str
-
-
-def area_of(index: int) -> str:
-    """Return in which area of the dictionary an object is."""
-    return next((name for name, (_, area) in AREAS.items() if index in area), "communication")
-
-
-def searched(entries: Sequence[Entry], text: str) -> list[Entry]:
-    """Return the entries whose index or name has all words of a text; all for none."""
-    words = text.lower().replace("h:", ":").split()
-    found = []
-    for entry in entries:
-        place = f"{entry.index:04x}:{entry.sub:02x} {entry.index:04x}h {entry.name.lower()} {entry.unit.lower()}"
-        if all(word in place for word in words):
-            found.append(entry)
-    return found
 
 
 def values_of(entries: Sequence[Entry], axis: int, scale: Scale) -> Callable[[Drives], dict[Key, ShownValue]]:

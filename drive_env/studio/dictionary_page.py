@@ -11,6 +11,7 @@ from nicegui.events import GenericEventArguments, UploadEventArguments
 
 from drive_env import cia402
 from drive_env.cia402 import Key
+from drive_env.dictionary import search
 from drive_env.dictionary.entries import Entry
 from drive_env.master.parameters import Difference
 from drive_env.studio import dictionary_jobs as jobs
@@ -82,7 +83,7 @@ class DictionaryPanel:
                 "dense outlined clearable data-test=search debounce=250"
             )
             self._search.classes("w-full").on_value_change(self._choose)
-            areas = {ALL: "all", FAVOURITES: "favourites"} | {name: name for name in jobs.AREAS}
+            areas = {ALL: "all", FAVOURITES: "favourites"} | {name: name for name in search.AREAS}
             self._area = ui.toggle(areas, value=ALL, on_change=self._choose).props("no-caps unelevated dense")
             self._area.classes("studio-toggle")
             with ui.expansion("Tree", icon="account_tree").classes("w-full"), ui.element("div").classes("studio-tree"):
@@ -93,8 +94,8 @@ class DictionaryPanel:
     def _nodes(self) -> list[dict[str, Any]]:
         """Return the tree: areas, then objects."""
         nodes = []
-        for name, (title, _) in jobs.AREAS.items():
-            objects = {e.index: e for e in reversed(self._entries) if jobs.area_of(e.index) == name}
+        for name, (title, _) in search.AREAS.items():
+            objects = {e.index: e for e in reversed(self._entries) if search.area_of(e.index) == name}
             children = [
                 {"id": f"{index:04X}", "label": f"{index:04X}h {entry.name.partition('.')[0]}"}
                 for index, entry in sorted(objects.items())
@@ -103,7 +104,7 @@ class DictionaryPanel:
         return nodes
 
     def _select(self, node: str | None) -> None:
-        if node in jobs.AREAS:
+        if node in search.AREAS:
             self._area.set_value(node)
         elif node:
             self._area.set_value(ALL)
@@ -115,8 +116,8 @@ class DictionaryPanel:
         if area == FAVOURITES:
             entries = [e for e in entries if (e.index, e.sub) in self._favourites]
         elif area != ALL:
-            entries = [e for e in entries if jobs.area_of(e.index) == area]
-        self._chosen = jobs.searched(entries, self._search.value or "")
+            entries = [e for e in entries if search.area_of(e.index) == area]
+        self._chosen = search.searched(entries, self._search.value or "")
         self._first = 0
         self._draw()
 
