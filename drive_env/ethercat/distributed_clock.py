@@ -162,7 +162,9 @@ class DistributedClock:
             self._next_sync1 = (pulse + self._delay) % TIMES
             struct.pack_into("<Q", self._memory, registers.SYNC1_NEXT, self._next_sync1)
         self._next_pulse = (pulse + cycle) % TIMES if cycle else None
-        struct.pack_into("<Q", self._memory, registers.SYNC0_START, pulse if self._next_pulse is None else self._next_pulse)
+        struct.pack_into(
+            "<Q", self._memory, registers.SYNC0_START, pulse if self._next_pulse is None else self._next_pulse
+        )
         return SYNC0, self._world_time(pulse)
 
     def _sync1_is_first(self) -> bool:

@@ -615,7 +615,11 @@ def compose(stages: FirmwareStages, source: str) -> Firmware:
         layout=layout,
         causes=tuple(stages.causes),
         machinery=machinery,
-        run=_run(source, reader(machinery), _run_group(_play_row(events, layout.place("target_position")[1]), supervise, window, leave_diverged)),
+        run=_run(
+            source,
+            reader(machinery),
+            _run_group(_play_row(events, layout.place("target_position")[1]), supervise, window, leave_diverged),
+        ),
         run_drives_alone=_run_drives_alone(source, supervise, window),
         write_events=_write_events(source, events),
         power_on=_power_on(source, stages, events.tell_state),

@@ -95,5 +95,8 @@ def move(sequence, exchange, turns=0.25, patience=400):
         data = exchange(sequence.pack(sequence.positions(data), None))
     shown = range(AXES)
     return Seen(
-        moved, was_on, [sequence.is_on(data, axis) for axis in shown], [sequence.has_error(data, axis) for axis in shown]
+        moved,
+        was_on,
+        [sequence.is_on(data, axis) for axis in shown],
+        [sequence.has_error(data, axis) for axis in shown],
     )
