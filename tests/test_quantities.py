@@ -132,14 +132,15 @@ def test_an_integer_is_shown_with_its_unit_and_as_people_say_it(raw, unit, incre
     assert show(raw, entry(unit), increments) == text
 
 
-# Numerator 3 over divisor 1000 (6094h): a velocity unit is 0.003 rpm. M-Ipeak is 8 A.
-OF_ITS_OWN = AxisScale(TURN, 3 / 1000, 8.0)
+# Numerator 3 over divisor 1000 (6094h): a velocity unit is 0.003 rpm. M-Ipeak is 8 A, M-Inull 2 A.
+OF_ITS_OWN = AxisScale(TURN, 3 / 1000, 8.0, 2.0)
 
 
 @pytest.mark.parametrize(("text", "unit", "raw"), [
     ("30 rpm", "velocity unit", 10_000), ("0.5 rev/s", "velocity unit", 10_000), ("-3 rpm", "velocity unit", -1000),
     ("600 rpm/s", "velocity unit/s", 200_000), ("1 rev/s^2", "velocity unit/s", 20_000),
-    ("8 A", "1/32767 M-Ipeak", 32_767), ("-2 A", "1/32767 M-Ipeak", -8192), ("17", "velocity unit", 17),
+    ("8 A", "1/32767 M-Ipeak", 32_767), ("-2 A", "1/32767 M-Ipeak", -8192),
+    ("-1 A", "1/1000 of M-Inull", -500), ("17", "velocity unit", 17),
 ])  # fmt: skip
 def test_a_velocity_unit_and_a_part_of_the_peak_current_follow_their_own_scales(text, unit, raw):
     assert parse(text, entry(unit), OF_ITS_OWN) == raw
@@ -156,15 +157,24 @@ def test_what_has_a_scale_of_its_own_is_shown_with_it():
     assert show(0, entry("chars"), OF_ITS_OWN) == "0 chars ('')"
 
 
+def test_four_characters_are_written_as_a_text():
+    for text, found in (("AM30", b"AM30"), ("2a", b"2a  "), ("'12'", b"12  "), ("''", b"    "), ("0x2041", b"A \0\0")):
+        assert parse(text, entry("chars"), OF_ITS_OWN).to_bytes(4, "little") == found
+    for text in ("AM3041", "\u03a9"):
+        with pytest.raises(ValueError, match="not a text of up to four Latin-1 characters .* next register"):
+            parse(text, entry("chars"), OF_ITS_OWN)
+
+
 @pytest.mark.parametrize(("values", "roles", "expected"), [
     ({}, {}, [None, None]), ({(0x608F, 1): (4096, 0)}, {}, [4096.0, None]),
     ({(0x2058, 0): (65536, 1)}, {Role.POSITION_SCALE: (0x2058, 0)}, [65536.0, 1.0]),
     (
-        {(0x6094, 1): (1, 7), (0x6094, 2): (1000, 2), (0x2107, 0): (4000, 8000)},
+        {(0x6094, 1): (1, 7), (0x6094, 2): (1000, 2), (0x2107, 0): (4000, 8000), (0x2106, 0): (1000, 3000)},
         {
-            Role.VELOCITY_NUMERATOR: (0x6094, 1), Role.VELOCITY_DIVISOR: (0x6094, 2), Role.PEAK_CURRENT: (0x2107, 0)
+            Role.VELOCITY_NUMERATOR: (0x6094, 1), Role.VELOCITY_DIVISOR: (0x6094, 2), Role.PEAK_CURRENT: (0x2107, 0),
+            Role.NOMINAL_CURRENT: (0x2106, 0),
         },
-        [(None, 0.001, 4.0), (None, 3.5, 8.0)],
+        [(None, 0.001, 4.0, 1.0), (None, 3.5, 8.0, 3.0)],
     ),
 ])  # fmt: skip
 def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
@@ -176,7 +186,7 @@ def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
 
 @pytest.mark.parametrize(("unit", "follows"), [
     ("inc", True), ("pps", True), ("pps^2", True), ("velocity unit", True), ("velocity unit/s", True),
-    ("1/32767 M-Ipeak", True), ("10 pps", True), ("rpm", False), ("mA", False), ("", False), ("0.1 rpm", False),
+    ("1/32767 M-Ipeak", True), ("1/1000 of M-Inull", True), ("10 pps", True), ("rpm", False), ("mA", False), ("", False), ("0.1 rpm", False),
 ])  # fmt: skip
 def test_which_units_follow_a_scale_that_the_drive_is_asked_for(unit, follows):
     assert follows_scale(unit) is follows

@@ -144,11 +144,15 @@ def parse(text: str, entry: Entry, scale: Scale) -> int:
 
     Raises:
         ValueError: For what is not a number, or a unit that does not fit the object.
+
+    An object of four characters of a text takes these, filled up with blanks; in quotation marks digits are characters.
     """
     try:
         return int(text, 0)
     except ValueError:
         pass
+    if entry.unit == CHARACTERS:
+        return _characters(text, entry)
     found = _QUANTITY.match(text)
     if found is None:
         raise ValueError(f"{text!r} is not a number for {entry.label}; give an integer, or a number and a unit")
@@ -165,6 +169,17 @@ def parse(text: str, entry: Entry, scale: Scale) -> int:
     if not math.isfinite(count):
         raise ValueError(_too_large(text, entry))
     return round(count)
+
+
+def _characters(text: str, entry: Entry) -> int:
+    """Return four characters as an integer, the first one in the lowest byte."""
+    inner = text[1:-1] if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"" else text
+    if len(inner) > 4 or any(ord(letter) > 0xFF for letter in inner):
+        raise ValueError(
+            f"{text!r} is not a text of up to four Latin-1 characters for {entry.label}; write what follows to the next "
+            "register"
+        )
+    return int.from_bytes(inner.ljust(4).encode("latin-1"), "little")
 
 
 def is_quantity(value: object) -> bool:

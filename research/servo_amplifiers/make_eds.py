@@ -85,7 +85,7 @@ def rows() -> Iterator[tuple[int, int, Row]]:
     with (HERE / "tgz.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             index, sub = int(row["index"].rstrip("h"), 16), int(row["sub"])
-            first, *further = row["default"].split()
+            first, *further = row["default"].split() or [""]
             yield index, sub, {**row, "default": first}
             if row["axes"] != "node":
                 default = further[0] if further else first
@@ -106,7 +106,8 @@ def entry(row: Row, section: str) -> str:
     lines = [f"[{section}]", f"ParameterName={row['name']}", f"ObjectType={VARIABLE}"]
     lines += [f"DataType=0x{TYPES[row['type']]:04X}", f"AccessType={access}"]
     lines += [f"{key}={row[name]}" for key, name in (("LowLimit", "low"), ("HighLimit", "high")) if row[name]]
-    lines += [f"DefaultValue={number(row['default'])}", f"PDOMapping={int(row['pdo'] != 'no')}"]
+    lines += [f"DefaultValue={number(row['default'])}"] if row["default"] else []
+    lines += [f"PDOMapping={int(row['pdo'] != 'no')}"]
     if row["unit"]:
         lines.append(f"Unit={row['unit']}")
     return "\n".join(lines) + "\n"
