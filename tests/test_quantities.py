@@ -161,7 +161,7 @@ def test_four_characters_are_written_as_a_text():
     for text, found in (("AM30", b"AM30"), ("2a", b"2a  "), ("'12'", b"12  "), ("''", b"    "), ("0x2041", b"A \0\0")):
         assert parse(text, entry("chars"), OF_ITS_OWN).to_bytes(4, "little") == found
     for text in ("AM3041", "\u03a9"):
-        with pytest.raises(ValueError, match="not a text of up to four Latin-1 characters .* next register"):
+        with pytest.raises(ValueError, match=r"not a text of up to four Latin-1 characters .* next register"):
             parse(text, entry("chars"), OF_ITS_OWN)
 
 
@@ -186,7 +186,8 @@ def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):
 
 @pytest.mark.parametrize(("unit", "follows"), [
     ("inc", True), ("pps", True), ("pps^2", True), ("velocity unit", True), ("velocity unit/s", True),
-    ("1/32767 M-Ipeak", True), ("1/1000 of M-Inull", True), ("10 pps", True), ("rpm", False), ("mA", False), ("", False), ("0.1 rpm", False),
+    ("1/32767 M-Ipeak", True), ("1/1000 of M-Inull", True), ("10 pps", True),
+    ("rpm", False), ("mA", False), ("", False), ("0.1 rpm", False),
 ])  # fmt: skip
 def test_which_units_follow_a_scale_that_the_drive_is_asked_for(unit, follows):
     assert follows_scale(unit) is follows

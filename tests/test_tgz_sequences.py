@@ -1,4 +1,4 @@
-"""The two sequences of the TGZ's maker, each put to the drive by our frame master and by SOEM: Op, and both axes move."""
+"""The two sequences of the TGZ's maker, each by our frame master and by SOEM: Op, and both axes move."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_our_frame_master_moves_both_axes(segment, name, clock):
 @needs_namespaces
 @pytest.mark.parametrize("delay", [None, 0, 250_000], ids=["free", "together", "later"])
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_soem_moves_both_axes(spaces, name, delay):  # noqa: F811
+def test_soem_moves_both_axes(spaces, name, delay):
     options = () if delay is None else (delay,)
     seen = seen_by(spaces, "--lockstep", "ethercat_tgz_master.py", name, *options, device="tgz_d", load="gantry")
     size = SEQUENCES[name].size

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from drive_env import cia402
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
-from drive_env.devices.image_rows import FixedImage, fixed_images
 from drive_env.devices.gain_set import GainSet, load_gain_set
+from drive_env.devices.image_rows import FixedImage, fixed_images
 from drive_env.devices.own_folder import BINDINGS, bindings_of, check_scale, is_own_folder, naming, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
 from drive_env.devices.variants import (

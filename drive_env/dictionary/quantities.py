@@ -176,8 +176,8 @@ def _characters(text: str, entry: Entry) -> int:
     inner = text[1:-1] if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"" else text
     if len(inner) > 4 or any(ord(letter) > 0xFF for letter in inner):
         raise ValueError(
-            f"{text!r} is not a text of up to four Latin-1 characters for {entry.label}; write what follows to the next "
-            "register"
+            f"{text!r} is not a text of up to four Latin-1 characters for {entry.label}; write what follows to the "
+            "next register"
         )
     return int.from_bytes(inner.ljust(4).encode("latin-1"), "little")
 

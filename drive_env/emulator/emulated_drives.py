@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from drive_env.cores import usable_cores
 from drive_env.default_device import DEFAULT_DEVICE
-from drive_env.devices import Device, find_device
+from drive_env.devices import find_device
 from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quantity

@@ -105,7 +105,8 @@ class Inside(Saved):
         longer = device.cycle / self.device.cycle
         self.device = device
         self.schedule = [
-            (self.cycle + math.ceil((due - self.cycle) / longer - 1e-9), *change) for due, *change in self.schedule
+            (self.cycle + math.ceil((due - self.cycle) / longer - 1e-9), name, values, where)
+            for due, name, values, where in self.schedule
         ]
         # A step that is no longer than before leaves no resonance too fast for it.
         rates = rates_of(device, math.ceil(1.0 / (device.velocity_rate * self._longest_step) - 1e-9))

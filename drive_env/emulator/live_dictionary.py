@@ -24,9 +24,9 @@ from drive_env.dictionary.position_scale import PositionScale, position_scale, v
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import (
+    CONTEXT_FIELDS,
     NOMINAL_FIELD,
     PEAK_FIELD,
-    CONTEXT_FIELDS,
     PROFILE_FIELD,
     RATIO_FIELD,
     SCALE_FIELD,
@@ -389,7 +389,8 @@ class LiveDictionary:
         )
         if not self._layout.has(RATIO_FIELD):
             return scales
-        return scales._replace(**{name: self._scale_field(name) for name in CONTEXT_FIELDS})
+        of_axes: dict[str, Any] = {name: self._scale_field(name) for name in CONTEXT_FIELDS}
+        return scales._replace(**of_axes)
 
     def _scale_field(self, name: str) -> Floats:
         return get_lanes(self._records, name, self.num_axes).astype(float)
@@ -462,8 +463,8 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
             if self.codes[key].field == "target_position":
-                whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
-                set_lanes(self._records, "target_is_whole", whole, where)
+                is_whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
+                set_lanes(self._records, "target_is_whole", is_whole, where)
         elif event >= 0:
             self.device.firmware.write_events(self._records, event, raw, where)
         else:

@@ -97,7 +97,7 @@ class DistributedClock:
         struct.pack_into("<I", self._memory, registers.TIME_DIFFERENCE, 0)
         struct.pack_into("<h", self._memory, registers.SPEED_DIFFERENCE, 0)
 
-    # --- SYNC0 and SYNC1 ------------------------------------------------------------------------------------------------------
+    # --- SYNC0 and SYNC1 --------------------------------------------------------------------------------------------
     @property
     def has_sync0(self) -> bool:
         """Whether SYNC0 is switched on."""
@@ -143,7 +143,7 @@ class DistributedClock:
         return None if pulse is None else self._world_time(pulse)
 
     def take_pulse(self, now: int) -> tuple[int, int] | None:
-        """Return the pulse that is due at `now` [ns], SYNC0 or SYNC1, with its world time [ns], and go on to the next."""
+        """Return the pulse that is due at `now` [ns], SYNC0 or SYNC1, with its world time [ns]; go on to the next."""
         if self._sync1_is_first():
             following = self._next_sync1
             if following is None or (self.system(now) - following) % TIMES >= TIMES // 2:

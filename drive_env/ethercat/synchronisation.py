@@ -1,8 +1,8 @@
 """How a slave is synchronised: 1C32h of its outputs, 1C33h of its inputs (ETG.1020, 22).
 
 SYNC0 of the distributed clocks decides: switched on before Safe-Op, outputs take effect at its pulses, and both objects
-show type 2 and its cycle. Of a device that uses SYNC1 that decides, where the master makes it, and the type is 3. Without
-clocks outputs take effect as they come.
+show type 2 and its cycle. Of a device that uses SYNC1 that decides, where the master makes it, and the type is 3.
+Without clocks outputs take effect as they come.
 """
 
 from __future__ import annotations

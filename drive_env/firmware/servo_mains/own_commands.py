@@ -1,8 +1,8 @@
 """Commands that are not CiA 402's: control of the native image, and K-Command of the service modes.
 
 The native image's control (bit 0 clear errors, bit 1 enable the power stage) acts at its edges, as the same commands do
-of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation. Where csv
-needs D-Mode 10, that makes it 9, and the image's set-points are speeds as long as its control enables.
+of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation. Where
+csv needs D-Mode 10, that makes it 9, and the image's set-points are speeds as long as its control enables.
 
 K-Command (bits 1 and 0 are 01: enable; bit 3: clear errors) is that of the maker's service program. It acts while the
 master is disconnected or has no mode (6060h is 0), in the modes of the D-Mode: K-I, K-V or K-P_Angle and K-P_Revol are
