@@ -198,3 +198,32 @@ def test_axes_of_one_machine_have_one_slack_and_the_worst_cost():
     rows = np.array([sets(300, 600), sets(450, 450)])
     np.testing.assert_allclose(both.slack(rows), [[0.5, 1.0 / 3.0]] * 2)
     np.testing.assert_allclose(both.score(rows), 3.0)  # of the second one; the first one costs 2
+
+
+class FedForward:
+    """Whatever the loops, a share of the speed feed-forward is the best."""
+
+    def __init__(self, device, best):
+        self.twins = SimpleNamespace(device=device, num_axes=1)
+        self.column, self.best = device.gains.column("feed-forward", "speed"), best
+
+    def of_machines(self, values, reduce):
+        return values
+
+    def slack(self, gains, *, nominal=False):
+        return np.ones(gains.shape[:2])
+
+    def score(self, gains):
+        ahead = 0.0 if self.column is None else gains[..., self.column]
+        return 1.0 + np.abs(ahead - self.best) * np.ones(gains.shape[:2])
+
+
+@pytest.mark.parametrize("best", [0, 500, 850, 1000])
+def test_the_speed_feed_forward_of_a_tgz_is_tried_and_taken_where_it_is_better(best):
+    """P-SFF, thousandths of the demanded speed."""
+    device = find_device("tgz_d")
+    with emulated("tgz_d", "inertia", num_threads=1) as target:
+        plant = true_plant(target.drives)
+    judge = FedForward(device, best)
+    found = design(judge, judge, [plant])
+    assert found.gains[0, 0, judge.column] == best and found.cost[0, 0] == 1.0

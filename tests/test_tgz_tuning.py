@@ -48,6 +48,8 @@ def test_auto_over_a_bus_certifies_both_axes_and_undoes_itself(tmp_path):
             found = gains(inside)
             np.testing.assert_array_equal(found, [axis.after for axis in told.axes])
             assert (found != before).any(axis=1).all()
+            ahead = DEVICE.gains.column("feed-forward", "speed")
+            assert (found[:, ahead] > before[:, ahead]).all(), "P-SFF, of which the factory has none"
             assert not cia402.is_live(inside.read(cia402.STATUSWORD)).any()
             restore(drives, load_snapshot(before_file), whole=False)
             np.testing.assert_array_equal(gains(inside), before)
