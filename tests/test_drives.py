@@ -106,7 +106,7 @@ def test_load_torque_disturbs_and_the_loop_recovers(running):
 
 def test_unknown_names_list_what_there_is():
     for options, message in (
-        ({"device": "acme"}, "no device is named 'acme'; there are tgz_d, tgz_s"),
+        ({"device": "acme"}, "no device is named 'acme'; there are tgz_d, tgz_d_2026"),
         ({"load": "acme"}, "no load is named 'acme'; there are arm, ball_screw, belt, cart_pendulum"),
         ({"motor": "acme"}, "no motor is named 'acme'; there are am3033_e, am3041_e"),
         ({"num_machines": 0}, "num_machines must be 1 or more, not 0"),

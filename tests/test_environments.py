@@ -441,7 +441,7 @@ def test_an_amplifier_on_mains_is_a_drive_like_any_other(kind, load):
 # --- a wrong configuration --------------------------------------------------------------------------------------------
 @EVERY_KIND
 @pytest.mark.parametrize(("options", "says"), [
-    ({"device": "tmcm"}, "no device is named 'tmcm'; there are tgz_d, tgz_s"),
+    ({"device": "tmcm"}, "no device is named 'tmcm'; there are tgz_d, tgz_d_2026"),
     ({"load": "crane"}, "no load is named 'crane'; there are arm, ball_screw, belt"),
     ({"motor": "big"}, "qbl4208"),
     ({"friction": "wet"}, "no friction is named 'wet'; there are none, coulomb_viscous, stribeck, lugre"),

@@ -162,7 +162,7 @@ def test_any_interface_serves(tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["tmcm1637"], "drive-env: no device is named 'tmcm1637'; there are tgz_d, tgz_s"),
+    (["tmcm1637"], "drive-env: no device is named 'tmcm1637'; there are tgz_d, tgz_d_2026"),
     (["--load", "abc"], "drive-env: no load is named 'abc'; there are "),
     (["--motor", "abc"], "drive-env: no motor is named 'abc'; there are"),
     (["--motor", "none"], "drive-env: motor none: every machine has a motor; name it, and for a drive with factory "

@@ -393,7 +393,7 @@ TEXT = DEFAULT.read_text(encoding="utf-8")
 
 
 @every_row(("old", "new", "message"), [
-    ('device = "tmcm1636"', 'device = "abc"', "no device is named 'abc'; there are tgz_d, tgz_s"),
+    ('device = "tmcm1636"', 'device = "abc"', "no device is named 'abc'; there are tgz_d, tgz_d_2026"),
     ('motor = "qbl4208"', 'motor = "abc"', "no motor is named 'abc'; there are am3033_e, am3041_e"),
     ('load = "two_mass"', 'load = "abc"', "no load is named 'abc'; there are arm, ball_screw, belt, cart_pendulum"),
     ('load = "two_mass"', "load = 3", "load = 3 is a whole number; it must be a text"),

@@ -175,7 +175,7 @@ def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_
     (["sweep", "--config", "none.toml"], "drive-tune: cannot read the experiment none.toml: No such file"),
     (["sweep", "--motor", "abc"], "drive-tune: no motor is named 'abc'; there are am3033_e, am3041_e"),
     (["sweep", "--load", "abc"], "drive-tune: no load is named 'abc'; there are arm, ball_screw, belt, cart_pendulum"),
-    (["sweep", "--device", "abc"], "drive-tune: no device is named 'abc'; there are tgz_d, tgz_s"),
+    (["sweep", "--device", "abc"], "drive-tune: no device is named 'abc'; there are tgz_d, tgz_d_2026"),
     (["sweep", "--seed", "-1"], "drive-tune: seed = -1 lies outside"),
     (["sweep", "--out", "full"], "drive-tune: the folder full is not empty; choose another --out or remove it"),
     (["sweep", "--out", "full/file"], "drive-tune: full/file is a file; choose another --out"),

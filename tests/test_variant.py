@@ -181,7 +181,7 @@ def test_the_command_line_prints_the_eds_of_a_device():
         assert (found.exit_code, found.stdout) == (0, device.eds.read_text(encoding="utf-8"))
     found = CliRunner().invoke(app, ["export", "eds", "-", "--device", "tmcm1637"])
     assert (found.exit_code, found.stdout) == (2, "")
-    assert "no device is named 'tmcm1637'; there are tgz_d, tgz_s, tmcm1636, tmcm1636_fw109" in found.stderr
+    assert "no device is named 'tmcm1637'; there are tgz_d, tgz_d_2026, tgz_s, tmcm1636, tmcm1636_fw109" in found.stderr
 
 
 # --- each object acts -------------------------------------------------------------------------------------------------
