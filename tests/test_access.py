@@ -350,7 +350,9 @@ def context(scaler=65536.0, **other):
         "current_lsb": 100.0 / 32768.0,
         "rated_current": 3.5,
         "velocity_ratio": 2.5,
+        "set_point_ratio": 1.0,
         "peak_current": 12.0,
+        "nominal_motor_current": 4.0,
         "profile_bits": 16.0,
     }
     values.update(other)

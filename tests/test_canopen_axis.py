@@ -184,7 +184,7 @@ def two(tmp_path, monkeypatch):
     device = several_axes(tmp_path, 2, history=3)
     monkeypatch.setattr("drive_env.emulator.emulated_drives.find_device", lambda name: device)
     with EmulatedDrives(load="inertia", num_machines=3, num_threads=1) as drives:
-        yield Wire(drives, first_axis=1)
+        yield Wire(drives, first_axis=0)
 
 
 @pytest.mark.parametrize(
@@ -211,8 +211,8 @@ def test_each_axis_has_its_automaton(two):
         rx 605  40 41 68 01 00 00 00 00
         tx 585  80 41 68 01 11 00 09 06
     """)
-    assert (two.drives.read(0x6041) & 0x6F).tolist() == [0x40, 0x40, 0x21]
-    assert two.drives.read(0x6083)[2] == 0x0403_0201
+    assert (two.drives.read(0x6041) & 0x6F).tolist() == [0x40, 0x21, 0x40]
+    assert two.drives.read(0x6083)[1] == 0x0403_0201
 
 
 def test_each_axis_has_its_pdos(two):
@@ -238,7 +238,7 @@ def test_a_fault_of_one_axis_and_the_register_of_both(two):
     two.enable()
     for raw, sub in ((3, 0x6860), (6, 0x6840), (7, 0x6840), (15, 0x6840)):
         assert two.download(sub, 0, raw, 1 if sub == 0x6860 else 2) == 0
-    two.drives.machine.enable_input = np.array([True, True, False])
+    two.drives.machine.enable_input = np.array([True, False, True])
     two.play("""
         wait 1 ms
         tx 085  41 54 81 00 FF 00 00 00
@@ -252,7 +252,7 @@ def test_a_fault_of_one_axis_and_the_register_of_both(two):
     two.receive(0, "02 05")
     two.wait(5)
     two.receive(0, "80 05")
-    assert (two.drives.read(0x6041) & 0x4F).tolist() == [0x40, 0x08, 0x08], "stopping takes every axis of the node"
+    assert (two.drives.read(0x6041) & 0x4F).tolist() == [0x08, 0x08, 0x40], "stopping takes every axis of the node"
 
 
 def test_a_node_is_watched_once(two):
@@ -307,8 +307,8 @@ def test_store_and_reset_of_several_axes(two):
     assert two.download(0x1010, 1, 0x65766173, 4) == 0
     two.drives.write(0x6083, 99)
     two.receive(0, "81 05")
-    assert two.drives.read(0x6083).tolist() == [99, 815, 4711], "the axis that is not the node's is left alone"
-    assert two.drives.read(0x2003)[2] == 1234
+    assert two.drives.read(0x6083).tolist() == [815, 4711, 99], "the axis that is not the node's is left alone"
+    assert two.drives.read(0x2003)[1] == 1234
 
 
 def test_ten_nodes_of_one_set(drives):

@@ -297,6 +297,9 @@ def test_an_axis_that_is_disconnected_while_it_turns_stops_and_is_off():
 def test_motion_brings_the_d_mode_along_and_is_heard_whatever_it_is():
     with two_axes() as drives:
         for mode, number in cia402.MODES.items():
+            if number not in D_MODES:
+                assert mode == "vl"
+                continue
             motion.enable(drives, mode=mode)
             assert np.all(drives.read(Role.MODE_GATE) == D_MODES[number]), mode
             assert np.all(drives.read(0x6041) & REMOTE)
