@@ -57,7 +57,7 @@ FROZEN = {
     "ServoDrive/PoleBalance-v1": "87bf81fa814f7439",
     "ServoDrive/PoleSwingUp-v1": "a176bbc9569535f4",
     "ServoDrive/ArmPath-v1": "099611bdd54fcb38",
-    "ServoDrive/StepperRun-v1": "5cb2e43f84e4010e",
+    "ServoDrive/StepperRun-v1": "f9e749def4b173d9",
     "ServoDrive/PayloadScheduling-v1": "d30cd507bfc0d3ee",
     "ServoDrive/KnownPayload-v1": "d64930769400297a",
     "ServoDrive/ServoTuning-v1": "0a61b10e4c9c9160",
