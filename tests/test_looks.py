@@ -99,7 +99,7 @@ def looks_of(current=NO_LIMIT, following=NO_LIMIT, *, travel=False, time_waits=T
     limits = SimpleNamespace(
         current=np.array([NO_LIMIT, current]), following=np.array([NO_LIMIT, following]), has_position=travel
     )
-    axes = SimpleNamespace(clock=5.0, now=lambda: axes.clock, epoch=0)
+    axes = SimpleNamespace(clock=5.0, now=lambda: axes.clock, epoch=0, velocity_object=VELOCITY)
     return Looks(drives, axes, SimpleNamespace(bounds=lambda: limits), lambda *seen: None), drives, axes, limits
 
 
