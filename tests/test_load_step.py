@@ -64,7 +64,7 @@ def test_dip_and_recovery_are_those_of_the_rotor_in_the_emulator(load, gains):
             angle.append(abs(machine.rotor_angle[1] - rest))
     dip = max(angle)
     away = np.flatnonzero(np.array(angle) > 0.05 * dip)[-1] + 2.0  # [ms]
-    assert found[DIP] == pytest.approx(dip / TURN, rel=0.1)
+    assert found[DIP] == pytest.approx(dip / TURN, rel=0.1, abs=2.0 / target.motor.encoder_counts)
     assert found[RECOVERY] == pytest.approx(away, rel=0.15, abs=3.0)
 
 
