@@ -252,6 +252,25 @@ def turns():
     return drives
 
 
+@pytest.mark.parametrize("word", [0x00, 0x02, 0x06, 0x07], ids=lambda word: f"{word:02X}h")
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["word first", "edge first"])
+def test_a_controlword_that_stops_wins_over_an_edge_that_enables(drives, word, order):
+    motion.enable(drives, mode="csv")
+    drives.write(cia402.TARGET_VELOCITY, "300 rpm")
+    drives.advance(0.3)
+    assert drives.machine.rotor_speed[0] == pytest.approx(300.0 * RPM, rel=0.05)
+    writes = ((cia402.CONTROLWORD, word), (0x23C8, 2))
+    for k in order:
+        drives.write(*writes[k])
+    drives.advance(1.0)
+    assert not is_on(drives)
+    drives.write(cia402.TARGET_VELOCITY, 0)
+    for control in (0, 2):
+        drives.write(0x23C8, control)
+        drives.advance(0.02)
+    assert is_on(drives), "another edge enables"
+
+
 STOPS = {
     "K-Command": lambda drives: drives.write("K-Command", 0),
     "another D-Mode": lambda drives: drives.write("D-Mode", 1),

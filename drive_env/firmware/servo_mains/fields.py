@@ -90,6 +90,7 @@ STATE = (
     Field("gate_fits", "i4", "", "1: the D-Mode fits the mode of operation"),
     Field("native_before", "i4", "", "the native image's control in the period before"),
     Field("native_wants", "i4", "", "1: it enables the axis, step by step"),
+    Field("native_fsa", "i4", "", "state of the axis at the end of the period before"),
     Field("service", "i4", "", "K-Command: 0 off, 1 it enables or leads the axis, 2 the axis stops"),
     Field("service_before", "i4", "", "K-Command in the period before"),
     Field("service_mode", "i4", "", "mode of operation that it leads the axis in"),

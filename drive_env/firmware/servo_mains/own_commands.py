@@ -3,6 +3,7 @@
 The native image's control (bit 0 clear errors, bit 1 enable the power stage) acts at its edges, as the same commands do
 of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation. Where
 csv needs D-Mode 10, that makes it 9, and the image's set-points are speeds as long as its control enables.
+A controlword that stops an axis wins over an edge that enables it in the same period; another edge enables it then.
 
 K-Command (bits 1 and 0 are 01: enable; bit 3: clear errors) is that of the maker's service program. It acts while the
 master is disconnected or has no mode (6060h is 0), in the modes of the D-Mode: K-I, K-V or K-P_Angle and K-P_Revol are
@@ -59,11 +60,21 @@ def native_mode(drive, lane):
 
 
 @stage
+def is_stopped(drive, lane):
+    """Return whether a command took the axis down a state, or into a quick stop, since the period before."""
+    before, now = drive.native_fsa[lane], drive.fsa[lane]
+    return fsa.DISABLED < before <= fsa.ENABLED and (now < before or now > fsa.ENABLED)
+
+
+@stage
 def obey_native_control(drive, lane, dt):
     """Act on the edges of the native image's control."""
     control = int(drive.native_control[lane]) & (CLEAR | ENABLE)
     before = drive.native_before[lane]
     drive.native_before[lane] = control
+    if is_stopped(drive, lane):
+        drive.native_wants[lane] = 0
+        before |= ENABLE & control
     if control & ~before & CLEAR:
         clear_errors(drive, lane)
     if control & ~before & ENABLE:
@@ -82,6 +93,7 @@ def obey_native_control(drive, lane, dt):
     failed = drive.fsa[lane] == fsa.FAULTED or drive.fsa[lane] == fsa.REACTING or drive.disconnected[lane] == 1
     if drive.native_wants[lane] == 1 and (failed or step_up(drive, lane)):
         drive.native_wants[lane] = 0
+    drive.native_fsa[lane] = drive.fsa[lane]
 
 
 @stage
@@ -182,6 +194,7 @@ def forget_commands(drive, lane):
     """Begin anew: no command of before acts."""
     drive.native_before[lane] = int(drive.native_control[lane]) & (CLEAR | ENABLE)
     drive.native_wants[lane] = 0
+    drive.native_fsa[lane] = drive.fsa[lane]
     drive.service_before[lane] = drive.service_command[lane]
     drive.service[lane] = 0
     drive.leads[lane] = 0
