@@ -69,7 +69,7 @@ class _Follower(NamedTuple):
 
 
 def joint_loads(load: Load, joints: Collection[str] = ()) -> list[JointLoad]:
-    """Return what drives on the joints of a load's file would turn, in the order of the file.
+    """Return inertia, torques and friction for a drive on each joint of a model, in the order of the file.
 
     The extremes are searched for over the ranges of all joints, of a hinge without one over a turn.
 

@@ -338,7 +338,7 @@ def _changes(model: mujoco.MjModel, tolerance: float, speed: float) -> bool:
 
 
 def _inertias(alone: mujoco.MjSpec, single: mujoco.MjModel) -> list[_Inertia]:
-    """Return what each body of a specification has in the model that was compiled of it, the world's first."""
+    """Return the inertia of each body of a specification in its compiled model; the world is the first."""
     arrays = single.body_mass, single.body_inertia, single.body_ipos, single.body_iquat
     return [_Inertia(*(array[body.id].copy() for array in arrays)) for body in alone.bodies]
 
@@ -364,7 +364,7 @@ def _tell(spec: mujoco.MjSpec, inertias: list[_Inertia]) -> None:
 
 
 def _copy(load: Load, shift: int, inertias: list[_Inertia]) -> mujoco.MjSpec:
-    """Return what a packed model has of a copy whose contact bits are shifted; inertias to be told, if any."""
+    """Return the specification of one copy, contact bits shifted; without `inertias` its shapes make them."""
     child = _spec(load)
     if inertias:
         _tell(child, inertias)

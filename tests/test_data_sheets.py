@@ -1,4 +1,4 @@
-"""Data sheets typed as they are printed, against figures by hand; units, contradictions, and what is none."""
+"""Data sheets typed as they are printed, against figures by hand; units, contradictions, texts that are no quantity."""
 
 from __future__ import annotations
 

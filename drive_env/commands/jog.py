@@ -264,7 +264,7 @@ def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dic
 
 
 def _is_error(message: dict[str, Any]) -> bool:
-    """Return whether an emergency tells an error; 0000h tells that there is none any more (CiA 301)."""
+    """Return whether an emergency reports an error; the code 0000h reports that all errors are gone (CiA 301)."""
     return bool(message["code"])
 
 

@@ -53,7 +53,7 @@ def limited_target(drive, lane):
 
 @stage
 def ramp_input(drive, lane):
-    """Return what the ramp leads to [rad/s], by bits 4 and 6 of the controlword."""
+    """Return the speed at which the ramp ends [rad/s], by bits 4 and 6 of the controlword."""
     bits = cia402.ENABLE_RAMP | cia402.REFERENCE_RAMP
     return limited_target(drive, lane) if drive.controlword[lane] & bits == bits else 0.0
 
