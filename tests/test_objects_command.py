@@ -70,7 +70,7 @@ def test_the_table_has_limits_with_their_object():
 
 
 @pytest.mark.parametrize(("arguments", "code", "message"), [
-    (["nosuchword"], REFUSED, "no object with 'nosuchword'; try fewer words"),
+    (["nosuchword"], REFUSED, "no object with 'nosuchword'; try another word, or fewer"),
     (["--area", "profil"], USER_ERROR, "not 'profil'; did you mean"),
     (["--device", "nosuch"], USER_ERROR, "nosuch"),
     (["--eds", "nosuch.eds"], USER_ERROR, "nosuch.eds"),

@@ -45,7 +45,8 @@ def objects(
         if not found:
             where = "" if area is None else f" in the area {area}"
             raise RuntimeError(
-                f"{known.name} has no object with {' '.join(words or ['anything'])!r}{where}; try fewer words"
+                f"{known.name} has no object with {' '.join(words or ['anything'])!r}{where}; "
+                "try another word, or fewer"
             )
         if json:
             print_json([
