@@ -248,7 +248,8 @@ class PackedLoad:
         speed = self._by_copy(self.data.qvel)
         if element in self.joints:
             dof = self.joints.index(element)
-            self.place(dof, np.full(self.copies, self.plant.spring_zero[dof]), where)
+            position[where, dof] = self.plant.spring_zero[dof]
+            speed[where, dof] = before[where, dof] = 0.0
             return
         motion = next(row.motion for row in self.load.contacts if row.name == element)
         joint = next(name for name in motion if name not in self.load.joints)

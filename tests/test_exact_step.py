@@ -241,3 +241,12 @@ def test_a_gear_passes_on_its_efficiency_of_the_work(driving, h):
     _, omega, _ = run(machine, np.full(round(0.4 / h), load_torque / 50.0 * share))
     # By then the teeth have rung out.
     assert np.abs(omega[round(0.3 / h) :] / (sign * speed) - 1.0).max() < 3e-4
+
+
+def test_a_coupling_that_is_mended_moves_no_rotor():
+    """The load comes to where the rotor is; correcting the twist before as one at rest made the rotor leap."""
+    machine = machine_of(LOADS["two_mass"], H)
+    machine.data.qpos[:] = np.array([0.3, 2.0])
+    machine.data.qvel[:] = np.array([50.0, 80.0])
+    machine.mend("stiffness", np.ones(1, bool))
+    assert machine.data.qpos.tolist() == [0.3, 0.0] and machine.data.qvel.tolist() == [50.0, 0.0]

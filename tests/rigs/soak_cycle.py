@@ -58,6 +58,8 @@ def run_cycle(records, plant, rates, scratch, num_axes, sums, change):
                     mean_u = 0.5 * (before[lane] + u_end)
                     sums[BRIDGE, axis] += drive.bridge_power[lane] * dt
                     sums[COPPER, axis] += drive.phase_factor[lane] * drive.R_s[lane] * square * dt
+                    in_stage = (2.0 if drive.is_dc[lane] > 0.5 else 1.5) * drive.on_resistance[lane]
+                    sums[COPPER, axis] += in_stage * square * dt
                     sums[SOURCE, axis] += (drive.supply_voltage[lane] - R * fed) * fed * dt
                     sums[CHOPPER, axis] += (
                         drive.chopper[lane] * before[lane] / drive.chopper_resistance[lane] * mean_u * dt
