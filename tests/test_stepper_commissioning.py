@@ -290,7 +290,10 @@ def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
         assert all("teeth before the stall" in text for text in own)
         assert figures.keys() == seen.keys()
         numbers = [name for name, value in figures.items() if value is not None and name not in loaded]
-        assert [seen[name] for name in numbers] == pytest.approx([figures[name] for name in numbers], rel=1e-3)
+        place = 4e-3 * figures["dry friction [N m]"]  # what the teeth hold of a rotor that begins elsewhere
+        for name in numbers:
+            torque = place if name.endswith("[N m]") else 0.0
+            assert seen[name] == pytest.approx(figures[name], rel=1e-3, abs=torque), name
         assert [figures[name] for name in loaded[1:]] == [0.15, 0.03]
         assert (
             all(seen[name] is None for name in loaded)
