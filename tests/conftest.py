@@ -29,8 +29,11 @@ if hasattr(signal, "SIGHUP"):
 def pytest_collection_modifyitems(config, items):
     """Of the rows of a test that is marked `every(n)` and are not slow each n-th is in each run; the others are slow.
 
-    SLOW_STRIDE and SLOW_SHARE leave out slow rows and slow tests: see rigs/thinning.py.
+    SLOW_STRIDE and SLOW_SHARE leave out slow rows and slow tests: see rigs/thinning.py. With --last-failed none is left
+    out: tests that failed stand alone here, and no row is the n-th of all.
     """
+    if config.getoption("lf", False):
+        return
     from rigs.thinning import EACH, FIRST, STRIDE
 
     rows, slow, numbers, left_out = Counter(), Counter(), {}, []
