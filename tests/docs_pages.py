@@ -28,19 +28,16 @@ import tempfile
 import termios
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-DOCS = ROOT / "docs"
-SHELL = ("bash", "sh", "console", "")
+MACHINERY = Path(__file__).resolve().parent.parent / "docs" / "machinery"
+sys.path.append(str(MACHINERY))
+from page_blocks import ROOT, Block, blocks  # noqa: E402
+
 PORT = 29636  # that of `drive-env serve`
 PATIENCE, SERVED = 900.0, 120.0  # s, of one command; until a drive is served
 END = "@@ended@@"
 
-FENCE = re.compile(r"^(?P<indent> *)```(?P<info>[^`\n]*)\n(?P<text>.*?)^(?P=indent)``` *$", re.M | re.S)
-MARK = re.compile(r"<!--\s*(?P<key>not run|exits|exact)\s*(?::\s*(?P<value>(?:(?!-->).)*?))?\s*-->\s*\Z", re.S)
-SNIPPET = re.compile(r'^-+8<-+ "(?P<path>[^"]+)" *$', re.M)
 SERVES = re.compile(r"^\s*drive-env serve\b(?!.*(--help|--duration))")
 # What comes and goes: bars, and the kernels' first compilation.
 PASSING = re.compile(r"━━|compiling the kernels|^\s*$")
@@ -61,72 +58,6 @@ while True:
     sys.stderr.flush()
     print("%s", code, flush=True)
 """ % (END,)  # noqa: UP031  # braces are the program's
-
-
-@dataclass(frozen=True)
-class Block:
-    """A fenced block of a page."""
-
-    language: str
-    title: str
-    text: str  # without its indentation, snippets put in
-    marks: dict[str, str]
-    line: int
-    start: int  # of its text in the page
-    end: int
-    indent: str
-    only_script: str = ""  # the script of `examples/` that it is nothing but
-
-    def commands(self) -> list[str]:
-        """Return the commands of a block of the shell, each as it is typed."""
-        lines = self.text.splitlines()
-        if self.language == "console":
-            lines = [line[2:] for line in lines if line.startswith(("$ ", "> "))]
-        found: list[str] = []
-        held: list[str] = []
-        until = ""
-        for line in lines:
-            held.append(line)
-            if until:
-                if line.strip() != until:
-                    continue
-                until = ""
-            elif here := re.search(r"<<-?\s*['\"]?(\w+)", line):
-                until = here.group(1)
-                continue
-            elif line.rstrip().endswith("\\"):
-                continue
-            command = "\n".join(held)
-            held = []
-            if command.strip() and not command.strip().startswith("#"):
-                found.append(command)
-        return found
-
-
-def blocks(page: Path) -> list[Block]:
-    """Return the blocks of a page in their order."""
-    whole = page.read_text(encoding="utf-8")
-    found = []
-    for match in FENCE.finditer(whole):
-        info = match["info"].strip()
-        language = re.match(r"[\w+-]*", info).group(0)
-        title = re.search(r'title="([^"]+)"', info)
-        text = re.sub(rf"^{match['indent']}", "", match["text"], flags=re.M)
-        scripts = SNIPPET.findall(text)
-        only = scripts[0] if scripts and not SNIPPET.sub("", text).strip() else ""
-        text = SNIPPET.sub(lambda snippet: (ROOT / snippet["path"]).read_text(encoding="utf-8"), text)
-        marks, before = {}, whole[: match.start()]
-        while mark := MARK.search(before):
-            marks[mark["key"]] = mark["value"] or ""
-            before = before[: mark.start()]
-        found.append(Block(language, title[1] if title else "", text, marks, whole.count("\n", 0, match.start()) + 1,
-                           match.start("text"), match.end("text"), match["indent"], only))  # fmt: skip
-    return found
-
-
-def pages() -> list[Path]:
-    """Return README and the pages of the site, without decisions, which nobody follows at a keyboard."""
-    return [ROOT / "README.md", *sorted(page for page in DOCS.rglob("*.md") if "decisions" not in page.parts)]
 
 
 def environment() -> dict[str, str]:
@@ -324,7 +255,7 @@ def follow(page: Path, folder: Path, write: bool = False) -> list[tuple[Block, s
                 printed = None
             elif block.only_script:
                 printed = None  # run by a command of this page: test_docs.py
-            elif block.title or block.language == "python" or block.language in SHELL:
+            elif block.title or block.is_done:
                 printed = reader.follow(block)
             elif block.language == "text" and printed is not None:
                 whole = not re.search(r"^(\.\.\.|…)$", block.text, re.M)

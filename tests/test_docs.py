@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from docs_pages import DOCS, ROOT, SHELL, SNIPPET, Block, blocks, compare, follow, pages, port_is_free
+from docs_pages import compare, follow, port_is_free
+from page_blocks import DOCS, ROOT, SHELL, SNIPPET, Block, blocks, pages, where_tested
 from rigs.tables import every_row
 
 PROGRAMS = {"drive-env": "drive_env.commands.cli", "drive-tune": "tuning.commands.cli",
@@ -37,12 +38,7 @@ def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-def is_done(block: Block) -> bool:
-    """Return whether a reader would do something with a block."""
-    return block.language == "python" or block.language in SHELL
-
-
-PAGES = [page for page in pages() if any(is_done(block) for block in blocks(page))]
+PAGES = [page for page in pages() if any(block.is_done for block in blocks(page))]
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 WRITTEN_HERE = [*HOW_TO, *sorted((DOCS / "tutorials").glob("*.md"))]
 
@@ -89,6 +85,16 @@ def test_a_recipe_can_be_followed(recipe, tmp_path):
 
 def test_quick_pages_are_there():
     assert {name(page) for page in PAGES} >= QUICK
+
+
+def test_a_page_says_below_it_which_of_its_blocks_are_run(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("```bash\ntrue\n```\n<!-- not run: needs root -->\n```bash\ntrue\n```\n```text\n1\n```\n")
+    assert "1 of its 2 blocks" in where_tested(page) and "(not run: needs root)" in where_tested(page)
+    page.write_text("```python\n1\n```\n")
+    assert "run all its blocks" in where_tested(page) and "not run" not in where_tested(page)
+    page.write_text("```toml\na = 1\n```\n")
+    assert where_tested(page) == ""
 
 
 def test_what_is_not_run_says_why():

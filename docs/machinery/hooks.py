@@ -17,8 +17,10 @@ import distribution_pages
 import environment_pages
 import load_pages
 import motor_pages
+import page_blocks
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 import drive_env.faults.page
 
@@ -90,3 +92,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     if faults.read_text(encoding="utf-8") != drive_env.faults.page.page():
         raise ValueError(f"{faults} is out of date; write it anew with python -m drive_env.faults.page {faults}")
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Add below a page that is written by hand where its commands and programs were tested."""
+    written = Path(config.docs_dir) / page.file.src_uri
+    tested = page_blocks.where_tested(written) if written in page_blocks.pages() else ""
+    return f"{markdown}\n\n{tested}\n" if tested else markdown
