@@ -230,6 +230,10 @@ def test_a_text_is_read_in_segments(wire, facts):
     wire.play(f"""
         rx 605  40 {where} 00 00 00 00
         tx 585  41 {where} {len(letters):02X} 00 00 00
+        rx 605  70 00 00 00 00 00 00 00   # the first has toggle 0
+        tx 585  80 {where} 00 00 03 05
+        rx 605  40 {where} 00 00 00 00
+        tx 585  41 {where} {len(letters):02X} 00 00 00
         rx 605  60 00 00 00 00 00 00 00
         tx 585  00 {first}
         rx 605  60 00 00 00 00 00 00 00   # the same toggle again
@@ -280,6 +284,7 @@ def test_a_transfer_is_replaced_given_up_and_ended_by_stopped(wire, facts):
         wait 1 ms
         tx 585  80 {where} 00 00 04 05    # the client was silent for a second
         rx 606  40 {status} 00 00 00 00   # another node's
+        rx 585  40 {status} 00 00 00 00
         rx 605  40 {status[:8]}           # no request: it is too short
         rx 605  RTR
     """)
