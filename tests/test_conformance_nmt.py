@@ -262,6 +262,9 @@ def test_node_guarding_alternates_and_shows_the_state(wire, facts):
         rx 000  02 05
         rx 705  RTR
         tx 705  84
+        rx 000  80 05
+        rx 705  RTR
+        tx 705  7F
         rx 000  82 05                     # reset communication: toggle 0 again
         tx 705  00
         rx 705  RTR
