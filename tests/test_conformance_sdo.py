@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+
 import pytest
 from rigs.can_devices import (
     DEVICES,
@@ -126,6 +129,26 @@ def test_what_the_documents_say_is_refused_is_refused_whatever_is_written(wire, 
             assert write(wire, facts, entry.index, facts.default(*entry.key), entry.sub) == 0x0800_0020, entry.label
 
 
+# --- the file ---------------------------------------------------------------------------------------------------------
+@EACH_DEVICE
+def test_the_file_is_ascii_and_lists_its_objects_in_the_right_place(facts):
+    assert facts.path.read_bytes().isascii()
+    eds = facts.eds
+    indices = [int(name, 16) for name in eds.sections() if re.fullmatch("[0-9A-F]{4}", name)]
+    subs = Counter(name[:4] for name in eds.sections() if name[4:7] == "sub")
+    listed = {}
+    for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
+        count = int(eds[group]["SupportedObjects"])
+        assert list(eds[group]) == ["supportedobjects", *map(str, range(1, count + 1))]
+        listed[group] = [int(eds[group][str(k)], 16) for k in range(1, count + 1)]
+    assert listed["MandatoryObjects"] == [0x1000, 0x1001, 0x1018]
+    assert listed["ManufacturerObjects"] == [index for index in sorted(indices) if 0x2000 <= index < 0x6000]
+    assert sorted(index for group in listed.values() for index in group) == sorted(indices)
+    for index in indices:
+        if "SubNumber" in eds[f"{index:04X}"]:
+            assert int(eds[f"{index:04X}"]["SubNumber"], 16) == subs[f"{index:04X}"]
+
+
 # --- axes -------------------------------------------------------------------------------------------------------------
 @EACH_AXIS
 def test_a_write_reaches_its_axis_alone(wire, facts, axis):
@@ -144,18 +167,21 @@ def test_a_write_reaches_its_axis_alone(wire, facts, axis):
 
 @pytest.mark.parametrize("facts", [facts for facts in DEVICES if len(facts.axes) > 1], ids=repr)
 def test_every_parameter_of_an_axis_is_its_own(wire, facts):
-    """Of axis 0 each is changed; those of the others stay, but for what the manual says they share."""
+    """Each is changed on the first and on the last axis; others stay, but for what the manual says they share."""
     for first, last, step in facts.manual.areas:
         for entry in [e for e in facts.entries.values() if first <= e.index <= last and facts.axis_of(e.index) == 0]:
             if not entry.is_written or entry.bits is None or entry.index in facts.manual.shared:
                 continue
             places = [(entry.index + step * axis, entry.sub) for axis in facts.axes]
             assert all(facts.has(*place) for place in places), entry.label
-            before = [read(wire, facts, *place) for place in places]
-            if another(wire, facts, entry, before[0]) is None:
-                continue  # a command, or it takes the value alone that it has
-            after = [read(wire, facts, *place) for place in places]
-            assert after[1:] == before[1:], entry.label
+            for axis in (facts.axes[0], facts.axes[-1]):
+                before = [read(wire, facts, *place) for place in places]
+                raw = another(wire, facts, facts.entries[places[axis]], before[axis])
+                if raw is None:
+                    continue  # a command, or it takes the value alone that it has
+                after = [read(wire, facts, *place) for place in places]
+                del before[axis], after[axis]
+                assert after == before, facts.entries[places[axis]].label
 
 
 @EACH_DEVICE
