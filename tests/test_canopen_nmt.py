@@ -74,29 +74,6 @@ def test_what_lives_in_which_state(wire):
     """)
 
 
-def test_operation_enabled_goes_to_fault_when_stopped(wire):
-    wire.enable()
-    wire.start()
-    wire.play("""
-        rx 000  02 05
-        wait 20 ms
-        rx 000  80 05
-        tx 085  00 81 11 00 FF 00 00 00   # what an emergency could not tell in stopped
-    """)
-    assert wire.value(0x6041) & 0x4F == 0x08, "fault"
-    wire.play("""
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 11 00 00 00   # generic and communication error
-        rx 605  2B 40 60 00 80 00 00 00   # the cause is gone: it can be reset
-        tx 585  60 40 60 00 00 00 00 00
-        wait 1 ms
-        tx 085  00 00 00 00 00 00 00 00
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 00 00 00 00
-    """)
-    assert wire.value(0x6041) & 0x4F == 0x40
-
-
 def test_a_moving_axis_brakes_on_the_quick_stop_ramp_when_stopped(wire):
     wire.enable()
     assert wire.download(0x6085, 0, 2_000_000, 4) == 0
@@ -110,26 +87,6 @@ def test_a_moving_axis_brakes_on_the_quick_stop_ramp_when_stopped(wire):
     wire.wait(300)
     assert wire.node._axes[0].state == fsa.State.FAULT
     assert abs(wire.drives.read(0x606C)[0]) < 20_000
-
-
-def test_reset_node_restores_everything(wire):
-    wire.enable()
-    assert wire.download(0x6081, 0, 4711, 4) == 0
-    assert wire.download(0x1017, 0, 4000, 2) == 0
-    assert wire.download(0x2705, 0, 9, 1) == 0
-    wire.take()
-    wire.play("""
-        rx 000  81 05
-        tx 705  00
-        wait 10 ms
-        rx 605  40 17 10 00 00 00 00 00
-        tx 585  4B 17 10 00 00 00 00 00
-        rx 605  40 05 27 00 00 00 00 00   # it was not stored
-        tx 585  4F 05 27 00 05 00 00 00
-        rx 605  40 41 60 00 00 00 00 00
-        tx 585  4B 41 60 00 50 02 00 00
-    """)
-    assert wire.value(0x6081) == wire.drives.inside.objects.stored(0)[0x6081, 0] != 4711
 
 
 def test_reset_communication_restores_1000h_to_1fffh_alone(wire):

@@ -119,6 +119,12 @@ def test_stopped_takes_the_enabled_axis_to_fault_and_no_other(wire, facts, axis)
     assert states(wire, facts) == others(facts, axis, FAULT, SWITCH_ON_DISABLED)
     frames = wire.receive(0, "80 05")
     assert [without_register(frame) for frame in frames] == facts.told_of("stopped", [axis]), "once it may be told"
+    assert read(wire, facts, 0x1001) & 0x11 == 0x11, "generic error, and communication"
+    assert write(wire, facts, CONTROLWORD + PROFILE * axis, 0x80) == 0, "the cause is gone: it can be reset"
+    wire.wait(1)
+    assert any(frame.data[:3] == bytes(3) for frame in wire.take()), "no error any more"
+    assert states(wire, facts) == [SWITCH_ON_DISABLED] * len(facts.axes)
+    assert read(wire, facts, 0x1001) == 0
 
 
 @EACH_AXIS
