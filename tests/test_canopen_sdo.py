@@ -319,27 +319,6 @@ def test_a_segment_of_the_other_direction_ends_the_transfer(wire):
     """)
 
 
-@pytest.mark.parametrize(
-    "request_",
-    [
-        "A0 08 10 00 7F 00 00 00",  # block upload
-        "A4 08 10 00 7F 00 00 00",
-        "C2 81 60 00 04 00 00 00",  # block download
-        "C6 81 60 00 04 00 00 00",
-        "E0 81 60 00 00 00 00 00",  # no such specifier
-    ],
-)
-def test_block_transfer_is_refused(wire, request_):
-    wire.play(f"""
-        rx 605  40 08 10 00 00 00 00 00
-        tx 585  41 08 10 00 09 00 00 00
-        rx 605  {request_}
-        tx 585  80 {request_[3:11]} 01 00 04 05
-        rx 605  60 00 00 00 00 00 00 00   # what was open is no more
-        tx 585  80 00 00 00 01 00 04 05
-    """)
-
-
 @pytest.mark.parametrize("segment", ["00 01 02 03 04 05 06 07", "60 00 00 00 00 00 00 00"])
 def test_a_segment_out_of_nowhere(wire, segment):
     wire.play(f"rx 605  {segment}\ntx 585  80 00 00 00 01 00 04 05")

@@ -283,7 +283,14 @@ def test_a_text_is_read_in_segments(wire, facts):
 def test_a_block_transfer_is_refused(wire, facts, specifier):
     """None of the manuals has it."""
     where = request(PROFILE_VELOCITY, 0)
-    wire.play(f"rx 605  {specifier} {where} 04 00 00 00\ntx 585  80 {where} 01 00 04 05")
+    wire.play(f"""
+        rx 605  21 {where} 04 00 00 00
+        tx 585  60 {where} 00 00 00 00
+        rx 605  {specifier} {where} 04 00 00 00
+        tx 585  80 {where} 01 00 04 05
+        rx 605  07 01 00 00 00 00 00 00   # what was open is no more
+        tx 585  80 00 00 00 01 00 04 05
+    """)
 
 
 @EACH_DEVICE
