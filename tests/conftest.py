@@ -89,6 +89,22 @@ def emulated():
         drives.close()
 
 
+@pytest.fixture(scope="module")
+def drives():
+    """One commissioned drive on a rigid inertia, for a module's tests."""
+    with EmulatedDrives(load="inertia", num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    """Node 5 of a module's drives, freshly reset and pre-operational."""
+    from rigs.canopen_wire import Wire
+
+    drives.machine.reset()
+    return Wire(drives)
+
+
 @pytest.fixture
 def axis():
     """One commissioned drive on a rigid inertia, in switch on disabled."""

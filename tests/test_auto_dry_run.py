@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from rigs.auto_stages import run_agent
 from rigs.ethercat_segment import EmulatedSegment
 from typer.testing import CliRunner
 
 from agents.policies.policy import load_policy
 from agents.shipped import shipped
-from agents.tuner.tuning_run import run
 from drive_env import EmulatedDrives, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -115,7 +115,7 @@ def test_a_run_writes_nothing_that_was_not_told(tmp_path, monkeypatch):
     ):
         told = {row.key for row in rehearse(target).writes}
         assert not written
-        run(target, policy, tmp_path / "before.toml", name="gain_tuning")
+        run_agent(target, policy, tmp_path / "before.toml", name="gain_tuning")
     assert written <= told
     mapping = {key for key in told if 0x1600 <= key[0] < 0x1B00}  # entries that this run's PDOs do not have
     assert told - written - mapping - AFTER_A_TRIP - WIRED_OTHERWISE == IN_REAL_TIME

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import canopen
 import pytest
-from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
@@ -26,12 +25,6 @@ LONGEST = 4096
 def drives():
     with EmulatedDrives(DEVICE, load="inertia", num_threads=1) as made:
         yield made
-
-
-@pytest.fixture
-def wire(drives):
-    drives.machine.reset()
-    return Wire(drives)
 
 
 def written(wire, text, index=DATA):

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 
-import can
 import numpy as np
 import pytest
 from rigs.scripted_drive import ScriptedBus, ScriptedDrive
@@ -21,9 +20,8 @@ from drive_env.devices import find_device
 from drive_env.dictionary import quantities
 from drive_env.fieldbus.description import describe
 from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.can.mapping import Slots, pack
+from drive_env.master.can.mapping import Slots
 from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, slots
-from drive_env.master.packing import integers
 
 EDS = find_device("tmcm1636").eds.read_text(encoding="utf-8")
 
@@ -116,13 +114,6 @@ def test_a_silent_node_is_named_with_what_to_try_and_soon(drives, drive, bus):
     assert transcript(bus) == [request, abort, request, abort]
 
 
-def test_a_write_is_not_repeated(drives, drive, bus):
-    drive.silent.add((0x6040, 0))
-    with pytest.raises(NoAnswerError, match="the write of 15 to 6040h:00 Controlword"):
-        drives.write(0x6040, 15)
-    assert transcript(bus).count("601  2B 40 60 00 0F 00 00 00") == 1
-
-
 def test_an_object_may_have_its_own_patience(bus, drive):
     drive.silent.add((0x6064, 0))
     with CanDrives(bus=bus, pace="lockstep", safety=False, timeout=0.02, timeouts={0x6064: 0.15}) as drives:
@@ -132,53 +123,10 @@ def test_an_object_may_have_its_own_patience(bus, drive):
         assert time.monotonic() - before >= 0.3
 
 
-def test_an_answer_that_came_too_late_is_not_taken_for_the_next(drives, drive, bus):
-    drive.set(0x6064, 7)
-    drive.silent.add((0x6064, 0))
-    with pytest.raises(NoAnswerError):
-        drives.read(0x6064)
-    drive.silent.clear()
-    bus.push(0x581, bytes.fromhex("43 64 60 00 01 02 03 04"))  # the late one
-    assert drives.read(0x6064) == [7]
-
-
-def test_an_answer_about_another_object_is_passed_over(drives, bus, monkeypatch):
-    truly = bus.send
-
-    def with_a_stray_answer(message, timeout=None):
-        bus.push(0x581, bytes.fromhex("43 FF 60 00 09 09 09 09"))
-        bus.push(0x581, bytes.fromhex("80 FF 60 00 00 00 02 06"))
-        bus.push(0x581, bytes.fromhex("43 41 60"))  # no SDO: three bytes
-        truly(message, timeout)
-
-    monkeypatch.setattr(bus, "send", with_a_stray_answer)
-    assert drives.read(0x6041) == [0x0240]
-
-
 def test_flooded_with_foreign_frames_it_still_answers(drives, bus):
     for k in range(3000):
         bus.push(0x100 + k % 0x70, b"\x01")
     assert drives.read(0x6041) == [0x0240]
-
-
-def test_a_node_that_was_stopped_is_woken(drive, caplog):
-    class Stopped(ScriptedDrive):
-        awake = False
-
-        def receive(self, can_id, data, remote):
-            if can_id == 0 and data == bytes((0x80, 1)):
-                self.awake = True
-            return super().receive(can_id, data, remote) if self.awake else []
-
-    with ScriptedBus(Stopped()) as bus, CanDrives(bus=bus, pace="lockstep", timeout=0.02) as drives:
-        assert drives.read(0x6041) == [0x0240]
-    assert "node 1 was stopped" in caplog.text
-
-
-def test_another_device_is_told(drive, bus):
-    drive.values[0x1018, 2] = (0x1234, 4)
-    with pytest.raises(BusError, match=r"node 1 is not a tmcm1636: its product .* is 1234h, and the EDS says 664h"):
-        CanDrives(bus=bus, pace="lockstep")
 
 
 def test_where_selects_axes_and_a_wrong_mask_is_told():
@@ -220,24 +168,6 @@ def test_a_tpdo_is_remapped_off_empty_filled_counted_on(drives, bus):
     ]
 
 
-def test_tpdos_that_nobody_asked_for_are_silent_until_the_drives_are_closed(bus, drive):
-    """TPDO 3 and 4 of the factory go with SYNC; the third is needed now and then, and silent again afterwards."""
-    before = {key: drive.values[key] for key in drive.values if 0x1800 <= key[0] < 0x1C00}
-    sent, sync = [], drive._sync
-
-    def listening():
-        frames = sync()
-        sent.append([can_id for can_id, _ in frames])
-        return frames
-
-    drive._sync = listening
-    with CanDrives(bus=bus, pace="lockstep", safety=False) as drives:
-        for objects in ([0x6041], [0x6064, 0x606C, 0x6062, 0x6041, 0x6077, 0x6061], [0x6041, 0x6040], [0x6041]):
-            drives.record(objects, 0.001)
-    assert sent == [[0x181], [0x181, 0x281, 0x381], [0x181], [0x181]]
-    assert {key: drive.values[key] for key in before} == before
-
-
 def test_set_points_go_out_before_their_sync(drives, bus, drive):
     drive.motion = lambda d: d.set(0x6064, d.get(0x6064) + d.get(0x60FF))
     drives.record([0x6064], 0.001, play={0x60FF: [0]})
@@ -248,30 +178,6 @@ def test_set_points_go_out_before_their_sync(drives, bus, drive):
     ]  # fmt: skip
     assert trace[0x6064][:, 0].tolist() == [0, 1, -1]  # row k is sampled at SYNC k, before the cycle
     assert trace.t.tolist() == [0.0, 0.001, 0.002]
-
-
-def test_each_axis_plays_its_own_column_and_is_sampled_in_its_own():
-    nodes = [ScriptedDrive(node) for node in (1, 2)]
-    for node in nodes:
-        node.motion = lambda d: d.set(0x6064, d.get(0x60FF))
-    with ScriptedBus(*nodes) as bus, CanDrives(bus=bus, nodes=(1, 2), pace="lockstep", safety=False) as drives:
-        trace = drives.record([0x6064, 0x60FF], 0.003, play={0x60FF: [[1, -1], [2, -2], [3, -3]]})
-    assert trace[0x60FF].tolist() == [[1, -1], [2, -2], [3, -3]]
-    assert trace[0x6064].tolist() == [[0, 0], [1, -1], [2, -2]]
-
-
-def test_a_longer_period_takes_every_nth_row(drives, drive):
-    drive.motion = lambda d: d.set(0x6064, d.get(0x6064) + 1)
-    trace = drives.record([0x6064], 0.007, period=0.003)
-    assert trace[0x6064][:, 0].tolist() == [0, 3, 6]
-    assert trace.t == pytest.approx([0.0, 0.003, 0.006])
-
-
-def test_the_same_objects_again_cost_no_configuration(drives, bus):
-    drives.record([0x6041, 0x6064], 0.002)
-    bus.log.clear()
-    drives.record([0x6064], 0.002)
-    assert transcript(bus) == ["080", "080"]
 
 
 def test_pdos_are_as_before_when_closed(drive, bus):
@@ -333,36 +239,6 @@ def test_a_refused_mapping_is_told(drives, drive):
         drives.record([0x6064], 0.001)
 
 
-def entry(bits):
-    from drive_env.dictionary.entries import Entry
-
-    return Entry(0x6000 + bits, 0, f"{bits} bits", bits, "rw", None, None, 0, "", True)
-
-
-@pytest.mark.parametrize(
-    ("widths", "fits"),
-    [
-        ([32, 32, 32, 32, 32, 32, 32, 32], True),
-        ([32] * 9, False),
-        ([32] * 4 + [16] * 8, True),  # one wide and two narrow in each: filling up in turn would not do
-        ([16] * 12, True),
-        ([8] * 13, False),  # three objects in a PDO, however narrow
-        ([], True),
-    ],
-)
-def test_packing_finds_room_where_there_is_some(widths, fits):
-    found = pack([entry(width) for width in widths], Slots((0, 1, 2, 3), 3), keep_order=False)
-    assert (found is not None) == fits
-    if found:
-        assert sorted(e.bits for pdo in found for e in pdo) == sorted(widths)
-        assert all(len(pdo) <= 3 and sum(e.bits for e in pdo) <= 64 for pdo in found)
-
-
-def test_packing_keeps_the_order_where_it_can():
-    entries = [entry(16), entry(32), entry(32), entry(8)]
-    assert pack(entries, Slots((0, 1), 3), keep_order=True) == [entries[:2], entries[2:]]
-
-
 # --- network ------------------------------------------------------------------------------------------------------
 def test_emergencies_come_with_axis_code_register_and_name():
     nodes = [ScriptedDrive(node) for node in (5, 4)]
@@ -379,13 +255,6 @@ def test_emergencies_come_with_axis_code_register_and_name():
         assert drives.emergencies() == []
 
 
-def test_emergencies_are_taken_from_where_1014h_says(drive, bus):
-    drive.values[0x1014, 0] = (0x0A5, 4)
-    with CanDrives(bus=bus, pace="lockstep") as drives:
-        bus.push(0x0A5, bytes.fromhex("11 86 21 00 00 00 00 00"))
-        assert [message.code for message in drives.emergencies()] == [0x8611]
-
-
 def test_a_reset_waits_for_the_boot_up_and_a_missing_one_is_told(drives, drive, bus, monkeypatch):
     drives.reset_node()
     assert transcript(bus) == ["000  81 01"]
@@ -393,31 +262,6 @@ def test_a_reset_waits_for_the_boot_up_and_a_missing_one_is_told(drives, drive, 
     monkeypatch.setattr(drive, "receive", lambda *_: [])
     with pytest.raises(NoAnswerError, match=r"node 1 sent no boot-up message \(700h \+ node\)"):
         drives.reset_node()
-
-
-def boots_at_the_next_request(drive, monkeypatch):
-    """Have the drive boot in place of its next answer."""
-    answer, is_up = drive.receive, []
-
-    def receive(can_id, data, *rest):
-        if can_id != 0x601 or is_up:
-            return answer(can_id, data, *rest)
-        is_up.append(True)
-        return [(0x701, b"\0")]
-
-    monkeypatch.setattr(drive, "receive", receive)
-
-
-def test_a_node_that_boots_has_forgotten_the_transfer(drive, bus, monkeypatch):
-    """It is not waited for: a read is asked once more, a write is told."""
-    with CanDrives(bus=bus, pace="lockstep", safety=False, timeout=3600.0) as drives:
-        bus.log.clear()
-        boots_at_the_next_request(drive, monkeypatch)
-        assert drives.read(0x60FF) == [0]
-        assert transcript(bus).count("601  40 FF 60 00 00 00 00 00") == 2
-        boots_at_the_next_request(drive, monkeypatch)
-        with pytest.raises(NoAnswerError, match="node 1 has restarted during the write of 7 to 60FFh"):
-            drives.write(0x60FF, 7)
 
 
 def test_closed_drives_say_so(bus):
@@ -476,32 +320,6 @@ def test_a_late_program_keeps_the_time_of_advance_and_the_rows_of_record(drive, 
         assert drive.syncs == 10
         assert drives.timing.late >= 8
         assert drives.timing.worst > 0.003
-
-
-def test_a_frame_is_read_in_pieces_and_several_at_once():
-    import socket
-
-    from drive_env.master.can.slcan_socket import SlcanSocket
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        bus = SlcanSocket(f"socket://127.0.0.1:{server.getsockname()[1]}", bitrate=500_000)
-        peer, _ = server.accept()
-        with peer:
-            assert peer.recv(100) == b"C\rS6\rO\r"
-            peer.sendall(b"\r\at1812")
-            assert bus.recv(0.05) is None
-            peer.sendall(b"4002\rr7011\rT000001232ABCD\rtXYZ\rt0801")
-            frames = [bus.recv(0.5) for _ in range(3)]
-            assert [(f.arbitration_id, bytes(f.data), f.is_remote_frame, f.is_extended_id) for f in frames] == [
-                (0x181, b"\x40\x02", False, False), (0x701, b"", True, False), (0x123, b"\xab\xcd", False, True),
-            ]  # fmt: skip
-            assert bus.recv(0.01) is None
-            bus.send(can.Message(arbitration_id=0x601, data=b"\x40\x41", is_extended_id=False))
-            bus.send(can.Message(arbitration_id=0x701, is_remote_frame=True, dlc=1, is_extended_id=False))
-            assert peer.recv(100) == b"t60124041\rr7011\r"
-        with pytest.raises(can.CanError, match="closed the connection"):
-            bus.recv(0.5)
-        bus.shutdown()
 
 
 # --- other devices ------------------------------------------------------------------------------------------------
@@ -574,14 +392,6 @@ def test_integers_of_every_width_of_cia_301(tmp_path, drive, bus):
         assert drives.read(0x2F02).tolist() == [-2]
         with pytest.raises(ObjectAccessError, match="its highest is 8388607"):
             drives.write(0x2F02, 2**23)
-
-
-@pytest.mark.parametrize("size", range(1, 9))
-@pytest.mark.parametrize("signed", [True, False])
-def test_rows_of_bytes_become_integers(size, signed):
-    raw = [b"\x01" + bytes(size - 1), bytes(size - 1) + b"\x80", b"\xff" * size]
-    found = integers(np.frombuffer(b"".join(raw), np.uint8).reshape(3, size), signed)
-    assert found.tolist() == [int.from_bytes(row, "little", signed=signed) for row in raw]
 
 
 @pytest.mark.parametrize(
@@ -659,27 +469,6 @@ def test_quantities_become_integers_and_are_shown_back(name, text, raw):
     assert quantities.parse(text, found, 65536.0) == raw
     again = quantities.show(raw, found, 65536.0).split("(")[0].strip()
     assert quantities.parse(again, found, 65536.0) == raw
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        (0x6081, "fast", "is not a number for 6081h:00 Profile velocity"),
-        (0x6081, "3 A", "it takes pps, rev/s, rpm, rad/s, deg/s"),
-        (0x6081, "1.5", "takes integers in pps; 1.5 is not one, choose 2"),
-        ((0x2042, 1), "3 rpm", "has no unit that rpm could be turned into"),
-    ],
-)
-def test_what_is_no_quantity_of_the_object_is_told(name, text, message):
-    with pytest.raises(ValueError, match=re.escape(message)):
-        quantities.parse(text, KNOWN.find(name), 65536.0)
-
-
-@pytest.mark.parametrize("one", ["Statusword", 0x6041])
-def test_one_object_may_be_recorded_by_its_name_alone(drives, one):
-    trace = drives.record(one, 0.002)
-    assert trace["Statusword"].shape == (2, 1)
-    assert (trace[0x6041] == drives.read(0x6041)).all()
 
 
 def test_importing_the_package_imports_no_bus():

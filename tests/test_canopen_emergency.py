@@ -8,18 +8,11 @@ from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.emergency import QUEUE
-from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import NmtState
 from drive_env.devices import find_device
 from drive_env.firmware.common import fsa
 from drive_env.firmware.servo.causes import CAUSES
 from drive_env.node.error_history import CONDITIONS
-
-
-@pytest.fixture(scope="module")
-def drives():
-    with EmulatedDrives(load="inertia", num_threads=1) as made:
-        yield made
 
 
 @pytest.fixture
@@ -32,25 +25,6 @@ def wire(drives):
 
 def test_every_cause_and_condition_has_a_row_in_the_device():
     assert set(find_device("tmcm1636").emergencies) == {cause.name for cause in CAUSES} | set(CONDITIONS)
-
-
-@pytest.mark.parametrize(
-    ("name", "code", "extra"),
-    [  # table 303
-        ("pdo_not_accepted", 0x6320, (0, 255, 0, 0, 0)),
-        ("communication_error", 0x8100, (0, 255, 0, 0, 0)),
-        ("controller_overflow", 0x8110, (1, 255, 0, 0, 0)),
-        ("transmit_overflow", 0x8110, (2, 255, 0, 0, 0)),
-        ("receive_overflow", 0x8110, (3, 255, 0, 0, 0)),
-        ("error_passive", 0x8120, (0, 255, 0, 0, 0)),
-        ("heartbeat_lost", 0x8130, (0, 255, 0, 0, 0)),
-        ("bus_off_recovered", 0x8140, (0, 255, 0, 0, 0)),
-        ("pdo_too_short", 0x8210, (0, 255, 0, 0, 0)),
-        ("pdo_too_long", 0x8220, (0, 255, 0, 0, 0)),
-    ],
-)
-def test_codes_of_the_bus(name, code, extra):
-    assert tuple(find_device("tmcm1636").emergencies[name]) == (code, extra)
 
 
 def test_a_fault_and_its_reset(wire):
@@ -109,27 +83,6 @@ def test_a_fault_reset_ends_conditions_of_the_bus(wire):
     assert "085  00 00 00 00 00 00 00 00" in map(str, wire.take())
 
 
-def test_inhibit_time_in_tenths_of_a_millisecond(wire):
-    wire.start()
-    wire.play("""
-        rx 605  2B 15 10 00 C8 00 00 00   # 200: 20 ms
-        tx 585  60 15 10 00 00 00 00 00
-        rx 205  00
-        tx 085  10 82 11 00 FF 00 00 00   # the first at once
-        rx 205  00 00 00
-        rx 305  00
-        wait 19 ms
-        wait 1 ms
-        tx 085  20 82 11 00 FF 00 00 00
-        wait 19 ms
-        wait 1 ms
-        tx 085  10 82 11 00 FF 00 00 00
-        wait 100 ms
-        rx 405  00
-        tx 085  10 82 11 00 FF 00 00 00
-    """)
-
-
 def test_a_full_queue_loses_the_newest(wire):
     wire.start()
     assert wire.download(0x1015, 0, 10_000, 2) == 0  # one second
@@ -138,25 +91,6 @@ def test_a_full_queue_loses_the_newest(wire):
     wire.wait(10_000)
     codes = [frame.data[:2].hex() for frame in wire.take()]
     assert codes == ["2082", "1082"] * (QUEUE // 2), "the first went at once"
-
-
-def test_its_identifier(wire):
-    wire.start()
-    wire.play("""
-        rx 605  23 14 10 00 85 00 00 80   # off
-        tx 585  60 14 10 00 00 00 00 00
-        rx 205  00
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 11 00 00 00   # the error is there all the same
-        rx 605  23 14 10 00 99 00 00 00   # on
-        tx 585  60 14 10 00 00 00 00 00
-        rx 305  00
-        tx 099  10 82 11 00 FF 00 00 00
-        rx 605  23 14 10 00 05 06 00 80
-        tx 585  60 14 10 00 00 00 00 00
-        rx 605  23 14 10 00 05 06 00 00   # reserved
-        tx 585  80 14 10 00 30 00 09 06
-    """)
 
 
 def test_stopped_tells_later(wire):
@@ -187,74 +121,6 @@ def test_overruns(wire, buffer, extra):
 
 
 # How each condition of the bus comes about, and how it ends by itself: by another frame, or it is over when it is told.
-def lose_heartbeat(wire):
-    assert wire.download(0x1016, 1, 0x0007_0032, 4) == 0  # node 7, 50 ms
-    wire.node.receive(Frame(0x707, b"\x05"), wire.now)
-    wire.wait(60)
-
-
-def lose_guarding(wire):
-    assert wire.download(0x100C, 0, 25, 2) == 0
-    assert wire.download(0x100D, 0, 2, 1) == 0
-    wire.node.receive(REQUEST, wire.now)
-    wire.wait(60)
-
-
-def lose_the_bus(wire):
-    wire.node.bus_off(wire.now)
-    wire.node.bus_on(wire.now)
-
-
-def frame(can_id, text):
-    return lambda wire: wire.node.receive(Frame(can_id, bytes.fromhex(text)), wire.now)
-
-
-def nothing(wire):
-    pass
-
-
-REQUEST = Frame(0x705, b"", True, 1)
-ENDS = {
-    "pdo_not_accepted": (frame(0x305, "00 00 02"), frame(0x305, "00 00 01")),
-    "pdo_too_short": (frame(0x205, "00"), frame(0x205, "00 00")),
-    "pdo_too_long": (frame(0x205, "00 00 00"), frame(0x205, "00 00")),
-    "heartbeat_lost": (lose_heartbeat, frame(0x707, "05")),
-    "life_guarding_lost": (lose_guarding, lambda wire: wire.node.receive(REQUEST, wire.now)),
-    "error_passive": (lambda wire: wire.node.error_passive(wire.now), nothing),
-    "controller_overflow": (lambda wire: wire.node.overrun(wire.now, "controller"), nothing),
-    "transmit_overflow": (lambda wire: wire.node.overrun(wire.now, "transmit"), nothing),
-    "receive_overflow": (lambda wire: wire.node.overrun(wire.now, "receive"), nothing),
-    "bus_off_recovered": (lose_the_bus, nothing),
-}
-
-
-def test_every_condition_of_the_bus_has_its_end():
-    """8100h comes with a fault and ends with its reset; the axis' own rows are in test_protection.py."""
-    assert set(ENDS) - {"life_guarding_lost"} == set(CONDITIONS) - {"communication_error"}
-
-
-@pytest.mark.parametrize("name", ENDS)
-def test_0000h_tells_that_1001h_has_fallen_to_0_by_itself(wire, name):
-    begin, end = ENDS[name]
-    row = find_device("tmcm1636").emergencies["heartbeat_lost" if name == "life_guarding_lost" else name]
-    assert wire.download(0x1029, 1, 1, 1) == 0  # stay operational
-    wire.start()
-    begin(wire)
-    told = [f.data for f in wire.take() if f.can_id == 0x085]
-    assert [data[:2] + data[3:] for data in told] == [row.code.to_bytes(2, "little") + bytes(row.extra)]
-    assert told[0][2] & 0x11, "generic error, and communication or profile"
-    if end is not nothing:
-        wire.wait(100)
-        assert [f for f in wire.take() if f.can_id == 0x085] == [], "the error is there still"
-        assert wire.value(0x1001) == told[0][2]
-    end(wire)
-    wire.wait(1)
-    assert [str(f) for f in wire.take() if f.can_id == 0x085] == ["085  00 00 00 00 00 00 00 00"]
-    assert wire.value(0x1001) == 0
-    wire.wait(20)
-    assert [f for f in wire.take() if f.can_id == 0x085] == [], "once"
-
-
 def test_0000h_waits_until_all_errors_are_gone(wire):
     wire.start()
     wire.play("""
@@ -282,11 +148,6 @@ def test_an_error_that_nobody_was_told_of_has_no_end(wire):
         rx 205  00 00
         wait 10 ms
     """)
-
-
-def test_error_passive(wire):
-    wire.node.error_passive(wire.now)
-    assert [str(f) for f in wire.take()] == ["085  20 81 11 00 FF 00 00 00"]
 
 
 # --- bus-off ----------------------------------------------------------------------------------------------------------
@@ -328,18 +189,6 @@ def test_recovery_without_bus_off_is_nothing(wire):
 
 
 # --- error behaviour --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("raw", "end"), [(0, NmtState.STOPPED), (1, NmtState.OPERATIONAL), (2, NmtState.STOPPED)])
-def test_an_application_error(wire, raw, end):
-    assert wire.value(0x1029, 2) == 1
-    assert wire.download(0x1029, 2, raw, 1) == 0
-    wire.enable()
-    wire.start()
-    wire.drives.machine.enable_input = False
-    wire.wait(1)
-    assert "085  41 54 81 00 FF 00 00 00" in map(str, wire.take()), "told before the state changes"
-    assert wire.node.state is end
-
-
 def test_a_warning_is_no_application_error(wire):
     assert wire.download(0x1029, 2, 0, 1) == 0
     wire.enable()
@@ -373,9 +222,3 @@ def test_each_node_tells_of_its_own_axes():
         assert [str(f) for f in last.take()] == ["08A  41 54 81 00 FF 00 00 00"]
         assert first.value(0x6041) & 0x6F == 0x27
         assert last.value(0x6041) & 0x4F == 0x08
-
-
-@pytest.mark.parametrize("name", sorted(CONDITIONS))
-def test_an_error_of_the_node_shows_its_class_in_1001h_beside_the_generic_bit(name):
-    """CiA 301: bit 0 for any error, bit 4 for communication; bit 5, of the profile, for a PDO not accepted."""
-    assert CONDITIONS[name].error_register == (0x21 if name == "pdo_not_accepted" else 0x11)

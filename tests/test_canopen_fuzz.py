@@ -236,12 +236,6 @@ FRAMES = (
 )
 
 
-@pytest.fixture(scope="module")
-def drives():
-    with EmulatedDrives(load="inertia", num_threads=1) as made:
-        yield made
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
 @settings(max_examples=200, deadline=None)

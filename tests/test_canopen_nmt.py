@@ -3,25 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from rigs.canopen_wire import Wire
 
-from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import NmtState
 from drive_env.canopen.node import Node
 from drive_env.firmware.common import fsa
-
-
-@pytest.fixture(scope="module")
-def drives():
-    with EmulatedDrives(load="inertia", num_threads=1) as made:
-        yield made
-
-
-@pytest.fixture
-def wire(drives):
-    drives.machine.reset()
-    return Wire(drives)
 
 
 def test_a_node_boots_into_pre_operational(drives):
@@ -45,50 +31,6 @@ def test_a_node_has_a_number_that_canopen_knows(drives, node_id):
 def test_a_node_has_axes_that_the_drives_have(drives):
     with pytest.raises(ValueError, match="first_axis=1: tmcm1636 has 1 of the 1 axes"):
         Node(1, drives, 1, send=print)
-
-
-P, O, S = NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED
-TO = {P: "80", O: "01", S: "02"}
-
-
-@pytest.mark.parametrize(
-    ("start", "command", "end", "boots"),
-    [  # figure 1: every command from every state
-        (P, "01", O, False),
-        (P, "02", S, False),
-        (P, "80", P, False),
-        (P, "81", P, True),
-        (P, "82", P, True),
-        (O, "01", O, False),
-        (O, "02", S, False),
-        (O, "80", P, False),
-        (O, "81", P, True),
-        (O, "82", P, True),
-        (S, "01", O, False),
-        (S, "02", S, False),
-        (S, "80", P, False),
-        (S, "81", P, True),
-        (S, "82", P, True),
-    ],
-)
-@pytest.mark.parametrize("address", ["05", "00"])
-def test_commands_move_the_state(wire, start, command, end, boots, address):
-    wire.receive(0, f"{TO[start]} 05")
-    assert wire.node.state is start
-    frames = wire.receive(0, f"{command} {address}")
-    assert wire.node.state is end
-    assert [str(frame) for frame in frames] == (["705  00"] if boots else [])
-
-
-@pytest.mark.parametrize("data", ["01 06", "01 7F", "01", "01 05 00", "", "00 05", "03 05", "83 05", "FF 00"])
-def test_what_is_no_command_for_this_node_changes_nothing(wire, data):
-    wire.play(f"rx 000  {data}")
-    assert wire.node.state is NmtState.PRE_OPERATIONAL
-
-
-def test_a_remote_frame_is_no_command(wire):
-    wire.play("rx 000  RTR")
-    assert wire.node.state is NmtState.PRE_OPERATIONAL
 
 
 def test_what_lives_in_which_state(wire):
@@ -132,29 +74,6 @@ def test_what_lives_in_which_state(wire):
     """)
 
 
-def test_operation_enabled_goes_to_fault_when_stopped(wire):
-    wire.enable()
-    wire.start()
-    wire.play("""
-        rx 000  02 05
-        wait 20 ms
-        rx 000  80 05
-        tx 085  00 81 11 00 FF 00 00 00   # what an emergency could not tell in stopped
-    """)
-    assert wire.value(0x6041) & 0x4F == 0x08, "fault"
-    wire.play("""
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 11 00 00 00   # generic and communication error
-        rx 605  2B 40 60 00 80 00 00 00   # the cause is gone: it can be reset
-        tx 585  60 40 60 00 00 00 00 00
-        wait 1 ms
-        tx 085  00 00 00 00 00 00 00 00
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 00 00 00 00
-    """)
-    assert wire.value(0x6041) & 0x4F == 0x40
-
-
 def test_a_moving_axis_brakes_on_the_quick_stop_ramp_when_stopped(wire):
     wire.enable()
     assert wire.download(0x6085, 0, 2_000_000, 4) == 0
@@ -168,49 +87,6 @@ def test_a_moving_axis_brakes_on_the_quick_stop_ramp_when_stopped(wire):
     wire.wait(300)
     assert wire.node._axes[0].state == fsa.State.FAULT
     assert abs(wire.drives.read(0x606C)[0]) < 20_000
-
-
-@pytest.mark.parametrize("words", [[], [6], [6, 7]])
-def test_other_states_of_the_drive_do_not_care_about_stopped(wire, words):
-    for word in words:
-        assert wire.download(0x6040, 0, word, 2) == 0
-    before = wire.node._axes[0].state
-    wire.play("""
-        rx 000  02 05
-        wait 2 ms
-        rx 000  80 05
-    """)
-    assert wire.node._axes[0].state == before
-
-
-def test_pre_operational_leaves_the_drive_alone(wire):
-    wire.enable()
-    wire.start()
-    wire.play("""
-        rx 000  80 05
-        wait 3 ms
-    """)
-    assert wire.value(0x6041) & 0x6F == 0x27, "there are no links but one"
-
-
-def test_reset_node_restores_everything(wire):
-    wire.enable()
-    assert wire.download(0x6081, 0, 4711, 4) == 0
-    assert wire.download(0x1017, 0, 4000, 2) == 0
-    assert wire.download(0x2705, 0, 9, 1) == 0
-    wire.take()
-    wire.play("""
-        rx 000  81 05
-        tx 705  00
-        wait 10 ms
-        rx 605  40 17 10 00 00 00 00 00
-        tx 585  4B 17 10 00 00 00 00 00
-        rx 605  40 05 27 00 00 00 00 00   # it was not stored
-        tx 585  4F 05 27 00 05 00 00 00
-        rx 605  40 41 60 00 00 00 00 00
-        tx 585  4B 41 60 00 50 02 00 00
-    """)
-    assert wire.value(0x6081) == wire.drives.inside.objects.stored(0)[0x6081, 0] != 4711
 
 
 def test_reset_communication_restores_1000h_to_1fffh_alone(wire):

@@ -47,57 +47,6 @@ PARAMETERS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("sub", "stored"),
-    [
-        (1, {"communication", "profile", "motor 0", "bus"}),
-        (2, {"communication", "bus"}),
-        (3, {"profile"}),
-        (4, {"motor 0"}),
-    ],
-)
-@pytest.mark.parametrize("restart", ["power cycle", "reset node"])
-def test_each_group_is_stored_alone(wire, sub, stored, restart):
-    before = {name: wire.value(index, s) for name, (index, s, _, _) in PARAMETERS.items()}
-    for index, s, size, raw in PARAMETERS.values():
-        assert wire.download(index, s, raw, size) == 0
-    wire.play(f"rx 605  23 10 10 0{sub} {SAVE}\ntx 585  60 10 10 0{sub} 00 00 00 00")
-    if restart == "power cycle":
-        power_cycled(wire)
-    else:
-        wire.play("rx 000  81 05\ntx 705  00")
-    for name, (index, s, _, raw) in PARAMETERS.items():
-        assert wire.value(index, s) == (raw if name in stored else before[name]), name
-    assert wire.value(0x1010, sub) == wire.value(0x1011, sub) == 1
-
-
-@pytest.mark.parametrize("sub", [1, 2, 3, 4])
-@pytest.mark.parametrize(
-    ("index", "signature"), [(0x10, LOAD), (0x10, "73 61 76 64"), (0x10, "65 76 61 73"), (0x11, SAVE)]
-)
-def test_a_wrong_signature_stores_nothing(wire, sub, index, signature):
-    before = wire.value(0x6081)
-    assert wire.download(0x6081, 0, 4711, 4) == 0
-    wire.play(f"rx 605  23 {index:02X} 10 0{sub} {signature}\ntx 585  80 {index:02X} 10 0{sub} 20 00 00 08")
-    power_cycled(wire)
-    assert wire.value(0x6081) == before
-
-
-@pytest.mark.parametrize("sub", [1, 2, 3, 4])
-def test_restored_values_are_the_factory_s_and_active_after_a_reset_only(wire, sub):
-    for index, s, size, raw in PARAMETERS.values():
-        assert wire.download(index, s, raw, size) == 0
-    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
-    wire.play(f"rx 605  23 11 10 0{sub} {LOAD}\ntx 585  60 11 10 0{sub} 00 00 00 00")
-    for index, s, _, raw in PARAMETERS.values():
-        assert wire.value(index, s) == raw, "not yet"
-    power_cycled(wire)
-    factory = DEVICE.new_dictionary(1)
-    for name, (index, s, _, raw) in PARAMETERS.items():
-        restored = name in DEVICE.canopen.store_groups[sub]
-        assert wire.value(index, s) == (factory.find((index, s)).default if restored else raw), name
-
-
 def test_restoring_everything_takes_the_drive_to_its_factory_values(wire):
     assert wire.value(0x2050) == 3, "the emulator comes commissioned"
     assert wire.download(0x1011, 1, 0x64616F6C, 4) == 0
@@ -107,27 +56,6 @@ def test_restoring_everything_takes_the_drive_to_its_factory_values(wire):
     for entry in factory:
         if entry.access == "rw":
             assert wire.value(entry.index, entry.sub) == entry.default, entry.label
-
-
-def test_commands_and_set_points_are_no_parameters(wire):
-    wire.enable()
-    for index, raw in ((0x60FF, 1000), (0x607A, 5000)):
-        assert wire.download(index, 0, raw, 4) == 0
-    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
-    power_cycled(wire)
-    assert [wire.value(index) for index in (0x6040, 0x6060, 0x60FF, 0x607A)] == [0, 0, 0, 0]
-    assert wire.value(0x6041) & 0x6F == 0x40
-
-
-def test_a_stored_mapping_comes_back_and_works(wire):
-    for index, sub, raw, size in (
-        (0x1803, 1, 0xC000_0485, 4), (0x1A03, 0, 0, 1), (0x1A03, 1, 0x6064_0020, 4), (0x1A03, 2, 0x606C_0020, 4),
-        (0x1A03, 0, 2, 1), (0x1803, 1, 0x4000_01C5, 4), (0x1010, 2, 0x65766173, 4),
-    ):  # fmt: skip
-        assert wire.download(index, sub, raw, size) == 0
-    wire.play("rx 000  82 05\ntx 705  00")
-    wire.start()
-    wire.play("rx 080\ntx 385  50 02 00 00 00 00\ntx 1C5  00 00 00 00 00 00 00 00")
 
 
 def test_reset_communication_brings_stored_communication_parameters_alone(wire):

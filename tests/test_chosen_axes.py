@@ -10,7 +10,7 @@ import json
 import numpy as np
 import pytest
 from rigs.commands import drive_tune
-from rigs.several_axes import AXES, WIRED, partly_wired
+from rigs.six_axes import AXES, WIRED, partly_wired
 from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, Limits, cia402, motion

@@ -29,6 +29,7 @@ from rigs.can_devices import (
 
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import NmtState
+from drive_env.node.error_history import CONDITIONS as ALL_CONDITIONS
 
 REGISTER, HISTORY, EMCY_ID, INHIBIT, BEHAVIOUR = 0x1001, 0x1003, 0x1014, 0x1015, 0x1029
 RANGE, WRONG_STATE, NO_OBJECT = 0x0609_0030, 0x0800_0022, 0x0602_0000
@@ -126,15 +127,20 @@ def nothing(wire, facts):
 GOOD = frame("00 00 00")
 # Code, additional bytes, bits of 1001h (CiA 301; manual of the TMCM-1636, table 303), how it begins, how it ends.
 CONDITIONS = {
-    "pdo not accepted": (0x6320, 0, 0x21, frame("00 00 02"), GOOD),  # vl
-    "pdo too short": (0x8210, 0, 0x11, frame("00 00"), GOOD),
-    "pdo too long": (0x8220, 0, 0x11, frame("00 00 00 00"), GOOD),
-    "error passive": (0x8120, 0, 0x11, lambda wire, _: wire.node.error_passive(wire.now), nothing),
-    "controller": (0x8110, 1, 0x11, lambda wire, _: wire.node.overrun(wire.now, "controller"), nothing),
-    "transmit": (0x8110, 2, 0x11, lambda wire, _: wire.node.overrun(wire.now, "transmit"), nothing),
-    "receive": (0x8110, 3, 0x11, lambda wire, _: wire.node.overrun(wire.now, "receive"), nothing),
-    "bus-off": (0x8140, 0, 0x11, lose_the_bus, nothing),
+    "pdo_not_accepted": (0x6320, 0, 0x21, frame("00 00 02"), GOOD),  # vl
+    "pdo_too_short": (0x8210, 0, 0x11, frame("00 00"), GOOD),
+    "pdo_too_long": (0x8220, 0, 0x11, frame("00 00 00 00"), GOOD),
+    "error_passive": (0x8120, 0, 0x11, lambda wire, _: wire.node.error_passive(wire.now), nothing),
+    "controller_overflow": (0x8110, 1, 0x11, lambda wire, _: wire.node.overrun(wire.now, "controller"), nothing),
+    "transmit_overflow": (0x8110, 2, 0x11, lambda wire, _: wire.node.overrun(wire.now, "transmit"), nothing),
+    "receive_overflow": (0x8110, 3, 0x11, lambda wire, _: wire.node.overrun(wire.now, "receive"), nothing),
+    "bus_off_recovered": (0x8140, 0, 0x11, lose_the_bus, nothing),
 }
+
+
+def test_every_condition_of_the_bus_has_its_end():
+    """A lost heartbeat and a stopped node are in test_conformance_nmt.py."""
+    assert CONDITIONS.keys() == ALL_CONDITIONS.keys() - {"communication_error", "heartbeat_lost"}
 
 
 @EACH_DEVICE
@@ -142,7 +148,7 @@ def test_what_the_bus_has_begins_and_ends(wire, facts):
     configure(wire, BEHAVIOUR, 1, 1, 1)  # stay operational
     wire.start()
     for name, (code, first, register, begin, end) in CONDITIONS.items():
-        register = facts.manual.refused if name == "pdo not accepted" else register
+        register = facts.manual.refused if name == "pdo_not_accepted" else register
         begin(wire, facts)
         assert sent(wire) == [frame_of(code, f"{register:02X}", (first, 255, 0, 0, 0), 0)], name
         if end is not nothing:
@@ -154,6 +160,8 @@ def test_what_the_bus_has_begins_and_ends(wire, facts):
         wire.wait(1)
         (ended,) = sent(wire)
         assert ended[:13] == f"085  {RESET}", name
+        wire.wait(20)
+        assert sent(wire) == [], "once"
         assert read(wire, facts, REGISTER) == 0
 
 
@@ -223,12 +231,16 @@ def test_inhibit_time_in_tenths_of_a_millisecond(wire, facts):
         rx {RPDO_ID:03X}  00
         tx 085  10 82 11 00 FF 00 00 00   # the first at once
         rx {RPDO_ID:03X}  00 00 00 00
+        rx {RPDO_ID:03X}  00
         wait 19 ms
         wait 1 ms
         tx 085  20 82 11 00 FF 00 00 00
-        wait 100 ms
-        rx {RPDO_ID:03X}  00
+        wait 19 ms
+        wait 1 ms
         tx 085  10 82 11 00 FF 00 00 00
+        wait 100 ms
+        rx {RPDO_ID:03X}  00 00 00 00
+        tx 085  20 82 11 00 FF 00 00 00
     """)
 
 

@@ -119,6 +119,12 @@ def test_stopped_takes_the_enabled_axis_to_fault_and_no_other(wire, facts, axis)
     assert states(wire, facts) == others(facts, axis, FAULT, SWITCH_ON_DISABLED)
     frames = wire.receive(0, "80 05")
     assert [without_register(frame) for frame in frames] == facts.told_of("stopped", [axis]), "once it may be told"
+    assert read(wire, facts, 0x1001) & 0x11 == 0x11, "generic error, and communication"
+    assert write(wire, facts, CONTROLWORD + PROFILE * axis, 0x80) == 0, "the cause is gone: it can be reset"
+    wire.wait(1)
+    assert any(frame.data[:3] == bytes(3) for frame in wire.take()), "no error any more"
+    assert states(wire, facts) == [SWITCH_ON_DISABLED] * len(facts.axes)
+    assert read(wire, facts, 0x1001) == 0
 
 
 @EACH_AXIS
@@ -228,6 +234,7 @@ def test_a_lost_heartbeat_does_what_1029h_says_and_is_told_once(wire, facts, raw
     wire.play("rx 707  05")
     wire.wait(1)
     if stopped:
+        assert read(wire, facts, 0x1001) & 0x11 == 0x11, "the axis is in fault still"
         assert write(wire, facts, CONTROLWORD + PROFILE * last, 0x80) == 0
         wire.wait(1)
     assert any(frame.data[:3] == bytes(3) for frame in wire.take()), "no error any more"
@@ -261,14 +268,26 @@ def test_node_guarding_alternates_and_shows_the_state(wire, facts):
         rx 000  02 05
         rx 705  RTR
         tx 705  84
+        rx 000  80 05
+        rx 705  RTR
+        tx 705  7F
         rx 000  82 05                     # reset communication: toggle 0 again
         tx 705  00
         rx 705  RTR
         tx 705  7F
         rx 706  RTR
+        rx 700  RTR
+        rx 685  RTR
+        rx 705  7F                        # no remote frame
         rx 605  2B 17 10 00 E8 03 00 00   # the heartbeat excludes guarding
         tx 585  60 17 10 00 00 00 00 00
         rx 705  RTR
+        wait 1 ms
+        tx 705  7F
+        rx 605  2B 17 10 00 00 00 00 00
+        tx 585  60 17 10 00 00 00 00 00
+        rx 705  RTR
+        tx 705  FF
     """)
 
 
@@ -298,6 +317,11 @@ def test_life_guarding(wire, facts):
         rx 000  80 05
     """)
     assert state(wire, last) == FAULT
+    assert write(wire, facts, CONTROLWORD + PROFILE * last, 0x80) == 0
+    wire.wait(1)
+    (ended,) = wire.take()
+    assert ended.data[:3] == bytes(3), "no error any more"
+    assert read(wire, facts, 0x1001) == 0
 
 
 @pytest.mark.parametrize("facts", [facts for facts in DEVICES if not facts.has(GUARD_TIME)], ids=repr)

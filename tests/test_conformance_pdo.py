@@ -41,7 +41,8 @@ UNSUPPORTED, NO_OBJECT, NO_SUB_INDEX, NOT_MAPPABLE, TOO_MUCH, TOO_HIGH = (
 )
 FREE_ID = 0x2F5  # none of the predefined connection set of node 5
 RESERVED = [*range(241, 254)]  # of the transmission types; 252 and 253 need remote frames, which none of them has
-RESTRICTED = [0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF]  # CiA 301, table 41
+# CiA 301, table 41.
+RESTRICTED = [0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF]
 
 
 @pytest.fixture
@@ -124,11 +125,11 @@ def test_what_is_received_reaches_the_mapped_objects_alone(wire, facts, pdo):
 
 
 @EACH_RPDO
-@pytest.mark.parametrize(("bytes_", "code"), [(-1, "10 82"), (1, "20 82")])
+@pytest.mark.parametrize(("bytes_", "code"), [(-8, "10 82"), (-1, "10 82"), (1, "20 82")])
 def test_another_length_is_told_once_and_not_processed(wire, facts, pdo, bytes_, code):
     entries = facts.mapped(pdo)
     good = data_of(entries, [value_for(entry, facts) for entry in entries])
-    wrong = (good + b"\x01")[: len(good) + bytes_]
+    wrong = (good + b"\x01")[: max(len(good) + bytes_, 0)]
     if len(wrong) > 8:
         pytest.skip(f"a PDO of 8 bytes cannot be longer: {facts} {pdo:04X}h")
     give(wire, pdo, FREE_ID)
@@ -320,12 +321,13 @@ def test_the_identifier_of_sync(wire, facts):
     assert [frame.can_id for frame in wire.receive(0x081, "07")] == [FREE_ID], "with a counter, too"
     for data in ("01 02", "00 00 00 00 00 00 00 00"):
         assert wire.receive(0x081, data) == [], "no SYNC"
+    wire.play("rx 081  RTR")
 
 
 @EACH_DEVICE
 def test_no_remote_frame_is_answered(wire, facts):
     wire.start()
-    for pdo in facts.tpdos:
+    for pdo in (*facts.rpdos, *facts.tpdos):
         if not wire.value(pdo, 1) & OFF:
             wire.play(f"rx {wire.value(pdo, 1) & 0x7FF:03X}  RTR")
 
@@ -381,6 +383,8 @@ def test_every_breach_of_the_order_of_mapping_is_refused(wire, facts):
             assert wire.download(mapping, 1, raw, 4) == code, f"{mapping:04X}h {raw:08X}h"
         assert wire.download(mapping, 0, room + 1, 1) == TOO_HIGH
         assert wire.download(mapping, room + 1, first, 4) == NO_SUB_INDEX
+        configure(wire, mapping, 2, 0, 4)
+        assert wire.download(mapping, 0, 2, 1) == NO_OBJECT, "the second entry is empty"
         wide = facts.entries[0x6064 if is_sent else 0x607A, 0].mapping
         for sub in range(1, 4):
             configure(wire, mapping, sub, wide, 4)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+
 import pytest
 from rigs.can_devices import (
     DEVICES,
@@ -126,6 +129,26 @@ def test_what_the_documents_say_is_refused_is_refused_whatever_is_written(wire, 
             assert write(wire, facts, entry.index, facts.default(*entry.key), entry.sub) == 0x0800_0020, entry.label
 
 
+# --- the file ---------------------------------------------------------------------------------------------------------
+@EACH_DEVICE
+def test_the_file_is_ascii_and_lists_its_objects_in_the_right_place(facts):
+    assert facts.path.read_bytes().isascii()
+    eds = facts.eds
+    indices = [int(name, 16) for name in eds.sections() if re.fullmatch("[0-9A-F]{4}", name)]
+    subs = Counter(name[:4] for name in eds.sections() if name[4:7] == "sub")
+    listed = {}
+    for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
+        count = int(eds[group]["SupportedObjects"])
+        assert list(eds[group]) == ["supportedobjects", *map(str, range(1, count + 1))]
+        listed[group] = [int(eds[group][str(k)], 16) for k in range(1, count + 1)]
+    assert listed["MandatoryObjects"] == [0x1000, 0x1001, 0x1018]
+    assert listed["ManufacturerObjects"] == [index for index in sorted(indices) if 0x2000 <= index < 0x6000]
+    assert sorted(index for group in listed.values() for index in group) == sorted(indices)
+    for index in indices:
+        if "SubNumber" in eds[f"{index:04X}"]:
+            assert int(eds[f"{index:04X}"]["SubNumber"], 16) == subs[f"{index:04X}"]
+
+
 # --- axes -------------------------------------------------------------------------------------------------------------
 @EACH_AXIS
 def test_a_write_reaches_its_axis_alone(wire, facts, axis):
@@ -144,18 +167,21 @@ def test_a_write_reaches_its_axis_alone(wire, facts, axis):
 
 @pytest.mark.parametrize("facts", [facts for facts in DEVICES if len(facts.axes) > 1], ids=repr)
 def test_every_parameter_of_an_axis_is_its_own(wire, facts):
-    """Of axis 0 each is changed; those of the others stay, but for what the manual says they share."""
+    """Each is changed on the first and on the last axis; others stay, but for what the manual says they share."""
     for first, last, step in facts.manual.areas:
         for entry in [e for e in facts.entries.values() if first <= e.index <= last and facts.axis_of(e.index) == 0]:
             if not entry.is_written or entry.bits is None or entry.index in facts.manual.shared:
                 continue
             places = [(entry.index + step * axis, entry.sub) for axis in facts.axes]
             assert all(facts.has(*place) for place in places), entry.label
-            before = [read(wire, facts, *place) for place in places]
-            if another(wire, facts, entry, before[0]) is None:
-                continue  # a command, or it takes the value alone that it has
-            after = [read(wire, facts, *place) for place in places]
-            assert after[1:] == before[1:], entry.label
+            for axis in (facts.axes[0], facts.axes[-1]):
+                before = [read(wire, facts, *place) for place in places]
+                raw = another(wire, facts, facts.entries[places[axis]], before[axis])
+                if raw is None:
+                    continue  # a command, or it takes the value alone that it has
+                after = [read(wire, facts, *place) for place in places]
+                del before[axis], after[axis]
+                assert after == before, facts.entries[places[axis]].label
 
 
 @EACH_DEVICE
@@ -230,6 +256,10 @@ def test_a_text_is_read_in_segments(wire, facts):
     wire.play(f"""
         rx 605  40 {where} 00 00 00 00
         tx 585  41 {where} {len(letters):02X} 00 00 00
+        rx 605  70 00 00 00 00 00 00 00   # the first has toggle 0
+        tx 585  80 {where} 00 00 03 05
+        rx 605  40 {where} 00 00 00 00
+        tx 585  41 {where} {len(letters):02X} 00 00 00
         rx 605  60 00 00 00 00 00 00 00
         tx 585  00 {first}
         rx 605  60 00 00 00 00 00 00 00   # the same toggle again
@@ -253,7 +283,14 @@ def test_a_text_is_read_in_segments(wire, facts):
 def test_a_block_transfer_is_refused(wire, facts, specifier):
     """None of the manuals has it."""
     where = request(PROFILE_VELOCITY, 0)
-    wire.play(f"rx 605  {specifier} {where} 04 00 00 00\ntx 585  80 {where} 01 00 04 05")
+    wire.play(f"""
+        rx 605  21 {where} 04 00 00 00
+        tx 585  60 {where} 00 00 00 00
+        rx 605  {specifier} {where} 04 00 00 00
+        tx 585  80 {where} 01 00 04 05
+        rx 605  07 01 00 00 00 00 00 00   # what was open is no more
+        tx 585  80 00 00 00 01 00 04 05
+    """)
 
 
 @EACH_DEVICE
@@ -280,6 +317,7 @@ def test_a_transfer_is_replaced_given_up_and_ended_by_stopped(wire, facts):
         wait 1 ms
         tx 585  80 {where} 00 00 04 05    # the client was silent for a second
         rx 606  40 {status} 00 00 00 00   # another node's
+        rx 585  40 {status} 00 00 00 00
         rx 605  40 {status[:8]}           # no request: it is too short
         rx 605  RTR
     """)

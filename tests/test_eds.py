@@ -399,20 +399,6 @@ def test_top_level_names_are_unique_whatever_their_case():
     assert not any("." in name for name in names)  # python-canopen splits "record.entry" there
 
 
-def test_file_is_ascii_and_lists_its_objects_in_the_right_place():
-    eds = configparser.RawConfigParser()
-    eds.optionxform = str
-    eds.read_string(EDS.read_bytes().decode("ascii"))
-    listed = {}
-    for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
-        count = int(eds[group]["SupportedObjects"])
-        assert list(eds[group]) == ["SupportedObjects", *map(str, range(1, count + 1))]
-        listed[group] = [int(eds[group][str(k)], 16) for k in range(1, count + 1)]
-    assert listed["MandatoryObjects"] == [0x1000, 0x1001, 0x1018]
-    assert listed["ManufacturerObjects"] == [index for index in sorted(OD) if 0x2000 <= index < 0x6000]
-    assert sorted(index for group in listed.values() for index in group) == sorted(OD)
-
-
 def test_every_section_has_the_keys_of_its_kind():
     eds = configparser.RawConfigParser()
     eds.optionxform = str

@@ -11,7 +11,6 @@ import pytest
 from canopen.objectdictionary import ODVariable
 from rigs.canopen_wire import Wire
 
-from drive_env import EmulatedDrives
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, NO_SUCH_OBJECT, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
@@ -59,12 +58,6 @@ RULES = (
     Rule(tuple((0x1011, sub) for sub in (1, 2, 3, 4)), (LOAD,), (0, SAVE, DWORD), CANNOT_BE_STORED),
     Rule(((0x5FFF, 0),), (0x1234_5678,), (0, 0x1234_5679, DWORD), VALUE_RANGE),
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def drives():
-    with EmulatedDrives(load="inertia", num_threads=1) as made:
-        yield made
 
 
 def prepare(drives, key):

@@ -236,25 +236,46 @@ def test_the_docstring_has_a_row_for_every_entry_of_the_spaces(kind, options, le
 
 
 # --- the same seed, the same episode ----------------------------------------------------------------------------------
-@pytest.mark.slow
 @EVERY_KIND
-def test_an_episode_is_the_same_among_1_8_and_64_lanes_and_under_2_threads(kind):
+@pytest.mark.parametrize(
+    ("sizes", "counts"),
+    [
+        (((1, 0, 1), (1, 5, 1), (8, 0, 1)), {0: 2, 5: 2}),
+        pytest.param(
+            ((1, 0, 1), (1, 70, 1), (8, 0, 1), (64, 0, 1), (72, 0, 2)), {0: 4, 70: 2, 5: 3}, marks=pytest.mark.slow
+        ),
+    ],
+    ids=["8", "72"],
+)
+def test_an_episode_is_the_same_alone_and_among_others_and_under_2_threads(kind, sizes, counts):
     """An autoreset is within. 72 machines are two groups, each with a thread of its own; 70 is in the second."""
     found = {}
     options = {"distributions": "inertia", "load": "inertia"}
-    for num_envs, first, threads in ((1, 0, 1), (1, 70, 1), (8, 0, 1), (64, 0, 1), (72, 0, 2)):
+    for num_envs, first, threads in sizes:
         with lanes_of(kind, num_envs, num_threads=threads, **options) as lanes:
             seeds = [20 + first + lane for lane in range(num_envs)]
             results = run(lanes, actions(lanes, steps_of(lanes) + 3, first), seed=seeds)[:4]
         for lane in range(num_envs):
             if first + lane in (0, 5, 70):
                 found.setdefault(first + lane, []).append([column[:, lane] for column in results])
-    assert {lane: len(runs) for lane, runs in found.items()} == {0: 4, 70: 2, 5: 3}
+    assert {lane: len(runs) for lane, runs in found.items()} == counts
     for one, *others in found.values():
         for other in others:
             for expected, seen in zip(one, other, strict=True):
                 np.testing.assert_array_equal(seen, expected)
     assert not np.array_equal(found[0][0][0], found[5][0][0])
+
+
+@EVERY_KIND
+def test_an_environment_that_is_reset_alone_begins_its_seed_anew_and_the_others_go_on(kind):
+    with lanes_of(kind, 2, autoreset_mode="Disabled") as lanes:
+        given = actions(lanes, 2)
+        undisturbed = run(lanes, given, seed=[3, 4])[0]
+        lanes.reset(seed=[3, 4])
+        lanes.step(given[0])
+        again, _ = lanes.reset(seed=[None, 4], options={"reset_mask": np.array([False, True])})
+        np.testing.assert_array_equal(again[1], undisturbed[0, 1])
+        np.testing.assert_array_equal(lanes.step(given[1])[0][0], undisturbed[2, 0])
 
 
 @EVERY_KIND
@@ -355,7 +376,8 @@ def test_a_broken_machine_leaves_the_others_bit_identical(kind):
             broken = k in (0, 1)
             if broken:
                 break_machine(lanes, 1)
-            observation, reward, terminated, truncated, _ = lanes.step(action)
+            observation, reward, terminated, truncated, info = lanes.step(action)
+            assert not terminated[1] or "diverged" in info["fault"][1]
             seen += lanes.drives.machine.diverged[1]
             if broken:
                 mend_machine(lanes)
@@ -449,6 +471,7 @@ def test_an_amplifier_on_mains_is_a_drive_like_any_other(kind, load):
     ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled', not 'Never'"),
     ({"render_mode": "ansi"}, "render_mode is one of None, 'rgb_array', 'human', not 'ansi'"),
     ({"colour": 1}, "there is no option 'colour'; there are load, device, motor"),
+    ({"stage": 2.0}, r"must lie in 0\.\.\.1, not 2"),
     ({"stage": "half"}, "stage must be a number, not 'half'"),
     ({"num_threads": 1.5}, "num_threads must be a whole number or left out, not 1.5"),
     ({"motor": 7}, "motor must be a motor's name, the path of its file, or a Motor( or left out)?, not 7"),
@@ -456,6 +479,11 @@ def test_an_amplifier_on_mains_is_a_drive_like_any_other(kind, load):
 def test_a_wrong_value_names_the_valid_ones(kind, options, says):
     with pytest.raises(ValueError, match=says):
         KINDS[kind][0](1, **options)
+
+
+def test_stable_baselines_wants_the_next_episode_in_the_step_that_ends_one():
+    with lanes_of("Tracking", 2) as lanes, pytest.raises(ValueError, match="SameStep"):
+        DriveVecEnv(lanes)
 
 
 @EVERY_KIND

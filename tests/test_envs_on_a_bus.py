@@ -50,9 +50,16 @@ def assert_same(one, other):
         np.testing.assert_array_equal(found, expected)
 
 
-@EVERY_LOAD
-def test_tracking(load):
-    options = {"load": load, "duration": 0.05, "delay": 2}
+@pytest.mark.parametrize(
+    ("load", "how"),
+    [
+        *(pytest.param(load, {}, id=load, marks=[] if load in TASKS else pytest.mark.slow) for load in LOADS),
+        *(pytest.param("two_mass", {"mode": mode, "action": action}, id=f"{mode}-{action}")
+          for mode, action in (("csv", "offset"), ("csp", "offset"), ("csp", "direct"))),
+    ],
+)  # fmt: skip
+def test_tracking(load, how):
+    options = {"load": load, "duration": 0.05, "delay": 2, **how}
     joint = TASKS[load].joint if load in TASKS else None
     inside = Tracking(1, num_threads=1, **options)
     expected = run(inside, 50, seed=3)
@@ -66,9 +73,10 @@ def test_tracking(load):
     inside.close()
 
 
+@pytest.mark.parametrize("mode", ["csp", "csv"])
 @EVERY_LOAD
-def test_gain_scheduling(load):
-    options = {"load": load, "base": "present", "payload": "none", "duration": 0.1}
+def test_gain_scheduling(load, mode):
+    options = {"load": load, "mode": mode, "base": "present", "payload": "none", "duration": 0.1}
     inside = GainScheduling(1, num_threads=1, distributions=NOMINAL, **options)
     expected = run(inside, 10, seed=3)
     with on_a_bus(twin(inside.drives)) as drives:

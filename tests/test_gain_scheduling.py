@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from rigs.world_bus import WorldBus
 
-from drive_env import CanDrives, EmulatedDrives
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives
 from drive_env.devices.gains import rule_gains
 from drive_env.drives.raw_gains import read_gains
 from drive_env.envs.gain_scheduling import GainScheduling, GainSchedulingConfig
@@ -197,72 +195,6 @@ def test_a_heavier_payload_needs_more_current():
     assert currents[1] > 3.0 * currents[0]
 
 
-# --- environments
-# ------------------------------------------------------------------------------------------------------------
-def test_a_lane_is_the_same_among_one_and_among_eight():
-    for lane in (0, 5):
-        alone, _ = run(env(1), 60, reset_seed=3 + lane)
-        among, _ = run(env(8), 60, reset_seed=range(3, 11))
-        assert np.array_equal(alone[:, 0], among[:, lane])
-
-
-def test_an_episode_begins_anew_while_others_go_on():
-    """Environment 1 begins anew in the middle; what 0 sees does not change, and what 1 sees is that of its seed."""
-    whole, _ = run(env(2), 40, reset_seed=[3, 4])
-    environment = env(2)
-    rng = np.random.default_rng(0)
-    seen = [environment.reset(seed=[3, 4])[0]]
-    for k in range(40):
-        if k == 20:
-            again, _ = environment.reset(seed=[None, 4], options={"reset_mask": np.array([False, True])})
-            assert np.array_equal(again[1], seen[0][1])
-        seen.append(environment.step(np.tile(rng.uniform(-1.0, 1.0, 3), (2, 1)))[0])
-    assert np.array_equal(np.array(seen)[:, 0], whole[:, 0])
-
-
-def test_a_tripped_drive_ends_its_lane_alone():
-    environment = env(3, load="inertia", distributions=NOMINAL, autoreset_mode="Disabled")
-    environment.reset(seed=0)
-    environment.drives.write(0x6065, 1, where=np.array([False, True, False]))  # following error window
-    found = []
-    for _ in range(60):
-        _, reward, terminated, truncated, info = environment.step(np.zeros((3, 3)))
-        found.append(terminated)
-        if terminated.any():
-            break
-    assert found[-1].tolist() == [False, True, False]
-    assert info["fault"].tolist() == ["", "following_error", ""]
-    assert reward[1] < -15.0
-    assert not truncated.any()
-
-
-def test_a_machine_that_leaves_physics_ends_its_lane_and_leaves_the_others_as_they_are():
-    whole, _ = run(env(2, distributions=NOMINAL), 10)
-    environment = env(2, distributions=NOMINAL)
-    rng = np.random.default_rng(0)
-    environment.reset(seed=3)
-    for k in range(10):
-        if k == 5:
-            environment.drives.machine.load_torque = [0.0, 1e12]
-        seen, _, terminated, _, info = environment.step(np.tile(rng.uniform(-1.0, 1.0, 3), (2, 1)))
-        if k == 5:
-            assert terminated.tolist() == [False, True]
-            assert info["fault"].tolist() == ["", "diverged"]
-            environment.drives.machine.load_torque = 0.0
-        assert np.array_equal(seen[0], whole[k + 1][0])
-        assert environment.observation_space.contains(seen)
-
-
-def test_an_episode_ends_in_time_and_the_next_begins():
-    environment = env(2, duration=0.05, autoreset_mode="SameStep")
-    first, _ = environment.reset(seed=1)
-    ends = [environment.step(np.zeros((2, 3))) for _ in range(5)]
-    assert [bool(end[3].all()) for end in ends] == [False] * 4 + [True]
-    assert not any(end[2].any() for end in ends)
-    assert ends[-1][4]["final_obs"][0].shape == first[0].shape
-    assert not np.array_equal(ends[-1][0], np.stack(list(ends[-1][4]["final_obs"])))
-
-
 def test_latency_delays_gains_and_measurements():
     """Three cycles late: of a step of 10 ms the new gains act in the last seven."""
     slow = {"parameters": {"bus.action_latency": {"law": "choice", "values": [3]}}}
@@ -276,26 +208,6 @@ def test_latency_delays_gains_and_measurements():
     before = int(environment.base_gains[0, 4])
     assert [value != before for value in played] == [False] * 3 + [True] * 7
     assert environment.drives.read(POSITION_P).tolist() == played[-1:]
-
-
-# --- on a bus ---------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("mode", ["csp", "csv"])
-def test_over_a_bus_the_same_policy_sees_the_same(mode):
-    options = {"load": "inertia", "mode": mode, "base": "present", "payload": "none", "duration": 0.2}
-    inside = env(1, distributions=NOMINAL, **options)
-    want, rewards = run(inside, 20)
-    world = World(lockstep=True)
-    served = EmulatedDrives(load="inertia", num_threads=1)
-    served.inside.noise_seeds[:] = inside.drives.inside.noise_seeds  # the episode's, drawn from its seed
-    served.machine.reset()
-    world.add(served, [1])
-    bus = WorldBus(world)
-    with CanDrives(bus=bus, nodes=[1], pace="lockstep", safety=False) as drives:
-        found, same = run(GainScheduling(1, drives=drives, **options), 20)
-    bus.shutdown()
-    world.close()
-    assert np.array_equal(found, want)
-    assert np.array_equal(same, rewards)
 
 
 # --- configuration ----------------------------------------------------------------------------------------------------
@@ -312,11 +224,7 @@ def test_over_a_bus_the_same_policy_sees_the_same(mode):
         ({"step": 0.003}, r"step must be 0\.005\.\.\.0\.02 s in whole milliseconds, not 0\.003 s"),
         ({"step": 0.0105}, "whole milliseconds"),
         ({"weights": {"effort": 1.0}}, "a weight's name is one of 'tracking', 'smoothness', 'trip', not 'effort'"),
-        ({"stage": 1.5}, r"stage of the curriculum must lie in 0\.\.\.1"),
         ({"duration": 0.001}, "at least one step"),
-        ({"load": "conveyor"}, "no load is named 'conveyor'; there are arm, "),
-        ({"motors": "x"}, "no option 'motors'; there are load, device, motor"),
-        ({"distributions": "belts"}, "no set of distributions is named 'belts'; there are arm"),
     ],
 )
 def test_a_wrong_value_names_the_valid_ones(options, message):

@@ -28,13 +28,6 @@ def drives():
         yield made
 
 
-@pytest.fixture
-def wire(drives):
-    """Node 5, configured."""
-    drives.machine.reset()
-    return Wire(drives)
-
-
 class Unconfigured(Wire):
     """A node without a node-ID."""
 

@@ -11,7 +11,7 @@ import pytest
 from rigs.world_bus import served
 from typer.testing import CliRunner
 
-from drive_env import EmulatedDrives, cia402, motion
+from drive_env import EmulatedDrives, cia402
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -27,7 +27,7 @@ from tuning.compare.suite import load_suite, open_group
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.search import optimise as optimise_module
 from tuning.search import trial_bench
-from tuning.search.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
+from tuning.search.optimise import SAFE_STEP, Settings, optimise
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
 from tuning.search.trials_files import load_options
 from tuning.target import Target, emulated
@@ -238,19 +238,6 @@ def test_what_shakes_on_with_the_last_good_gains_is_calmed_and_said():
         assert np.all(np.sqrt(np.mean(change**2, axis=0)) < 0.4 * target.motor.rated_current)
 
 
-def test_an_axis_that_went_astray_is_brought_back_before_the_next_trial(rigid):
-    bench = TrialBench(rigid)
-    bench.identify()
-    undisturbed = bench.run(bench.rule)
-    moves = bench.moves.copy()
-    rigid.drives.write(0x6040, 0x0F)  # bit 4 must rise
-    motion.start_move(rigid.drives, rigid.drives.read(0x6064) + 300_000, where=np.array([False, False, True, False]))
-    rigid.drives.advance(2.0)
-    tried = bench.run(bench.rule)
-    assert (bench.moves - moves).tolist() == [3, 3, 4, 3]
-    np.testing.assert_allclose(tried.cost, undisturbed.cost, atol=0.2)
-
-
 # --- a search -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("sampler", ["random", "grid", "tpe", "cmaes"])
 def test_a_search_ends_with_the_best_of_its_trials_on_the_drives(rigid, sampler):
@@ -274,15 +261,6 @@ def test_a_search_leaves_the_drives_as_they_were_but_for_the_gains(rigid):
     optimise(rigid, replace(FEW, trials=3))
     np.testing.assert_array_equal([rigid.drives.read(name) for name in kept], before)
     assert not np.any(cia402.matches(rigid.drives.read(0x6041), cia402.OPERATION_ENABLED))
-
-
-def test_a_generation_fills_the_lanes():
-    shares = []
-    found = searched(replace(FEW, trials=11), progress=shares.append)
-    assert [row.number for row in found.rows] == list(range(11))
-    assert shares == pytest.approx([4 / 11, 8 / 11, 1.0])
-    # Three generations of at most four side by side, not eleven one after the other.
-    assert trial_seconds(3) <= found.drive_seconds < 1.5 * trial_seconds(3)
 
 
 def test_a_search_follows_from_its_seed():
@@ -325,23 +303,6 @@ def test_a_journal_is_gone_on_from(tmp_path):
 
 
 # --- several objectives -------------------------------------------------------------------------------------------
-def test_the_front_is_what_no_trial_beats_in_every_objective():
-    settings = replace(FEW, objectives=OBJECTIVES, trials=16)
-    found = searched(settings, "two_mass")
-    rows = [row for row in found.rows if not row.aborted]
-    front = {row.number for row in found.front(OBJECTIVES)}
-    for row in rows:
-        own = objective_values(row, OBJECTIVES)
-        beaten = any(
-            all(a <= b for a, b in zip(objective_values(other, OBJECTIVES), own, strict=True))
-            and objective_values(other, OBJECTIVES) != own
-            for other in rows
-        )
-        assert (row.number in front) is not beaten
-    assert 0 < len(front) < len(found.rows)
-    assert found.cost[0] in [row.cost for row in pareto(rows, OBJECTIVES)]
-
-
 def test_robustness_is_worst_of_what_was_stopped():
     found = searched(replace(FEW, trials=16), "two_mass")
     stopped = [row for row in found.rows if row.aborted]
@@ -596,21 +557,6 @@ def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypa
 
 
 # --- mistakes -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"sampler": "luck"}, r"no sampler is named 'luck'; there are random, grid, tpe, cmaes, gp"),
-        ({"objectives": ("beauty",)}, r"no objective is named 'beauty'; there are cost, speed, robustness, current"),
-        ({"objectives": ()}, r"give different ones of objective: .*, not none"),
-        ({"trials": 0}, r"trials must be 1 or more, not 0"),
-        ({"width": 20.0}, r"width must lie above 0 and up to 10.4, not 20"),
-    ],
-)
-def test_mistakes_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        Settings(**settings)
-
-
 @pytest.mark.parametrize(
     ("gains", "message"),
     [

@@ -5,60 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
-from rigs.several_axes import build
 from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, Limits, ObjectAccessError, motion
 from drive_env.bus.world import World
-from drive_env.devices import find_device
 from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.rotor import scale_objects
 
-AXES = 6
-FULL_STEPS, MICROSTEPS = 0x2100, 0x20FF
-ROW = """
-[{index:04X}]
-ParameterName={name}{axis}
-ObjectType=0x7
-DataType={kind}
-AccessType=rw
-DefaultValue={default}
-HighLimit={high}
-LowLimit=0
-PDOMapping=0
-"""
-
-
-@pytest.fixture(scope="module")
-def module(tmp_path_factory):
-    """A module of six axes whose positions are microsteps; 2058h is gone."""
-    folder = build(tmp_path_factory.mktemp("microsteps") / "own")
-    eds = folder / "six.eds"
-    rows = [
-        ROW.format(index=index + 0x200 * axis, name=name, axis=f" axis {axis}" * (axis > 0), kind=kind, default=default,
-                   high=high)
-        for axis in range(AXES)
-        for index, name, kind, default, high in (
-            (MICROSTEPS, "Microstep resolution", "0x0005", 8, 8),
-            (FULL_STEPS, "Full steps", "0x0006", 200, 65535),
-        )
-    ]  # fmt: skip
-    eds.write_text(eds.read_text(encoding="utf-8") + "".join(rows), encoding="utf-8")
-    bindings, roles = folder / "bindings.toml", folder / "roles.toml"
-    lines = bindings.read_text(encoding="utf-8").splitlines()
-    bindings.write_text("\n".join(line for line in lines if "position_scaler" not in line), encoding="utf-8")
-    text = roles.read_text(encoding="utf-8").replace(
-        'position_scale = "2058:0"', f'full_steps = "{FULL_STEPS:04X}:0"\nmicrosteps = "{MICROSTEPS:04X}:0"'
-    )
-    roles.write_text(text, encoding="utf-8")
-    return find_device(str(folder))
+MODULE, AXES = "tmcm6212", 6
+FULL_STEPS, MICROSTEPS = 0x2001, 0x2000
 
 
 @pytest.fixture
-def drives(module):
-    with EmulatedDrives(module.name, load="inertia", num_machines=AXES, num_threads=1) as made:
+def drives():
+    with EmulatedDrives(MODULE, load="inertia", num_machines=AXES, num_threads=1) as made:
         yield made
 
 
@@ -111,12 +73,12 @@ def test_neither_object_is_played(drives):
         drives.record([0x6064], 0.002, play={MICROSTEPS: np.array([4, 4])})
 
 
-def test_a_master_reads_it_and_its_limits_stay_with_the_rotor(module):
+def test_a_master_reads_it_and_its_limits_stay_with_the_rotor():
     world = World(lockstep=True)
-    world.add(EmulatedDrives(module.name, load="inertia", num_machines=AXES, num_threads=1), [1])
+    world.add(EmulatedDrives(MODULE, load="inertia", num_machines=AXES, num_threads=1), [1])
     bus = WorldBus(world)
     limits = Limits(position=(-51200, 51200))
-    with CanDrives(module.name, bus=bus, pace="lockstep", safety=limits) as drives:
+    with CanDrives(MODULE, bus=bus, pace="lockstep", safety=limits) as drives:
         assert scale_objects(drives.description) == ((FULL_STEPS, 0), (MICROSTEPS, 0))
         assert drives.read(Role.POSITION_SCALE).tolist() == [51200] * AXES
         drives.write(MICROSTEPS, 4)

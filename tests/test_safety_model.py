@@ -198,12 +198,6 @@ def all_drives():
     return seen
 
 
-@pytest.fixture(scope="module")
-def drives():
-    with EmulatedDrives(load="inertia", num_threads=1) as made:
-        yield made
-
-
 class RealDrive:
     """The emulated node, told what the model's drive is told."""
 

@@ -342,6 +342,8 @@ def test_what_is_searched_by_default():
         ({"objectives": ("speed", "speed")}, "give different ones of objective: .*, not speed, speed"),
         ({"objectives": ("cost", "speed")}, None),
         ({"objectives": ()}, "not none"),
+        ({"objectives": ("beauty",)}, "no objective is named 'beauty'; there are cost, speed, robustness, current"),
+        ({"sampler": "luck"}, "no sampler is named 'luck'; there are random, grid, tpe, cmaes, gp"),
         ({"sampler": ""}, "no sampler is named ''"),
     ],
 )

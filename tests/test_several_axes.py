@@ -1,35 +1,30 @@
-"""A module of six axes on one node: its objects, PDOs, emergencies and store, by the rules of multi-axis modules."""
+"""A module of six axes on one node, the TMCM-6212, and its masters: axes of objects, emergencies, lent identifiers."""
 
 from __future__ import annotations
 
-import json
-import re
+import shutil
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
-from rigs.several_axes import AXES, build, six_axes
 from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
-from drive_env.devices import find_device
-from drive_env.dictionary.aborts import VALUE_RANGE
+from drive_env.devices import FOLDER, find_device
 from drive_env.fieldbus.description import describe
 from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
 
-
-@pytest.fixture(scope="module")
-def module(tmp_path_factory):
-    return six_axes(tmp_path_factory.mktemp("module") / "six")
+MODULE = find_device("tmcm6212")
+AXES = 6
 
 
 @pytest.fixture
-def drives(module):
-    with EmulatedDrives(module.name, load="inertia", num_machines=AXES, num_threads=1) as made:
+def drives():
+    with EmulatedDrives(MODULE.name, load="inertia", num_machines=AXES, num_threads=1) as made:
         yield made
 
 
@@ -43,74 +38,28 @@ def wire(drives):
     [(0x2005, 0, 0x2005), (0x2A05, 5, 0x2005), (0x21FF, 0, 0x21FF), (0x2200, 1, 0x2000), (0x2BFF, 5, 0x21FF),
      (0x3002, 0, 0x3002), (0x8841, 5, 0x6041), (0x1541, 5, 0x1401), (0x1B42, 5, 0x1A02), (0x1017, 0, 0x1017)],
 )  # fmt: skip
-def test_the_axis_of_an_index(module, index, axis, base):
-    assert module.locate(index) == (axis, base)
-    assert module.is_shared(index) == (index in (0x3002, 0x1017))
+def test_the_axis_of_an_index(index, axis, base):
+    assert MODULE.locate(index) == (axis, base)
+    assert MODULE.is_shared(index) == (index in (0x3002, 0x1017))
 
 
 def test_a_drive_of_one_axis_shares_nothing():
     assert not find_device("tmcm1636").is_shared(0x2704)
 
 
-# --- values -----------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("index", [0x1800 + 0x40 * axis + k for axis in range(AXES) for k in range(4)])
-def test_the_types_of_a_pdo_are_those_of_the_same_pdo_of_the_first_axis(wire, index):
-    assert wire.download(index, 2, 245, 1) == VALUE_RANGE, "CiA 301, table 69: reserved"
-    assert wire.download(index, 2, 240, 1) == 0
-
-
 # --- emergencies ------------------------------------------------------------------------------------------------------
-def too_hot(drives, axis):
-    """Warm the stage of one axis beyond what it bears, and cool the others."""
-    drives.machine.set_temperatures(25.0, np.where(np.arange(AXES) == axis, 101.0, 25.0))
-
-
-def test_an_emergency_tells_its_axis_and_so_does_its_end(wire):
-    for word in (6, 7, 15):
-        assert wire.download(0x6040, 0, word, 2) == wire.download(0x7840, 0, word, 2) == 0
-    wire.wait(1)
-    assert wire.value(0x6041) & 0x6F == wire.value(0x7841) & 0x6F == 0x27
-    too_hot(wire.drives, 3)
-    wire.play("""
-        wait 1 ms
-        tx 085  10 43 09 02 03 00 00 00   # overtemperature of axis 3
-        tx 085  10 43 09 01 03 00 00 00   # and the warning, which holds too
-    """)
-    assert wire.value(0x7841) & 0x4F == 0x08
-    assert wire.value(0x6041) & 0x6F == 0x27, "the others go on"
-    too_hot(wire.drives, None)
-    wire.play("""
-        rx 605  2B 40 78 00 80 00 00 00
-        tx 585  60 40 78 00 00 00 00 00
-        wait 1 ms
-        tx 085  00 00 00 00 03 00 00 00   # its error reset
-    """)
-
-
-def test_an_emergency_of_the_enable_input_tells_none(wire):
-    """It is the module's: 255 in the place of the axis."""
-    for word in (6, 7, 15):
-        assert wire.download(0x8840, 0, word, 2) == 0
-    wire.drives.machine.enable_input = False
-    wire.play("""
-        wait 1 ms
-        tx 085  41 54 81 00 FF 00 00 00
-    """)
-    wire.drives.machine.enable_input = True
-
-
-def test_a_master_finds_the_axis_of_an_emergency(module):
+def test_a_master_finds_the_axis_of_an_emergency():
     machine = {"load": "inertia", "num_machines": 2 * AXES, "num_threads": 1}
-    hot = np.where(np.arange(2 * AXES) == AXES + 4, 101.0, 25.0)
+    hot = np.where(np.arange(2 * AXES) == AXES + 4, 151.0, 25.0)
     found = []
-    with EmulatedDrives(module.name, **machine) as inside:
+    with EmulatedDrives(MODULE.name, **machine) as inside:
         motion.enable(inside, mode="pv")
         inside.machine.set_temperatures(25.0, hot)
         inside.advance(0.002)
         found.append(inside.emergencies())
     with (
-        served(module, (1, 20)) as (world, bus),
-        CanDrives(module.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
+        served((1, 20)) as (world, bus),
+        CanDrives(MODULE.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
     ):
         motion.enable(drives, mode="pv")
         world.nodes[1].drives.machine.set_temperatures(25.0, hot)
@@ -129,14 +78,16 @@ def test_a_master_finds_the_axis_of_an_emergency(module):
         ((3, 1, 0, 0, 0), "emergency_4310h", 0),
     ],
 )
-def test_bytes_that_were_received(module, extra, name, axis):
-    assert describe(module.name, None).emergency(0x4310, extra) == (name, axis)
+def test_bytes_that_were_received(extra, name, axis):
+    assert describe(MODULE.name, None).emergency(0x4310, extra) == (name, axis)
 
 
 def test_bytes_that_are_none_are_told(tmp_path):
-    folder = build(tmp_path / "own")
+    folder = shutil.copytree(FOLDER / "tmcm1636", tmp_path / "own")
     path = folder / "device.toml"
-    path.write_text(path.read_text(encoding="utf-8").replace('[2, "axis", 0', '[2, "axes", 0', 1), encoding="utf-8")
+    path.write_text(
+        path.read_text(encoding="utf-8").replace("bytes = [2, 0, 0", 'bytes = [2, "axes", 0', 1), encoding="utf-8"
+    )
     with pytest.raises(ValueError, match=r"device.toml: bytes = \[2, 'axes', 0, 0, 0\] .* \"axis\" in place of one"):
         find_device(str(folder))
 
@@ -146,10 +97,10 @@ PLAYED, SAMPLED = (0x607A,), (0x6041, 0x6064, 0x606C)
 
 
 @contextmanager
-def served(module, nodes=(1,), more=()):
+def served(nodes=(1,), more=()):
     """Nodes of the module on a bus in lockstep, and single drives at `more`."""
     world = World(lockstep=True)
-    emulated = EmulatedDrives(module.name, load="inertia", num_machines=AXES * len(nodes), num_threads=1, seed=4)
+    emulated = EmulatedDrives(MODULE.name, load="inertia", num_machines=AXES * len(nodes), num_threads=1, seed=4)
     world.add(emulated, list(nodes))
     if more:
         world.add(EmulatedDrives(load="inertia", num_machines=len(more), num_threads=1), list(more))
@@ -170,12 +121,12 @@ def cyclic_move(drives):
     return np.stack([trace[name] for name in SAMPLED])
 
 
-def test_cyclic_targets_of_two_modules_are_what_they_are_in_process(module):
-    with EmulatedDrives(module.name, load="inertia", num_machines=2 * AXES, num_threads=1, seed=4) as inside:
+def test_cyclic_targets_of_two_modules_are_what_they_are_in_process():
+    with EmulatedDrives(MODULE.name, load="inertia", num_machines=2 * AXES, num_threads=1, seed=4) as inside:
         expected = cyclic_move(inside)
     with (
-        served(module, (1, 20)) as (_, bus),
-        CanDrives(module.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
+        served((1, 20)) as (_, bus),
+        CanDrives(MODULE.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
     ):
         found = cyclic_move(drives)
     np.testing.assert_array_equal(found, expected)
@@ -196,11 +147,11 @@ def cob_ids(bus, node=1):
     return read
 
 
-def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back(module):
-    with served(module) as (_, bus):
+def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back():
+    with served() as (_, bus):
         before = cob_ids(bus)
         assert {before[0x1440 + 0x40 * k] for k in range(AXES - 1)} == {0xC0000000}
-        with CanDrives(module.name, bus=bus, pace="lockstep") as drives:
+        with CanDrives(MODULE.name, bus=bus, pace="lockstep") as drives:
             cyclic_move(drives)
             during = cob_ids(bus)
             # One received PDO an axis; the statusword and the position in one PDO, the speed in the next.
@@ -218,46 +169,21 @@ def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back(module):
         ((125,), (), r"node 125 has 6 axes, .* nodes 126 to 130: the highest node-ID is 127; give the nodes other IDs"),
     ],
 )
-def test_identifiers_that_somebody_has_are_not_borrowed(module, nodes, more, says):
+def test_identifiers_that_somebody_has_are_not_borrowed(nodes, more, says):
     with (
-        served(module, nodes, more) as (_, bus),
-        CanDrives(module.name, bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives,
+        served(nodes, more) as (_, bus),
+        CanDrives(MODULE.name, bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives,
         pytest.raises(BusError, match=says),
     ):
         drives.record(SAMPLED, 0.01)
 
 
-def test_a_dry_run_shows_whom_it_would_ask(module):
+def test_a_dry_run_shows_whom_it_would_ask():
     lines = []
-    with CanDrives(module.name, dry_run=lines.append, safety=False) as drives:
+    with CanDrives(MODULE.name, dry_run=lines.append, safety=False) as drives:
         drives.record(SAMPLED, 0.002)
     asked = [line[:3] for line in lines if line[4:].split("]")[1].split()[:3] == ["40", "00", "10"]]
     assert [f"60{node}" for node in range(2, 7)] == [who for who in asked if who != "601"]
-
-
-@pytest.mark.slow
-def test_a_drive_that_tells_no_current_is_stopped_like_any_other(tmp_path):
-    """Steppers have no 6077h: what looks at the drives while they stop goes without it."""
-    folder = build(tmp_path / "silent")
-    eds, bindings = folder / "six.eds", folder / "bindings.toml"
-    sections = re.split(r"(?m)^(?=\[)", eds.read_text(encoding="utf-8"))
-    torque = tuple(f"[{index + 0x800 * axis:04X}]" for axis in range(AXES) for index in (0x6071, 0x6077, 0x60B2))
-    eds.write_text("".join(one for one in sections if not one.startswith(torque)), encoding="utf-8")
-    rows = bindings.read_text(encoding="utf-8").splitlines()
-    rows = [row for row in rows if not row.startswith(('"6071', '"6077', '"60B2'))]
-    bindings.write_text("\n".join(rows), encoding="utf-8")
-    module = find_device(str(folder))
-    with served(module) as (world, bus):
-        drives = CanDrives(module.name, bus=bus, pace="lockstep")
-        with pytest.raises(KeyError), drives:
-            motion.enable(drives, mode="pv")
-            drives.write(0x60FF, 200_000)
-            drives.advance(0.2)
-            assert (np.abs(drives.read(0x606C)) > 100_000).all()
-            raise KeyError("a mistake in the program")
-        emulated = world.nodes[1].drives
-        assert (emulated.read(0x6041) & 0x6F != 0x27).all()
-        assert (np.abs(emulated.read(0x606C)) < 5_000).all()
 
 
 # --- what the axes have in common -------------------------------------------------------------------------------------
@@ -277,19 +203,3 @@ def test_inputs_and_outputs_of_the_module(wire):
         pytest.raises(ObjectAccessError, match="no digital inputs that belong"),
     ):
         other.machine.digital_inputs = 1
-
-
-# --- store ------------------------------------------------------------------------------------------------------------
-def test_each_axis_is_stored_alone_and_the_module_too(drives, tmp_path):
-    wire = Wire(drives, store=tmp_path / "store.json")
-    for axis in range(AXES):
-        assert wire.download(0x2003 + 0x200 * axis, 0, 1000 + axis, 4) == 0
-    assert wire.download(0x1010, 6, 0x65766173, 4) == 0  # axis 2
-    stored = json.loads((tmp_path / "store.json").read_text(encoding="utf-8"))["sections"]
-    assert list(stored) == ["motor 2"] and stored["motor 2"]["2403:0"] == 1002
-    assert not any(index[:4] < "2400" or index[:4] > "25FF" for index in stored["motor 2"])
-    wire.receive(0, "81 05")
-    factory = wire.value(0x2003)
-    assert [wire.value(0x2003 + 0x200 * axis) for axis in range(AXES)] == [factory] * 2 + [1002] + [factory] * 3
-    assert wire.download(0x1010, 10, 0x65766173, 4) == 0  # what belongs to no axis
-    assert set(json.loads((tmp_path / "store.json").read_text(encoding="utf-8"))["sections"]) == {"motor 2", "module"}

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rigs.canopen_wire import Wire
 from rigs.stepper_scenes import Scene, label
 
 from drive_env import EmulatedDrives, motion
@@ -255,26 +254,6 @@ def test_an_object_has_an_effect_on_its_axis_and_on_no_other(name):
 @pytest.mark.parametrize("name", [0x2107, 0x2700, 0x6094, 0x60FF], ids=hex)
 def test_so_it_is_on_the_second_axis(name):
     acts_on_one_axis((name, 1) if name == 0x6094 else name, 1)
-
-
-def test_an_object_of_an_axis_is_at_its_own_index_on_the_bus():
-    """100h further on for the second axis, 800h of CiA 402; what is written there is read there alone."""
-    with EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1) as drives:
-        wire, known = Wire(drives), DEVICE.new_dictionary()
-        for name, (_, one, other) in ROWS.items():
-            index, sub = name if isinstance(name, tuple) else (name, 0)
-            if index in (0x6040, 0x6060, 0x23C7, 0x607A, 0x60C1):  # commands, and one target by three objects
-                continue
-            entry = known.find((index, sub))
-            offset = 0x800 if index >= 0x6000 else 0x100
-            for axis in range(2):
-                before = [wire.value(index + offset * k, sub) for k in range(2)]
-                raw = other if drives.read(name)[axis] != other else one
-                code = wire.download(index + offset * axis, sub, raw % 2**entry.bits, entry.bits // 8)
-                assert code == 0, label(name)
-                before[axis] = raw
-                after = [wire.value(index + offset * k, sub) for k in range(2)]
-                assert np.mod(after, 2**entry.bits).tolist() == np.mod(before, 2**entry.bits).tolist(), label(name)
 
 
 def test_every_writable_object_of_an_axis_is_varied():

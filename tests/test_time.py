@@ -7,7 +7,6 @@ from pathlib import Path
 
 import canopen
 import pytest
-from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
@@ -21,12 +20,6 @@ DAY = 86_400_000
 def drives():
     with EmulatedDrives(DEVICE, load="inertia", num_threads=1) as made:
         yield made
-
-
-@pytest.fixture
-def wire(drives):
-    drives.machine.reset()
-    return Wire(drives)
 
 
 @pytest.mark.parametrize(

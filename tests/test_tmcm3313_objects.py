@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rigs.canopen_wire import Wire
 from rigs.stepper_scenes import (
     COMMON,
     ENCODER,
@@ -120,26 +119,6 @@ def test_every_writable_object_of_an_axis_is_varied():
     assert writable == keys() | set(ELSEWHERE)
     assert not keys() & set(ELSEWHERE)
     assert not {key for key in DEVICE.unsupported if key[0] >= 0x2000}
-
-
-def test_an_object_of_an_axis_is_at_its_own_index_on_the_bus():
-    """Section 2.4.1: 200h further on for each axis, 800h of CiA 402; what is written there is read there alone."""
-    with EmulatedDrives("tmcm3313", "inertia", num_machines=AXES, num_threads=1) as drives:
-        wire = Wire(drives)
-        for name, (_, one, other) in ROWS.items():
-            index, sub = name if isinstance(name, tuple) else (name, 0)
-            if index in (0x6040, 0x6060, 0x2020):
-                continue  # commands
-            entry = DEVICE.new_dictionary().find((index, sub))
-            offset = 0x800 if index >= 0x6000 else 0x200
-            for axis in range(AXES):
-                before = [wire.value(index + offset * k, sub) for k in range(AXES)]
-                raw = other if drives.read(name)[axis] != other else one
-                assert wire.download(index + offset * axis, sub, raw % 2**entry.bits, entry.bits // 8) == 0, label(name)
-                drives.advance(0.001)
-                before[axis] = raw
-                after = [wire.value(index + offset * k, sub) for k in range(AXES)]
-                assert np.mod(after, 2**entry.bits).tolist() == np.mod(before, 2**entry.bits).tolist(), label(name)
 
 
 def test_the_offset_of_the_encoder_is_the_initialisations_and_can_be_changed():

@@ -7,7 +7,6 @@ of the chip's registers. Where either is silent stands -.
 
 from __future__ import annotations
 
-import configparser
 import csv
 import re
 from pathlib import Path
@@ -400,21 +399,3 @@ def test_what_the_factory_maps_can_be_mapped(dictionary, base):
 def test_names_are_unique(dictionary):
     names = [entry.name.casefold() for entry in dictionary]
     assert len(names) == len(set(names))
-
-
-def test_the_file_is_ascii_and_lists_its_objects():
-    eds = configparser.RawConfigParser(comment_prefixes=(";",))
-    eds.optionxform = str
-    eds.read_string(EDS.read_bytes().decode("ascii"))
-    indices = [int(name, 16) for name in eds.sections() if len(name) == 4 and set(name) <= set("0123456789ABCDEF")]
-    listed = {}
-    for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
-        count = int(eds[group]["SupportedObjects"])
-        listed[group] = [int(eds[group][str(k)], 16) for k in range(1, count + 1)]
-    assert listed["MandatoryObjects"] == [0x1000, 0x1001, 0x1018]
-    assert listed["ManufacturerObjects"] == [index for index in sorted(indices) if 0x2000 <= index < 0x6000]
-    assert sorted(index for group in listed.values() for index in group) == sorted(indices)
-    for index in indices:
-        if "SubNumber" in eds[f"{index:04X}"]:
-            subs = [name for name in eds.sections() if name.startswith(f"{index:04X}sub")]
-            assert int(eds[f"{index:04X}"]["SubNumber"], 16) == len(subs)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 
@@ -13,7 +12,6 @@ from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.cia402 import State, state_of
 from drive_env.dictionary.aborts import (
-    CANNOT_BE_MAPPED,
     CANNOT_BE_STORED,
     NO_SUCH_OBJECT,
     NO_SUCH_SUB_INDEX,
@@ -74,16 +72,6 @@ def test_it_says_what_it_is(wire):
     """)
 
 
-@pytest.mark.parametrize("axis", EACH)
-def test_an_axis_has_its_own_objects(wire, axis):
-    """Written on one, read on all: that one alone has changed."""
-    for index, step, raw, size in ((0x2003, MOTOR, 100 + axis, 1), (0x6081, PROFILE, 70_000 + axis, 4)):
-        before = [wire.value(index + step * other) for other in EACH]
-        assert wire.download(index + step * axis, 0, raw, size) == 0
-        after = [wire.value(index + step * other) for other in EACH]
-        assert after == [raw if other == axis else before[other] for other in EACH]
-
-
 @pytest.mark.parametrize(
     ("index", "sub", "raw", "size", "abort"),
     [
@@ -113,34 +101,6 @@ def test_limit_switches_and_units_are_chosen_before_an_axis_is_enabled(wire, axi
     assert wire.download(0x2005 + MOTOR * axis, 0, 0, 4) == WRONG_STATE
     other = (axis + 1) % AXES
     assert wire.download(0x2005 + MOTOR * other, 0, 3, 4) == 0, "that is its own affair"
-
-
-# --- NMT --------------------------------------------------------------------------------------------------------------
-def test_stopped_takes_every_enabled_axis_to_fault_and_no_other(wire):
-    """Section 2.2 of the manual: the one link between the two automata."""
-    wire.start()
-    enable(wire, (0, 2, 5))
-    wire.take()
-    wire.play("""
-        rx 000  02 05
-    """)
-    wire.wait(1)
-    assert wire.take() == [], "a stopped node sends no emergency"
-    assert states(wire) == [FAULT if axis in (0, 2, 5) else DISABLED for axis in EACH]
-    wire.play("""
-        rx 000  80 05
-        tx 085  00 81 .. 00 FF 00 00 00   # told once it may be
-    """)
-
-
-def test_a_reset_restarts_all_axes(wire):
-    enable(wire)
-    assert states(wire) == [ENABLED] * AXES
-    wire.play("""
-        rx 000  81 05
-        tx 705  00
-    """)
-    assert states(wire) == [DISABLED] * AXES
 
 
 # --- PDO --------------------------------------------------------------------------------------------------------------
@@ -186,24 +146,6 @@ def give(wire, index, can_id, kind=None, objects=None):
 
 @pytest.mark.parametrize("place", range(4))
 @pytest.mark.parametrize("axis", EACH)
-def test_each_of_the_24_received_pdos_drives_its_axis(wire, axis, place):
-    """Numbers 1 to 4, 65 to 68, 129 to 132, ...: with the factory's mapping, once they have an identifier."""
-    give(wire, 0x1400 + PDO * axis + place, 0x234)
-    wire.start()
-    data = ["06 00", "06 00 03", "06 00 D2 04 00 00", "06 00 2E FB FF FF"][place]
-    wire.receive(0x234, data)
-    wire.wait(1)
-    assert states(wire) == [READY if other == axis else DISABLED for other in EACH]
-    of_axis = lambda index: wire.value(index + PROFILE * axis)  # noqa: E731
-    assert (of_axis(0x6060), of_axis(0x607A), of_axis(0x60FF)) == [(0, 0, 0), (3, 0, 0), (0, 1234, 0), (0, 0, -1234)][
-        place
-    ]
-    assert not any(wire.value(index + PROFILE * other) for other in EACH if other != axis
-                   for index in (0x6060, 0x607A, 0x60FF))  # fmt: skip
-
-
-@pytest.mark.parametrize("place", range(4))
-@pytest.mark.parametrize("axis", EACH)
 def test_each_of_the_24_sent_pdos_tells_of_its_axis(wire, axis, place):
     enable(wire, [axis])
     give(wire, 0x1800 + PDO * axis + place, 0x345, 1)
@@ -217,20 +159,6 @@ def test_each_of_the_24_sent_pdos_tells_of_its_axis(wire, axis, place):
     rest = int.from_bytes(frame.data[2:], "little", signed=True)
     assert rest == [0, 3, wire.value(0x6064 + PROFILE * axis), wire.value(0x606C + PROFILE * axis)][place]
     assert place < 2 or rest > 1000
-
-
-def test_a_pdo_carries_three_objects_of_any_axes(wire):
-    enable(wire, (1, 4))
-    words = [0x6041 + PROFILE * axis << 16 | 0x10 for axis in (1, 2, 4)]
-    give(wire, 0x1800, 0x185, 1, words)
-    wire.start()
-    wire.take()
-    (frame,) = [one for one in wire.receive(0x80) if one.can_id == 0x185]
-    assert [int.from_bytes(frame.data[2 * k : 2 * k + 2], "little") & 0x6F for k in range(3)] == [0x27, 0x40, 0x27]
-    assert wire.download(0x1800, 1, 0x185 | OFF, 4) == 0
-    assert wire.download(0x1A00, 0, 4, 1) in (VALUE_RANGE, VALUE_TOO_HIGH)
-    assert wire.download(0x1A00, 0, 0, 1) == 0
-    assert wire.download(0x1A00, 1, 0x2003_0008, 4) == CANNOT_BE_MAPPED
 
 
 def test_thirty_frames_per_sync_take_four_milliseconds_of_a_bus_of_1_mbit_s(wire):
@@ -262,26 +190,6 @@ def test_thirty_frames_per_sync_take_four_milliseconds_of_a_bus_of_1_mbit_s(wire
 
 
 # --- EMCY -------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("axis", EACH)
-def test_an_emergency_names_its_motor(wire, drives, axis):
-    enable(wire)
-    drives.machine.set_temperatures(25.0, np.where(np.arange(AXES) == axis, 151.0, 25.0))
-    wire.play(f"""
-        wait 1 ms
-        tx 085  10 43 09 02 {axis:02X} 00 00 00   # overtemperature
-        tx 085  10 43 09 01 {axis:02X} 00 00 00
-    """)
-    assert states(wire) == [FAULT if other == axis else ENABLED for other in EACH]
-    assert wire.value(0x1001) == 9
-    drives.machine.set_temperatures(25.0, 25.0)
-    wire.play(f"""
-        rx 605  2B {0x40:02X} {0x60 + 8 * axis:02X} 00 80 00 00 00
-        tx 585  60 {0x40:02X} {0x60 + 8 * axis:02X} 00 00 00 00 00
-        wait 1 ms
-        tx 085  00 00 00 00 {axis:02X} 00 00 00
-    """)
-
-
 def test_the_enable_input_belongs_to_the_module_which_tells_of_it_once(wire, drives):
     """Table 380 of the TMCM-3313 has FFh in place of the motor; CiA 301 has one emergency for one event."""
     enable(wire, (0, 3))

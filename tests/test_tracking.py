@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from rigs.world_bus import WorldBus
 from scipy.linalg import solve_continuous_are
 
-from drive_env import CanDrives, EmulatedDrives
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives
 from drive_env.devices import find_device
 from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.envs import tracking_cycle as cycle
@@ -93,12 +90,7 @@ def test_the_page_has_what_each_load_follows_by_default():
         ({"trajectory": "circle"}, r"'hold', 'moves', 'sines', 'run', not 'circle'"),
         ({"weights": {"speeed": 1.0}}, r"a weight's name is one of 'tracking', .*not 'speeed'"),
         ({"delay": 0}, r"delay is 1\.\.\.10 communication cycles, not 0"),
-        ({"stage": 2.0}, r"must lie in 0\.\.\.1, not 2"),
         ({"speed": 0.0}, "speed must be above 0 and finite, not 0"),
-        ({"loda": "gantry"}, r"there is no option 'loda'; there are load, device, motor"),
-        ({"load": "two_masses"}, "two_mass"),
-        ({"motor": "no"}, "qbl4208"),
-        ({"distributions": "no"}, "two_mass"),
     ],
 )
 def test_a_wrong_value_names_the_valid_ones(options, message):
@@ -130,80 +122,7 @@ def test_a_lane_is_the_same_alone_and_among_others(load):
             assert np.array_equal(many[:, lane], one[:, 0])
 
 
-def test_the_view_is_lane_0():
-    given = actions(50, 3)
-    with tracking(3, duration=0.05) as lanes:
-        observations, rewards, _, truncated = run(lanes, given, seed=11)
-    env = gymnasium.make(NAME, duration=0.05, num_threads=1).unwrapped
-    assert np.array_equal(env.reset(seed=11)[0], observations[0, 0])
-    for k in range(50):
-        observation, reward, _, over, _ = env.step(given[k, 0])
-        assert np.array_equal(observation, observations[k + 1, 0]) and reward == rewards[k + 1, 0]
-    assert over and truncated[50, 0]
-    env.close()
-
-
-def test_seeds_make_episodes_and_machines():
-    with tracking(2, distributions="two_mass", duration=0.01) as lanes:
-        first, told = lanes.reset(seed=0)
-        again, told_again = lanes.reset(seed=0)
-        _, told_other = lanes.reset(seed=100)
-    assert np.array_equal(first, again)
-    inertia = [info["parameters"]["load.inertia"] for info in (told, told_again, told_other)]
-    assert np.array_equal(inertia[0], inertia[1]) and not np.any(inertia[0] == inertia[2])
-
-
 # --- ends -------------------------------------------------------------------------------------------------------------
-def test_time_truncates_and_the_episodes_after_are_whole():
-    with tracking(2, duration=0.02, autoreset_mode="SameStep") as lanes:
-        *_, truncated = run(lanes, actions(60, 2))
-    assert np.flatnonzero(truncated[:, 0]).tolist() == [20, 40, 60]
-
-
-def test_a_tripped_drive_terminates_its_lane_and_names_the_fault():
-    given = actions(30, 3)
-    with tracking(3) as undisturbed:
-        expected = run(undisturbed, given)
-    with tracking(3) as lanes:
-        lanes.reset(seed=0)
-        for k in range(10):
-            lanes.step(given[k])
-        lanes.drives.machine.enable_input = np.array([True, False, True])
-        _, reward, terminated, truncated, info = lanes.step(given[10])
-        if not terminated.any():  # the sample that shows it is the next one
-            _, reward, terminated, truncated, info = lanes.step(given[11])
-        assert terminated.tolist() == [False, True, False] and not truncated.any()
-        assert info["fault"][1] == "shutdown_switch" and info["fault"][0] == ""
-        assert info["reward_terms"]["trip"].tolist() == [0.0, 1.0, 0.0] and reward[1] < -5.0
-        lanes.drives.machine.enable_input = True
-        for k in range(12, 30):
-            observation, reward, *_ = lanes.step(given[k])
-            assert np.array_equal(observation[[0, 2]], expected[0][k + 1, [0, 2]])
-            assert np.array_equal(reward[[0, 2]], expected[1][k + 1, [0, 2]])
-
-
-@pytest.mark.filterwarnings("ignore:machine 1 left the range of physics:RuntimeWarning")
-def test_a_machine_that_diverges_leaves_the_others_bit_identical():
-    given = actions(40, 9)
-    with tracking(9) as undisturbed:
-        expected = run(undisturbed, given)
-    with tracking(9) as lanes:
-        lanes.reset(seed=0)
-        for k in range(40):
-            if k == 10:
-                lanes.drives.machine.load_torque = np.where(np.arange(9) == 1, np.nan_to_num(1e300), 0.0)
-            observation, reward, terminated, _, info = lanes.step(given[k])
-            if terminated[1]:
-                assert "diverged" in info["fault"][1]
-                lanes.drives.machine.load_torque = 0.0
-            others = np.arange(9) != 1
-            assert lanes.observation_space.contains(observation)
-            assert np.array_equal(observation[others], expected[0][k + 1, others])
-            assert np.array_equal(reward[others], expected[1][k + 1, others])
-            assert not terminated[others].any()
-        assert not lanes.drives.machine.diverged.any()  # it lives again
-
-
 def test_a_fallen_pole_ends_the_episode():
     with tracking(2, load="inverted_pendulum", duration=5.0, autoreset_mode="SameStep") as lanes:
         lanes.reset(seed=0)
@@ -443,52 +362,6 @@ class Bare:
         return getattr(self._drives, name)
 
 
-def over_can(options, given, episodes, load):
-    world = World(lockstep=True)
-    world.add(EmulatedDrives(load=load, num_threads=1), list(range(1, 1 + (2 if load == "gantry" else 1))))
-    nodes = (1, 2) if load == "gantry" else (1,)
-    bus = WorldBus(world)
-    try:
-        with CanDrives(bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives:
-            return episode(drives, options, given, episodes)
-    finally:
-        bus.shutdown()
-        world.close()
-
-
-def in_process(options, given, episodes, load):
-    with EmulatedDrives(load=load, num_threads=1) as drives:
-        return episode(Bare(drives), options, given, episodes)
-
-
-def episode(drives, options, given, episodes):
-    lanes = Tracking(1, drives=drives, autoreset_mode="Disabled", **options)
-    rows = []
-    for seed in range(episodes):
-        rows.append(lanes.reset(seed=seed)[0])
-        for action in given:
-            observation, reward, terminated, *_ = lanes.step(action)
-            rows.append(observation)
-            rows.append(np.array([[reward[0], terminated[0]]]))
-    return rows
-
-
-@pytest.mark.parametrize(
-    ("load", "mode", "action"),
-    [("two_mass", "cst", "direct"), ("two_mass", "csv", "offset"), ("two_mass", "csp", "offset"),
-     ("two_mass", "csp", "direct"), ("gantry", "csv", "direct")],
-)  # fmt: skip
-def test_over_can_in_lockstep_the_observations_are_the_same(load, mode, action):
-    options = {"load": load, "mode": mode, "action": action, "duration": 0.06, "delay": 2}
-    given = 0.5 * actions(60, 1, 2 if load == "gantry" else 1)
-    expected = in_process(options, given, 2, load)
-    found = over_can(options, given, 2, load)
-    assert len(expected) == len(found) == 2 * (1 + 2 * 60)
-    for k, (one, two) in enumerate(zip(expected, found, strict=True)):
-        assert np.array_equal(one, two), k
-    assert np.ptp([row[0, 2] for row in expected[1::2] if row.shape[1] > 2]) > 0 or mode == "csp"
-
-
 @pytest.mark.parametrize(("load", "mode"), [("two_mass", "csp"), ("gantry", "csp"), ("two_mass", "cst")])
 def test_on_a_bus_an_axis_left_in_haste_is_taken_back_at_once(load, mode):
     """The last leap of a target in csp is at 35 turns per ms: as the speed that pp begins with it would run away."""
@@ -524,29 +397,6 @@ def test_on_a_bus_what_needs_a_machine_is_refused():
 
 
 # --- long and with others ---------------------------------------------------------------------------------------------
-@pytest.mark.slow
-def test_stable_baselines_trains_on_lanes_without_copies():
-    import stable_baselines3 as sb3
-
-    from drive_env.envs.stable_baselines import DriveVecEnv
-
-    with pytest.raises(ValueError, match="SameStep"), tracking(2) as lanes:
-        DriveVecEnv(lanes)
-    with tracking(8, duration=0.03, autoreset_mode="SameStep") as lanes:
-        env = DriveVecEnv(lanes)
-        handed = []
-        step = lanes.step
-        lanes.step = lambda given: handed.append(step(given)) or handed[-1]
-        env.seed(3)
-        assert np.array_equal(env.reset(), Tracking(8, duration=0.03, num_threads=1).reset(seed=3)[0])
-        for _ in range(30):
-            observation, _, ended, infos = env.step(np.zeros((8, 1), np.float32))
-            assert observation is handed[-1][0]
-        assert ended.all() and infos[2]["TimeLimit.truncated"]
-        assert np.array_equal(infos[2]["terminal_observation"], handed[-1][4]["final_obs"][2])
-        sb3.PPO("MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, device="cpu").learn(256)
-
-
 def test_a_configuration_takes_the_loads_own_task():
     assert TrackingConfig(load="cart_pendulum").mode == "csv"
     assert TrackingConfig(load="cart_pendulum", mode="cst").mode == "cst"

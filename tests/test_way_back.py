@@ -254,7 +254,7 @@ def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
 # --- axes that are left out ---------------------------------------------------------------------------------------
 def test_what_is_borrowed_of_axes_left_out_is_in_the_file_and_comes_back(tmp_path):
     """PDOs are mapped for a whole TMCM-6212: 50 objects of axes 1 to 5 stayed changed after `--axis 0` was killed."""
-    from rigs.several_axes import partly_wired
+    from rigs.six_axes import partly_wired
     from rigs.world_bus import WorldBus
 
     from drive_env import CanDrives

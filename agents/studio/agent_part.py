@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from nicegui import ui
 
 from drive_env.devices import find_device
+from drive_env.loops.dynamics import DEFAULT
 from drive_env.studio.parts import StudioPart
 from drive_env.studio.sentences import sentence
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from tuning.studio.tuner_card import TunerCard
     from tuning.target import Target
 
-TRIALS_SHARE = (0.3, 0.78)  # of a run's progress: where its trials begin and end
+TRIALS_SHARE = (0.3, 0.68)  # of a run's progress: where its trials begin and end
 
 
 def build(card: TunerCard) -> None:
@@ -60,35 +61,27 @@ def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSessi
     """Return the agent's work: that of `drive-tune auto --by agent`, its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
-        from agents.tuner import tuning_run
         from agents.tuner.known_range import outside
         from agents.tuner.open_tuner import remark
-        from tuning.certificate.certificate_files import certificate_files
+        from agents.tuner.tuning_run import method_of
+        from tuning.auto_to_files import auto_to_files
 
         outer = target.device.gains.columns_of("velocity", "position")
         low, high = TRIALS_SHARE
         count = int(policy.bundle.configuration["trials"])
-        share = 0.0
-
-        def say(what: str) -> None:
-            progress(what, max(share, low if what == "trials" else share))
 
         def show(trial: TrialShown) -> None:
-            nonlocal share
-            share = low + (high - low) * trial.number / max(1, count)
             figures = [str(value) for value in trial.gains[0, outer]]
             run.trials.append((str(trial.number or "rule"), *figures, f"{trial.measured[0]:.3f}", remark(trial)))
-            progress("trials", share)
+            progress("trials", low + (high - low) * trial.number / max(1, count))
 
         run.folder.mkdir(parents=True, exist_ok=True)
         doubts = outside(policy.bundle, target, None if target.bus else target.machine)
         for doubt in doubts:
             progress(doubt, 0.0)
-        done = tuning_run.run(
-            target, policy, run.folder / "before.toml", name=name, doubts=doubts, keep=store, show=show, say=say,
-            files=lambda certificate: certificate_files(certificate, run.folder),
-        )  # fmt: skip
-        return done.result
+        method = method_of(policy, name, doubts, show, lambda what: progress(what, low))
+        dynamics = policy.bundle.configuration.get("dynamics", DEFAULT)
+        return auto_to_files(target, run.folder, progress, keep=store, dynamics=dynamics, method=method)
 
     return work
 

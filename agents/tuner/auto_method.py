@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from agents.shipped import TUNER
 from agents.tuner.known_range import outside
 from agents.tuner.open_tuner import open_tuner, remark, titles_of_trials
-from agents.tuner.tuning_run import finder
-from tuning.auto.one_button import Method
+from agents.tuner.tuning_run import method_of
 from tuning.commands.methods import OpenedMethod
 
 if TYPE_CHECKING:
     from agents.tuner.tune_target import TrialShown
+    from tuning.auto.one_button import Method
     from tuning.target import Target
 
 J = (
@@ -63,7 +63,7 @@ def open_method(
             figures = "".join(f" {value:>{w}}" for value, w in zip(trial.gains[0, outer], widths, strict=True))
             tell(f"{trial.number or 'rule':>5}{figures} {trial.measured[0]:>8.3f}  {remark(trial)}".rstrip())
 
-        return Method(f"agent {name}", finder(policy, doubts, show, say), math.inf)
+        return method_of(policy, name, doubts, show, say)
 
     count = policy.bundle.configuration["trials"]
     return OpenedMethod(f"1 + {count} trials of gains that the agent proposes", math.inf, method)

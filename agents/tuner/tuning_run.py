@@ -4,90 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from agents.tuner.tune_target import TrialShown, best_good, tune_target
-from drive_env.loops.dynamics import DEFAULT
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
-    from tuning.auto.one_button import Find
-    from tuning.auto.result import Result
+    from tuning.auto.one_button import Find, Method
     from tuning.auto.stages import Basis, RecordedGains
-    from tuning.certificate.certificate import Certificate
-    from tuning.target import Target
 
 
-class TunerRun(NamedTuple):
-    """The result of a run, its certificate, and the agent's trials."""
-
-    result: Result
-    certificate: Certificate
-    trials: tuple[TrialShown, ...]
-
-
-def run(
-    target: Target,
-    policy: Any,
-    file: Path,
-    *,
-    name: str,
-    doubts: Sequence[str] = (),
-    keep: bool = True,
-    show: Callable[[TrialShown], None] = lambda trial: None,
-    say: Callable[[str], None] = lambda what: None,
-    files: Callable[[Certificate], AbstractContextManager[object]] = nullcontext,
-) -> TunerRun:
-    """Tune a target; gains that fail a check are rolled back, and the result says why.
-
-    What raises leaves the drives with what they had, at rest and disabled.
+def method_of(
+    policy: Any, name: str, doubts: Sequence[str], show: Callable[[TrialShown], None], say: Callable[[str], None]
+) -> Method:
+    """Return the method of auto that tries a policy's gains in the place of its own design.
 
     Args:
-        target: The drives.
-        policy: A policy for GainTuning.
-        file: Where the state before is left, for `drive-tune undo`.
-        name: Of the agent, for the certificate; it is asked for the dynamics of its configuration.
+        policy: A policy for GainTuning; PolicyError in the run if it gives no number.
+        name: Of the agent, for the certificate.
         doubts: Reservations of the certificate from the begin.
-        keep: Whether drives on a bus keep the gains over a power cycle.
         show: Called after every trial.
-        say: Called with what is under way.
-        files: Writes the certificate down, before the drives keep the gains; its files vanish if the block in it fails.
-
-    Raises:
-        PolicyError: If the policy gives no number; BusError, RuntimeError or TimeoutError for the drives; OSError for
-            a file that cannot be written.
+        say: Called before the first.
     """
-    from tuning.auto.certify import certificate
-    from tuning.auto.one_button import Method, auto
+    from tuning.auto.one_button import Method
 
-    trials: list[TrialShown] = []
-
-    def tried(trial: TrialShown) -> None:
-        trials.append(trial)
-        show(trial)
-
-    def told(what: str, share: float) -> None:
-        if share < 1.0:
-            say(what)
-
-    certificates: list[Certificate] = []
-
-    def written(result: Result) -> AbstractContextManager[object]:
-        certificates.append(certificate(target, result, 0, tuner=f"agent {name}"))
-        return files(certificates[0])
-
-    asked = policy.bundle.configuration.get("dynamics", DEFAULT)
-    method = Method(f"agent {name}", finder(policy, doubts, tried, say), math.inf)
-    result = auto(target, file, method=method, dynamics=asked, keep=keep, progress=told, files=written)
-    return TunerRun(result, certificates[0], tuple(trials))
+    return Method(f"agent {name}", finder(policy, doubts, show, say), math.inf)
 
 
 def finder(policy: Any, doubts: Sequence[str], show: Callable[[TrialShown], None], say: Callable[[str], None]) -> Find:
-    """Return the search of a run of auto, by a policy's trials; arguments as `run` has them."""
+    """Return the search of a run of auto, by a policy's trials; arguments as `method_of` has them."""
 
     def find(bench: AutoBench, basis: Basis, _: Any) -> RecordedGains:
         for doubt in doubts:

@@ -7,7 +7,6 @@ of type) and datagrams one behind the other: command, index, address, length, in
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from typing import NamedTuple
@@ -130,18 +129,6 @@ def read(frame: bytes | bytearray, start: int) -> list[Datagram]:
         (counter,) = struct.unpack_from("<H", frame, at + DATAGRAM + length)
         found.append(Datagram(command, address, data, counter, number, interrupt))
     return found
-
-
-def with_check_sequence(frame: bytes) -> bytes:
-    """Return an Ethernet frame with its FCS (IEEE 802.3, 3.2.9)."""
-    return frame + struct.pack("<I", zlib.crc32(frame))
-
-
-def without_check_sequence(frame: bytes) -> bytes | None:
-    """Return a frame without its FCS; None where it does not fit: the frame was damaged on its way."""
-    if len(frame) < SHORTEST_FRAME + 4 or struct.pack("<I", zlib.crc32(frame[:-4])) != frame[-4:]:
-        return None
-    return frame[:-4]
 
 
 def lines(datagrams: Iterable[Datagram]) -> list[str]:

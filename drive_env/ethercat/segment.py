@@ -1,7 +1,7 @@
 """A segment: slaves in a line. A frame passes each of them on its way out and comes back through all.
 
-A frame that is not whole changes nothing: its datagrams must fill its length, and, where the way it came tells the FCS,
-that must fit. Then the first slave counts it (0300h or 030Ch), those behind count that one before did (0308h).
+A frame that is not whole changes nothing: its datagrams must fill its length. Else the first slave counts it (030Ch),
+and those behind count that one before did (0308h).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from drive_env.ethercat import datagrams, registers
 from drive_env.ethercat.slave import EtherCatSlave
 
 HOP = 450  # ns from one slave's port to the next one's: a metre of cable, receiver, processing unit; ours
-INVALID_FRAME = 0  # byte of a port's two RX error counters
 SOURCE, LOCAL = 6, 0x02  # a controller sets this bit of the source address: the frame has been here
 
 
@@ -54,15 +53,6 @@ class Segment:
             listener(now, done, True)
         return done
 
-    def transfer_wire(self, frame: bytes, now: float) -> bytes | None:
-        """Return an Ethernet frame with its FCS as it comes back; None: it was damaged, or does not come back."""
-        plain = datagrams.without_check_sequence(frame)
-        if plain is None:
-            self._count(registers.RX_ERRORS + INVALID_FRAME)
-            return None
-        done = self.transfer(plain, now)
-        return None if done is None else datagrams.with_check_sequence(done)
-
     def transfer_payload(self, payload: bytes, now: float) -> bytes | None:
         """Return the payload of a UDP datagram as it comes back; None: it does not."""
         frame = datagrams.BROADCAST + datagrams.MASTER + datagrams.ETHERTYPE + payload
@@ -74,7 +64,8 @@ class Segment:
         """Let a frame pass all slaves; returns whether it was whole."""
         places = datagrams.find(body, start)
         if places is None:
-            self._count(registers.UNIT_ERRORS)
+            for k, slave in enumerate(self.slaves):
+                slave.controller.count(registers.UNIT_ERRORS if k == 0 else registers.FORWARDED_ERRORS)
             return False
         time = round(now * 1e9)
         last = len(self.slaves) - 1
@@ -88,7 +79,3 @@ class Segment:
                     clock.latch(1, time + (2 * last - k) * HOP)
             slave.after_frame(now)
         return True
-
-    def _count(self, address: int) -> None:
-        for k, slave in enumerate(self.slaves):
-            slave.controller.count(address if k == 0 else registers.FORWARDED_ERRORS)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace as vary
+from types import SimpleNamespace
 
 import numpy as np
 
+from agents.tuner.tuning_run import method_of
+from drive_env.loops.dynamics import DEFAULT
 from tuning.auto import correction, design, one_button
 from tuning.auto.stages import Basis, IdentifiedAxes, RecordedGains
 
@@ -40,6 +43,14 @@ def short_designs(replace):
     """Have auto look at few sets of gains; `replace` is monkeypatch.setattr or setattr."""
     for name, value in (("FINALISTS", 2), ("EACH", 1), ("STEPS", (1.15,)), ("PROMISING", 4)):
         replace(design, name, value)
+
+
+def run_agent(target, policy, file, *, name, doubts=()):
+    """Tune by an agent as `drive-tune auto --by agent` does; return the result, and each trial."""
+    trials = []
+    method = method_of(policy, name, doubts, trials.append, lambda what: None)
+    asked = policy.bundle.configuration.get("dynamics", DEFAULT)
+    return SimpleNamespace(result=one_button.auto(target, file, method=method, dynamics=asked), trials=trials)
 
 
 def skip_stages(replace, gains):

@@ -266,6 +266,7 @@ class Facts:
     def __init__(self, manual: Manual) -> None:
         self.manual = manual
         self.name = manual.name
+        self.path = Path(drive_env.__file__).parent / "devices" / self.name / f"{self.name}.eds"
 
     def __repr__(self) -> str:
         return self.name
@@ -274,8 +275,7 @@ class Facts:
     def eds(self) -> configparser.ConfigParser:
         """Its EDS; each section and each key stands once."""
         found = configparser.ConfigParser(interpolation=None, comment_prefixes=(";",))
-        path = Path(drive_env.__file__).parent / "devices" / self.name / f"{self.name}.eds"
-        found.read_string(path.read_text(encoding="utf-8"))
+        found.read_string(self.path.read_text(encoding="utf-8"))
         return found
 
     @cached_property

@@ -114,12 +114,12 @@ class Working:
         return self.target.low - here, self.target.high - here
 
 
-def cautious_gains(target: Target, inertia: ArrayLike, motor: Motor | None = None) -> Integers:
+def cautious_gains(target: Target, inertia: ArrayLike) -> Integers:
     """Return raw gains, (num_axes, count), for total inertias [kg*m^2], slow enough for rigid and elastic loads."""
     J = np.broadcast_to(np.asarray(inertia, float), (target.num_axes,))
     return np.array([
         bandwidth_gains(
-            target.device, motor or target.motor, float(J[k]), current_hz=CURRENT_HZ,
+            target.device, target.motor, float(J[k]), current_hz=CURRENT_HZ,
             velocity_hz=cautious_bandwidth(target.motor, float(J[k])), position_hz=POSITION_HZ,
             supply=float(target.supply[k]), integration=INTEGRATION,
         )

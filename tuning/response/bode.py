@@ -23,20 +23,16 @@ _FINE = 600
 _TICKS = (1, 2, 5, 10, 20, 50, 100, 200, 400, 1000)  # Hz
 
 
-def bode_figure(response: MeasuredLoop, axis: int = 0, plant: Plant | None = None) -> Figure:
-    """Return magnitude, phase and coherence over frequency, and the Nyquist curve around -1.
+def bode_figure(response: MeasuredLoop, axis: int = 0) -> Figure:
+    """Return magnitude, phase and coherence of an axis over frequency, and the Nyquist curve around -1.
 
-    Args:
-        response: What was measured.
-        axis: Which axis of it.
-        plant: Draw the loop that the linear model computes of this plant with the same gains; of a velocity loop the
-            fitted one by default.
+    The loop that the linear model computes of the fitted plant with the same gains is drawn beside what was measured.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
     fit = response.fits[axis]
-    known = fit.plant if plant is None and fit is not None and not fit.reason else plant
+    known = fit.plant if fit is not None and not fit.reason else None
     figure = Figure(figsize=(11.0, 7.0), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(3, 2), height_ratios=(3, 3, 1.4))
     magnitude = figure.add_subplot(grid[0, 0])
@@ -56,9 +52,9 @@ def bode_figure(response: MeasuredLoop, axis: int = 0, plant: Plant | None = Non
     return figure
 
 
-def write_bode(path: Path, response: MeasuredLoop, axis: int = 0, plant: Plant | None = None) -> None:
+def write_bode(path: Path, response: MeasuredLoop, axis: int = 0) -> None:
     """Write `bode_figure` to a file; its ending decides the format: .png, .svg, .pdf."""
-    write_picture(path, bode_figure(response, axis, plant), 120)
+    write_picture(path, bode_figure(response, axis), 120)
 
 
 def _model(response: MeasuredLoop, axis: int, plant: Plant | None) -> tuple[Floats, Complex] | None:
