@@ -16,6 +16,7 @@ from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
 from drive_env.drives.limits import Limits
 from drive_env.ethercat.application import AlState, AlStatusCode, ClockSetting
+from drive_env.ethercat.coe_node import CoeNode
 from drive_env.ethercat.esi import esi_text
 from drive_env.ethercat.sii_content import sii_content
 from drive_env.firmware.record import set_lanes
@@ -187,6 +188,13 @@ def test_an_identification_request_is_answered_by_c_id_which_is_the_alias_too(ri
     assert rig.request(0x28) == (0x12, 0x0011), "an error goes before"
 
 
+def test_the_serial_number_is_that_of_the_eeprom(machine):
+    node = CoeNode(machine, serial=7)
+    node.power_on(0.0)
+    assert node.dictionary.port(0x1018, 4).read() == 7
+    assert struct.unpack_from("<I", node.read_sii(), 2 * 0x0E) == (7,)
+
+
 @pytest.mark.parametrize(
     ("cycle", "taken"), [(250, True), (500, True), (1000, True), (2000, True), (750, False), (4000, False)]
 )
@@ -300,9 +308,43 @@ def test_a_target_of_64_bits_is_held_against_the_limits_by_all_of_them(within_tw
         drives.write(0x23C7, TURN_INSIDE // 100)
 
 
+def test_beside_the_native_image_each_d_mode_obeys_its_own_set_point(rig, machine):
+    """607Ah, written by SDO, is pp's, and what the image has meanwhile moves nothing; csp has the image's."""
+    for index, raw, size in ((0x2303, 7, 4), (0x6060, 1, 1)):
+        assert rig.download(index, 0, raw.to_bytes(size, "little")) == 0
+    to_op(rig, 0x1721, 0x1B21)
+    image = bytearray(44)
+
+    def exchange(position, control, cycles=1):
+        struct.pack_into("<qI", image, 0, round(position * TURN_INSIDE), control)
+        for _ in range(cycles):
+            data, _ = rig.exchange_image(bytes(image), 44)
+        return struct.unpack_from("<q", data)[0] / TURN_INSIDE
+
+    for word in (0x80, 0x06, 0x07, 0x0F):
+        assert rig.download(0x6040, 0, struct.pack("<H", word)) == 0
+        exchange(0.3, 0, 20)
+    assert rig.download(0x607A, 0, struct.pack("<i", TURN // 10)) == 0
+    exchange(0.3, 0)
+    assert rig.download(0x6040, 0, b"\x1f\x00") == 0
+    assert exchange(0.3, 0, 400) == pytest.approx(0.1, abs=0.01)
+    assert rig.download(0x6040, 0, bytes(2)) == 0
+    begin = exchange(0.3, 0)
+    for index, raw, size in ((0x2303, 3, 4), (0x6060, 8, 1)):
+        assert rig.download(index, 0, raw.to_bytes(size, "little")) == 0
+    exchange(begin, 0, 5)
+    exchange(begin, 2, 20)
+    for share in np.linspace(0.0, 0.1, 200):
+        assert rig.download(0x607A, 0, struct.pack("<i", -TURN)) == 0
+        exchange(begin + share, 2)
+    assert exchange(begin + 0.1, 2, 200) == pytest.approx(begin + 0.1, abs=0.01)
+    exchange(begin + 0.1, 0, 3)
+    assert machine.read(0x6041)[0] & 0x6F != 0x27
+
+
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_what_the_native_image_had_moves_no_axis_that_is_enabled_nor_keeps_one_from_its_move(lockstep):
-    """Its position set-point is 607Ah: an axis enabled in csp went 0.1 turns to it, and moves in pp ended there."""
+    """Its set-point is csp's alone: an axis enabled in csp went 0.1 turns to it, and moves in pp ended there."""
     pace = {"pace": "lockstep"} if lockstep else {}
     with (
         EmulatedSegment("tgz_d", load="gantry", lockstep=lockstep) as segment,

@@ -308,6 +308,14 @@ def test_of_a_field_an_object_takes_its_own_bits(drive):
     assert drive.take() == [(0x607A, -(1 << 31)), (0x2000, 0x7F), (0x6060, -128)]
 
 
+def test_a_field_that_is_not_taken_leaves_its_object_as_it_is(drive):
+    image = PackedFields([ImageField("u16", (0x2000, 0), False, ((0x6060, 0), (3, 8)))], drive.find)
+    for mode, taken in ((3, True), (7, False), (8, True)):
+        drive.values[0x6060] = mode
+        assert image.write(bytes.fromhex("55 00"))
+        assert drive.take() == ([(0x2000, 0x55)] if taken else [])
+
+
 @pytest.mark.parametrize(("raw", "transmit", "taken"), [
     (0x00050008, False, True), (0x00070020, False, True), (0x00020008, False, True),
     (0x00050008, True, False),  # nothing is passed over that goes out

@@ -15,11 +15,19 @@ NAMES_ANOTHER = "@"
 
 
 class ImageField(NamedTuple):
-    """A field: its type, its object, None for a reserved field; whether it names the object that the image carries."""
+    """A field of an image.
+
+    Attributes:
+        type: Its data type.
+        key: Its object; None for a reserved field.
+        is_name: Whether it names the object that the image carries.
+        taken_while: An object, and its values with which the field is taken; None: it always is.
+    """
 
     type: str
     key: Key | None
     is_name: bool
+    taken_while: tuple[Key, tuple[int, ...]] | None = None
 
 
 class FixedImage(NamedTuple):
@@ -42,9 +50,13 @@ def fixed_images(folder: Path) -> dict[int, FixedImage]:
     }
 
 
-def _field(kind: str, text: str) -> ImageField:
+def _field(kind: str, text: str, gate: str = "", values: tuple[int, ...] = ()) -> ImageField:
     name = text.removeprefix(NAMES_ANOTHER)
     if not name:
         return ImageField(kind, None, False)
+    return ImageField(kind, _key(name), name != text, (_key(gate), tuple(values)) if gate else None)
+
+
+def _key(name: str) -> Key:
     index, sub = name.split(":")
-    return ImageField(kind, (int(index, 16), int(sub)), name != text)
+    return int(index, 16), int(sub)

@@ -139,14 +139,10 @@ def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
     still = drives.read(cia402.POSITION_ACTUAL) if name == cia402.TARGET_POSITION else 0
     offset = None if added is None else _read_if_there(drives, added)
     drives.write(name, still if offset is None else still - offset, where=where)
-    if name == cia402.TARGET_POSITION and _has_target_inside(drives):
-        drives.write(Role.TARGET_INSIDE, drives.read(Role.POSITION_INSIDE), where=where)
-
-
-def _has_target_inside(drives: BasicDrives) -> bool:
-    """Return whether an object doubles 607Ah: an image that carries it would bring its old value back."""
     device: Device | None = getattr(drives, "device", None)
-    return device is not None and Role.TARGET_INSIDE in device.roles
+    if name == cia402.TARGET_POSITION and device is not None and Role.TARGET_INSIDE in device.roles:
+        # It doubles 607Ah: an image that carries it would bring its old value back.
+        drives.write(Role.TARGET_INSIDE, drives.read(Role.POSITION_INSIDE), where=where)
 
 
 def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
@@ -377,9 +373,6 @@ def start_move(
     axes = np.ones(drives.num_axes, bool) if where is None else where
     word = cia402.ENABLE_OPERATION | (cia402.RELATIVE if relative else 0)
     drives.write(cia402.TARGET_POSITION, position, where=where)
-    if _has_target_inside(drives):
-        per_unit = drives.read(Role.POSITION_NUMERATOR) / drives.read(Role.POSITION_DIVISOR)
-        drives.write(Role.TARGET_INSIDE, np.rint(np.asarray(position) * per_unit).astype(np.int64), where=where)
     with _bit_4_is_low(drives, word, where):
         kept = _still_acknowledged(drives, where)
         if relative and kept.any():

@@ -123,6 +123,7 @@ class EmulatedDrives(Saved):
     ) -> None:
         check_number_of_machines(num_machines)
         self._rated = self.device = find_device(device)  # with the rates that it was made for
+        self.image_period = self.device.cycle
         self.motor = find_motor(self.device.default_motor if motor is None else motor)
         self.device.check_motor(self.motor)
         self.load = find_load(load)
@@ -198,11 +199,13 @@ class EmulatedDrives(Saved):
         self._run(cycles, self._nothing)
 
     def set_cycle(self, cycle: float) -> None:
-        """Let a communication cycle be `cycle` [s], no longer than the device's own; time goes on from where it is.
+        """Let process images be `cycle` [s] apart, and a communication cycle as long, the device's own at the most.
 
-        A step of physics is no longer than before; the velocity loop has the nearest lower rate that fits the cycle.
+        Time goes on from where it is. A step of physics is no longer than before; the velocity loop has the nearest
+        lower rate that fits the cycle.
         """
         device = with_cycle(self._rated, cycle)
+        self.image_period = max(cycle, device.cycle)
         if device.cycle != self.device.cycle:
             longer = device.cycle / self.device.cycle
             self.device = device

@@ -64,7 +64,7 @@ class CoeNode:
         first_axis: Number of the device's first axis among the drives'.
         spare: Drives of the node's last axes, those that `drives` have none for.
         store: The file that is its non-volatile memory; without one it lasts as long as the node.
-        serial: Serial number in its EEPROM.
+        serial: Serial number in its EEPROM, and in 1018h:04 of a device that has it.
 
     Raises:
         ValueError: For a device that has no EtherCAT, or axes that the drives do not have.
@@ -121,7 +121,7 @@ class CoeNode:
         self._by_index = _by_index(entries)
         self._sdo = CoeSdoServer(self._port, self._entries_of, self._image, behaviour.send.length)
         self._information = SdoInformation(describe(device), behaviour.send.length)
-        self._sii = sii_content(device, serial)
+        self._sii, self._serial = sii_content(device, serial), serial
         self._waiting: bytes | None = None  # outputs that take effect with the next pulse
         self._number = device.canopen.objects.get("node_id")  # object of the node's number
         # Objects of measured times: register of the device, and when the last event was [s].
@@ -191,6 +191,8 @@ class CoeNode:
         self._objects.restore(NODE_ID, self._store.sections.get("communication", {}))
         if self._number is not None:
             self._objects.set("node_id", self._stored_number())
+        if "serial_number" in self._device.canopen.objects:
+            self._objects.set("serial_number", self._serial)
         self._times.clear()
         self._image.restart()
         self._errors.restart()

@@ -21,9 +21,9 @@ def _nanoseconds(duration: float) -> int:
 class EtherCatWorld:
     """Slaves in a line and the drives behind them.
 
-    In lockstep each frame with process data (LRD, LWR, LRW) lets one communication cycle pass after it, and nothing
-    else does: frames take no time, and what a frame brings back was there before its cycle. Otherwise time is what
-    `run_until` says.
+    In lockstep each frame with process data (LRD, LWR, LRW) lets one communication cycle pass after it, or as many as
+    the drives' process images are apart, and nothing else does: frames take no time, and what a frame brings back was
+    there before its cycle. Otherwise time is what `run_until` says.
 
     Attributes:
         segment: The line.
@@ -90,6 +90,11 @@ class EtherCatWorld:
         return min((drives.device.cycle for drives in self.drives), default=self._cycle_time)
 
     @property
+    def image_period(self) -> float:
+        """Time between two process images [s]: of its drives the shortest one."""
+        return min((drives.image_period for drives in self.drives), default=self._cycle_time)
+
+    @property
     def next_cycle(self) -> float:
         """When the next communication cycle ends [s]."""
         return (self._began + _nanoseconds(self.cycle_time)) / NANOSECONDS
@@ -130,9 +135,11 @@ class EtherCatWorld:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _after(self, done: bytes | None, start: int) -> bytes | None:
-        """Let a cycle pass, in lockstep, after a frame with process data."""
+        """Let the time to the next one pass, in lockstep, after a frame with process data."""
         if done is not None and self.lockstep:
             start = datagrams.begin(done) or start if start else start
             if any(place.command in LOGICAL for place in datagrams.find(done, start) or ()):
-                self.cycle()
+                due = self._began + _nanoseconds(self.image_period)
+                while self._began < due:
+                    self.cycle()
         return done

@@ -28,7 +28,7 @@ class PackedFields:
         self.size = self._layout.size
         self._bits = [TYPES[field.type][1] for field in fields]
         self._find = port
-        self._ports = [None if field.key is None else port(*field.key) for field in fields]
+        self._ports = [self._port(field) for field in fields]
         self._is_name = [field.is_name for field in fields]
         self._received = struct.Struct("<" + "".join(map(_received, self._bits, self._ports)))
         self._fields = ReceivedFields([one for one in self._ports if one is not None])
@@ -42,6 +42,16 @@ class PackedFields:
     def write(self, data: bytes) -> bool:
         """Write each object that takes its value; return whether all did."""
         return self._fields.write(self._received.unpack(data))
+
+    def _port(self, field: ImageField) -> ObjectPort | None:
+        """Return the way to a field's object, which a write does not reach while the field is not taken."""
+        if field.key is None:
+            return None
+        port = self._find(*field.key)
+        if field.taken_while is None:
+            return port
+        gate, values = self._find(*field.taken_while[0]), field.taken_while[1]
+        return port._replace(write=lambda raw: port.write(raw) if gate.read() in values else None)
 
     def _read(self, k: int) -> int:
         port = self._ports[k]

@@ -105,7 +105,7 @@ def entry(row: Row, section: str) -> str:
     access = PROCESS_DATA.get(row["pdo"], "rw") if row["access"] == "rw" else row["access"]
     lines = [f"[{section}]", f"ParameterName={row['name']}", f"ObjectType={VARIABLE}"]
     lines += [f"DataType=0x{TYPES[row['type']]:04X}", f"AccessType={access}"]
-    lines += [f"{key}={row[name]}" for key, name in (("LowLimit", "low"), ("HighLimit", "high")) if row[name]]
+    lines += [f"{key}={number(row[name])}" for key, name in (("LowLimit", "low"), ("HighLimit", "high")) if row[name]]
     lines += [f"DefaultValue={number(row['default'])}"] if row["default"] else []
     lines += [f"PDOMapping={int(row['pdo'] != 'no')}"]
     if row["unit"]:
