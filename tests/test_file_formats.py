@@ -26,9 +26,11 @@ from drive_env.bus.faults import Faults
 from drive_env.commands.cli import app as drive_env_app
 from drive_env.commands.frames import FORMATS, WRITTEN
 from drive_env.devices import device_names, find_device
+from drive_env.fieldbus.description import describe
 from drive_env.master.identity import Identity
 from drive_env.motors import MOTORS, NUMBERS, find_motor
 from drive_env.randomisation import random_machines as randomisation
+from drive_env.studio.workspace import Workspace
 from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,
@@ -258,3 +260,9 @@ def test_report_row_and_episodes(tmp_path):
     episode_log.save(tmp_path / "episodes.npz", "e", {}, [episode])
     with np.load(tmp_path / "episodes.npz") as stored:
         assert fields("episodes") == list(stored)
+
+
+def test_workspace_of_the_studio(tmp_path):
+    Workspace(describe("tmcm1636", None), tmp_path / "machine.toml").change(0, jog_speed="90 rpm")
+    data = tomllib.loads((tmp_path / "machine.toml").read_text(encoding="utf-8"))
+    assert list(data) == ["format", "device", "axis"] and set(data["axis"]["0"]) == set(fields("workspace"))

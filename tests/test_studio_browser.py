@@ -184,22 +184,31 @@ def test_two_pages_at_once(tab, served):
 
 # --- scope --------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
-def test_a_step_is_scoped_from_its_trigger_and_measured(tab, served):
+@pytest.mark.parametrize("moved_on", ["/scope", "/axes"])
+def test_a_step_is_scoped_from_its_trigger_and_measured(tab, moved_on):
+    """Moved on the same page; or on another one, where the trigger stays armed, with its cursors and its mode."""
     at_rest(tab)
+    tab.open("/scope")
     tab.press("enable")
     tab.await_state("Operation enabled")
-    tab.open("/scope")
+    choose(tab, "trigger-mode", "rolling")
     choose(tab, "trigger-mode", "single")
     status = lambda: tab.one(".studio-scope-status").text  # noqa: E731
     until(lambda: status() == "waiting for the trigger", "an armed trigger")
-    with chromium() as another:
-        mover = Tab(another, served).open("/axes")
-        mover.type("goal", "5 rev")
-        mover.press("move-by")
-        until(lambda: status() == "halted", "the picture")
-        header = tab.driver.execute_script("return studioScope.header")
-        assert header["triggered"] and header["from"] == pytest.approx(-0.2, abs=0.01)
-        assert {row["unit"] for row in header["channels"]} == {"rev", "rpm", "A"}
+    cursors = tab.driver.execute_script("studioScope.toggle(); return studioScope.cursors")
+    tab.open(moved_on)
+    before = until(lambda: tab.value(POSITION), "a position") if moved_on == "/axes" else None
+    tab.type("goal", "5 rev")
+    tab.press("move-by")
+    if before is not None:
+        until(lambda: abs(tab.value(POSITION) - before - 5.0) < 0.05, "the move")
+        tab.open("/scope")
+    until(lambda: status() == "halted", "the picture")
+    assert tab.driver.execute_script("return studioScope.cursors") == cursors
+    header = tab.driver.execute_script("return studioScope.header")
+    assert header["triggered"] and header["from"] == pytest.approx(-0.2, abs=0.01)
+    assert {row["unit"] for row in header["channels"]} == {"rev", "rpm", "A"}
+    tab.driver.execute_script("studioScope.toggle()")  # figures of all of it
 
     tab.press("measure")
     told = until(lambda: " ".join(one.text for one in tab.all(".studio-figures")).strip(), "figures")

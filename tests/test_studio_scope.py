@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +13,17 @@ import pytest
 from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.drives.trace import Trace
+from drive_env.fieldbus.description import describe
 from drive_env.studio.decimation import min_max, stride_of
 from drive_env.studio.recorder import SampleRing, ScopeRecorder
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
-from drive_env.studio.scope_trigger import ScopeTrigger, first_fired
+from drive_env.studio.scope_trigger import EDGES, ScopeTrigger, first_fired
 from drive_env.studio.scope_view import ScopeChannel, ScopeRecording, ScopeView, channel_of, with_channels
+from drive_env.studio.workspace import Workspace, trigger_of
 
 VELOCITY, STATUS = (cia402.VELOCITY_ACTUAL, 0), (cia402.STATUSWORD, 0)
 KNOWN = find_device("tmcm1636").new_dictionary()
+DEVICE = describe("tmcm1636", None)
 CHANNEL = ScopeChannel(VELOCITY, 0, "Velocity actual value", "rpm", 0.5)
 
 
@@ -282,3 +286,53 @@ def test_files_hold_every_sample():
         assert (str(found["names"][0]), str(found["units"][0])) == ("Velocity actual value", "rpm")
         assert found["objects"].tolist() == [[0x606C, 0, 0]]
     assert as_png(recording, recording).startswith(b"\x89PNG")
+
+
+# --- what is set ------------------------------------------------------------------------------------------------------
+
+
+def test_a_workspace_is_found_again_from_its_file(tmp_path):
+    """Of each axis its own; what was not set is as usual; a file is written by the first change."""
+    file = tmp_path / "machine.toml"
+    first = Workspace(DEVICE, file)
+    assert first.of(0) == Workspace(DEVICE).of(0) and not file.exists()
+    first.change(0, channels=((0x6041, 0), (0x2101, 0)), mode="single", level="-90 rpm")
+    first.change(1, jog_speed="5 deg/s")
+    first.change(0, window=0.5)
+    again = Workspace(DEVICE, file)
+    assert [again.of(axis) for axis in range(3)] == [first.of(axis) for axis in range(3)]
+    assert again.of(0).channels == ((0x6041, 0), (0x2101, 0)) and again.of(0).window == 0.5
+    assert again.of(0).jog_speed == again.of(2).jog_speed == "60 rpm"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("format = 1", "format = 2", "is not a workspace"),
+        ("tmcm1636", "tgz_d", "is of tgz_d, and this is tmcm1636; give another file"),
+        ("6041:00", "606C:07", "has no object 606C:07"),
+        ("6041:00", "velocity", "mend the line"),
+        ('"single"', '"once"', "'once' is not one of roll, auto"),
+        ("window = 2.0", "window = 3.0", "3.0 is not one of 0.1, 0.2"),
+        ("before = 0.1", "before = 1.5", "before is 0 to 0.9"),
+        ("before = 0.1", "behind = 0.1", "behind"),
+        ("before = 0.1", "before = [", "is not TOML"),
+    ],
+)
+def test_a_file_that_is_no_workspace_is_refused(tmp_path, old, new, message):
+    file = tmp_path / "machine.toml"
+    Workspace(DEVICE, file).change(0, channels=((0x6041, 0),), mode="single")
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        Workspace(DEVICE, file)
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_the_trigger_that_is_set(edge):
+    settings = replace(Workspace(DEVICE).of(0), edge=edge)
+    trigger = trigger_of(settings, 2, 700.0)
+    has_level = edge in ("rising", "falling")
+    assert (trigger.kind, trigger.axis) == (edge, 2)
+    assert trigger.key == ((0x606C, 0) if has_level else (0x6041, 0))

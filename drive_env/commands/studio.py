@@ -53,6 +53,10 @@ def studio(
     duration: Annotated[
         float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
     ] = None,
+    workspace: Annotated[
+        Path | None,
+        typer.Option(help="TOML with channels, triggers and jog speeds of the pages; made, and kept up to date."),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
     """Show drives on a local web page: state, motion, scope, dictionary; and what tuning and agents add.
@@ -68,6 +72,7 @@ def studio(
         from drive_env.studio.gate import checked_token, is_loopback, new_token
         from drive_env.studio.pages import studio_pages
         from drive_env.studio.session import Session
+        from drive_env.studio.workspace import Workspace
 
         check_time("--duration", duration)
         is_bus = names_a_bus(context) or eds is not None
@@ -83,7 +88,8 @@ def studio(
         title = _title(described, bus) if is_bus else f"{device}, emulated, load {load}"
         named = {"interface": bus.interface, "channel": bus.channel, "nodes": bus.node, "bitrate": bus.bitrate}
         address = named if is_bus else {}
-        session = Session(opener, title, described, {name: one for name, one in address.items() if one is not None})
+        given = {name: one for name, one in address.items() if one is not None}
+        session = Session(opener, title, described, given, Workspace(described, workspace))
         pages = studio_pages(emulated=not is_bus)
         if is_loopback(listen) and token is None:
             ticket = None

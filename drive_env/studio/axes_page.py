@@ -11,7 +11,8 @@ from drive_env import cia402
 from drive_env.cia402 import State
 from drive_env.drives.limit_at_rest import SAYS
 from drive_env.studio import motion_jobs
-from drive_env.studio.axis_states import MODE_NAMES, AxisState, ShownQuantity
+from drive_env.studio.axis_states import AxisState, ShownQuantity
+from drive_env.studio.motion_cards import card, move_rows, power_row
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.state_diagram import ARROWS, diagram
@@ -33,7 +34,8 @@ def build(session: Session, visitor: Visitor) -> None:
             _state_card(session, visitor)
         with ui.element("div").classes("studio-stack"):
             _motion_card(visitor)
-            _move_card(session, visitor)
+            with card("Move", "card-move"):
+                move_rows(session, visitor)
         with ui.element("div").classes("studio-stack"):
             _fault_card(session, visitor)
             _around_card(visitor)
@@ -45,37 +47,10 @@ async def _command(event: GenericEventArguments, visitor: Visitor) -> None:
     await visitor.do(motion_jobs.command(visitor.axis, word), f"Controlword {word:02X}h")
 
 
-def card(title: str, name: str) -> ui.card:
-    """Return a card with a heading; `name` is its class."""
-    made = ui.card().classes(f"studio-card {name}")
-    with made:
-        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
-    return made
-
-
 def _state_card(session: Session, visitor: Visitor) -> None:
     with card("State (CiA 402)", "card-state"):
         picture = ui.html(diagram(None), sanitize=False).classes("w-full")
-        with ui.row().classes("studio-buttons"):
-            modes = {name: f"{name}  {MODE_NAMES[name]}" for name in _modes(visitor.state)}
-            first = _first_mode(visitor.state)
-            mode = ui.select(modes, value=first, label="Mode of operation").props("dense outlined").classes("grow")
-            mode.props("data-test=mode")
-
-            async def enable() -> None:
-                await visitor.do(motion_jobs.enable(visitor.axis, str(mode.value)), f"Enable axis {visitor.axis}")
-
-            async def disable() -> None:
-                await visitor.do(motion_jobs.disable(visitor.axis), f"Disable axis {visitor.axis}")
-
-            async def select() -> None:
-                await visitor.do(motion_jobs.select_mode(visitor.axis, str(mode.value)), f"Mode {mode.value}")
-
-            ui.button("Set mode", on_click=select).props("outline no-caps").props("data-test=set-mode")
-            ui.button("Enable", icon="power", on_click=enable).props("unelevated no-caps color=positive").props(
-                "data-test=enable"
-            )
-            ui.button("Disable", icon="power_off", on_click=disable).props("outline no-caps").props("data-test=disable")
+        power_row(visitor)
         ui.label("Single transitions, also by a lit arrow:").classes("studio-label")
         single = ui.row().classes("studio-buttons")
     shown: list[object] = [object()]
@@ -100,18 +75,6 @@ def _single_transitions(state: State | None) -> None:
         button.props(f"data-command={arrow.word}")
     if not leaving:
         ui.label("None from this state: the drive goes on by itself.").classes("studio-hint")
-
-
-def _modes(state: AxisState | None) -> tuple[str, ...]:
-    return tuple(MODE_NAMES) if state is None else state.modes
-
-
-def _first_mode(state: AxisState | None) -> str:
-    """Return the mode that the axis is in, else the first that moves to places."""
-    modes = _modes(state)
-    if state is not None and state.mode in modes:
-        return state.mode
-    return "pp" if "pp" in modes else modes[0]
 
 
 def _motion_card(visitor: Visitor) -> None:
@@ -155,42 +118,6 @@ class _Values:
             number, unit = self._rows[one.label]
             number.set_text("—" if one.value is None else f"{one.value:,.3f}".rstrip("0").rstrip("."))
             unit.set_text(one.unit)
-
-
-def _move_card(session: Session, visitor: Visitor) -> None:
-    with card("Move", "card-move"):
-        ui.label("Jog: as long as you hold").classes("studio-label")
-        with ui.row().classes("studio-buttons"):
-            speed = ui.input("Jog speed", value=visitor.jog_speed, placeholder="60 rpm").props("dense outlined")
-            speed.classes("grow").bind_value(visitor, "jog_speed").props("data-test=jog-speed")
-            for text, icon, direction in (("Backwards", "fast_rewind", -1), ("Forwards", "fast_forward", 1)):
-                button = ui.button(text, icon=icon).props(f"no-caps outline data-jog={direction}")
-                button.classes("studio-jog").tooltip("Hold the button, or Enter while it has the focus")
-        ui.label("Move to a place, or by a distance").classes("studio-label")
-        with ui.row().classes("studio-buttons"):
-            goal = (
-                ui.input("Position or distance", value="1 rev")
-                .props("dense outlined")
-                .classes("grow")
-                .props("data-test=goal")
-            )
-            rate = ui.input("Speed (empty: the drive's)", placeholder="300 rpm").props("dense outlined")
-            rate.classes("grow").props("data-test=rate")
-
-            async def go(relative: bool) -> None:
-                what = f"Move axis {visitor.axis} {'by' if relative else 'to'} {goal.value}"
-                job = motion_jobs.move(session, visitor.axis, goal.value, rate.value or "", relative=relative)
-                await visitor.do(job, what)
-
-            async def home() -> None:
-                await visitor.do(motion_jobs.home(visitor.axis), f"Home axis {visitor.axis}")
-
-            ui.button("Move to", on_click=lambda: go(False)).props("unelevated no-caps").props("data-test=move-to")
-            ui.button("Move by", on_click=lambda: go(True)).props("unelevated no-caps").props("data-test=move-by")
-            ui.button("Home", icon="home", on_click=home).props("outline no-caps").props("data-test=home")
-        ui.label("Units: rev, deg, rad; rpm, rev/s, rad/s; an integer alone is in the drive's own unit.").classes(
-            "studio-hint"
-        )
 
 
 def _fault_card(session: Session, visitor: Visitor) -> None:

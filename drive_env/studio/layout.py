@@ -159,7 +159,7 @@ def _job_chip(session: Session) -> None:
 
 
 def _stop_button() -> None:
-    with ui.page_sticky("bottom-right", x_offset=20, y_offset=20).style("z-index: 7000"):
+    with ui.footer().classes("studio-footer"):  # it has its own place, so that it covers nothing
         button = ui.button("Quick stop", icon="dangerous", color=None).classes("studio-stop")
         button.props('unelevated no-caps aria-keyshortcuts="Space" aria-label="Quick stop (space bar)"')
         button.on("click", js_handler="() => studio.stop()")

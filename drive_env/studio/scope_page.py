@@ -7,6 +7,7 @@ import contextlib
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
@@ -17,9 +18,10 @@ from drive_env import cia402
 from drive_env.dictionary import quantities
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
+from drive_env.studio.motion_cards import card, move_rows, power_row
 from drive_env.studio.page import StudioPage
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
-from drive_env.studio.scope_trigger import EDGES, ScopeTrigger
+from drive_env.studio.scope_trigger import EDGES
 from drive_env.studio.scope_view import (
     MODES,
     MOST_CHANNELS,
@@ -33,10 +35,10 @@ from drive_env.studio.scope_view import (
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
+from drive_env.studio.workspace import AxisSettings, object_key, object_name, trigger_of
 from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
-DEFAULT = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
 FIRST = (  # of the objects that can be chosen, those that people look for
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
@@ -92,12 +94,9 @@ class ScopePanel:
     def __init__(self, session: Session, visitor: Visitor) -> None:
         self._session = session
         self._visitor = visitor
-        self._view = ScopeView(session.recorder)
+        self._view = session.scopes.get(visitor.axis) or self._view_of(session, visitor.axis)
         self._entries = _choices(session)
-        self._cursors: list[float | None] = [None, None]
-        known = session.description
-        defaults = [(index, 0) for index in DEFAULT if known.has((index, 0))]
-        self._view.channels = tuple(self._channel(key, visitor.axis) for key in defaults)
+        self._sampled = f"the scope of axis {visitor.axis}"
 
     def build(self) -> None:
         """Make it."""
@@ -111,21 +110,41 @@ class ScopePanel:
                     ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
                 self._readout()
             with ui.element("div").classes("studio-scope-side"):
+                self._move_card()
                 self._channel_card()
                 self._trigger_card()
                 self._figure_card()
         ui.on("scope_cursors", self._take_cursors)
-        ui.run_javascript(f"studioScope.start({self._visitor.id!r})")
+        ui.run_javascript(f"studioScope.start({self._visitor.id!r}, {json.dumps(self._view.cursors)})")
+
+    def _view_of(self, session: Session, axis: int) -> ScopeView:
+        """Return the scope of an axis as its settings have it; a trigger that is set is armed."""
+        settings = session.workspace.of(axis)
+        view = session.scopes[axis] = ScopeView(session.recorder)
+        view.channels = tuple(self._channel(key, axis) for key in settings.channels)
+        view.window, view.before, view.mode = settings.window, settings.before, settings.mode
+        if settings.mode != "roll":
+            view.trigger = trigger_of(settings, axis, self._level(settings))
+        return view
+
+    def _level(self, settings: AxisSettings) -> float:
+        """Return the level of an edge as the integer that the wire carries; ValueError for a text that is none."""
+        if settings.edge not in ("rising", "falling"):
+            return 0.0
+        entry = self._session.description.dictionary.find(settings.source)
+        return float(quantities.parse(settings.level, entry, self._session.scales[self._visitor.axis]))
 
     def _leave(self) -> None:
+        """Sample nothing for the scope any more, unless it waits for its trigger or another page shows it."""
         _views.pop(self._visitor.id, None)
-        self._session.forget_samples(self._visitor.id)
+        if not self._view.is_armed and self._view not in _views.values():
+            self._session.forget_samples(self._sampled)
 
     def _want(self) -> None:
         keys = [channel.key for channel in self._view.channels]
         if self._view.trigger is not None:
             keys.append(self._view.trigger.key)
-        self._session.sample(self._visitor.id, keys)
+        self._session.sample(self._sampled, keys)
 
     def _channel(self, key: tuple[int, int], axis: int) -> ScopeChannel:
         entry = self._session.description.dictionary.find(key)
@@ -142,7 +161,7 @@ class ScopePanel:
             ui.space()
             window = ui.select({one: f"{one:g} s" for one in WINDOWS}, value=view.window, label="Time across [s]")
             window.props("dense outlined options-dense").classes("studio-narrow")
-            window.on_value_change(lambda event: self._set(window=float(event.value)))
+            window.on_value_change(lambda event: self._set_window(float(event.value)))
             for text, icon, script, hint in (
                 ("Cursors", "straighten", "() => studioScope.toggle()", "Two cursors: drag them, or a, b and arrows"),
                 ("Fit", "fit_screen", "() => studioScope.fit()", "Scale every panel to what it shows"),
@@ -165,9 +184,9 @@ class ScopePanel:
 
         ui.timer(0.2, show)
 
-    def _set(self, **changes: Any) -> None:
-        for name, value in changes.items():
-            setattr(self._view, name, value)
+    def _set_window(self, window: float) -> None:
+        self._view.window = window
+        self._visitor.set(window=window)
         if self._view.is_running:
             self._view.run()
 
@@ -176,12 +195,18 @@ class ScopePanel:
         table = f'<table class="studio-readout"><thead><tr>{head}</tr></thead><tbody></tbody></table>'
         ui.html(table, sanitize=False).classes("w-full studio-scroll")
 
+    def _move_card(self) -> None:
+        """Enable and move the axis beside its traces."""
+        with card("Move", "card-move"):
+            power_row(self._visitor)
+            move_rows(self._session, self._visitor)
+
     # --- channels -------------------------------------------------------------------------------------------------
     def _channel_card(self) -> None:
         with ui.card().classes("studio-card"):
             ui.label(f"Channels ({MOST_CHANNELS} at most)").classes("studio-heading")
             chips = ui.row().classes("studio-chips")
-            options = {f"{index:04X}:{sub:02X}": entry.label for (index, sub), entry in self._entries.items()}
+            options = {object_name(key): entry.label for key, entry in self._entries.items()}
             add = ui.select(options, label="Add an object, by index or name", with_input=True, clearable=True)
             add.props("dense outlined options-dense data-test=add-channel").classes("w-full")
 
@@ -204,47 +229,38 @@ class ScopePanel:
                 return
             self._want()
             draw()
-            names = [f"{one.key[0]:04X}:{one.key[1]:02X}" for one in channels if one.axis == self._visitor.axis]
-            ui.run_javascript(f"studioScope.keep({json.dumps(names)})")
-
-        def kept(event: GenericEventArguments) -> None:
-            """Show the channels that this browser showed last, as far as the drive has them."""
-            keys = [(int(name[:4], 16), int(name[5:], 16)) for name in event.args]
-            there = [key for key in keys if key in self._entries][:MOST_CHANNELS]
-            if there:
-                self._view.channels = tuple(self._channel(key, self._visitor.axis) for key in there)
-                self._want()
-                draw()
+            self._visitor.set(channels=tuple(one.key for one in channels))
 
         def added() -> None:
             if not add.value:
                 return
-            index, _, sub = str(add.value).partition(":")
-            channel = self._channel((int(index, 16), int(sub, 16)), self._visitor.axis)
+            channel = self._channel(object_key(str(add.value)), self._visitor.axis)
             add.set_value(None)
             if channel not in self._view.channels:
                 change((*self._view.channels, channel))
 
         add.on_value_change(added)
-        ui.on("scope_channels", kept)
         draw()
 
     # --- trigger --------------------------------------------------------------------------------------------------
     def _trigger_card(self) -> None:
+        now = self._session.workspace.of(self._visitor.axis)
         with ui.card().classes("studio-card"):
             ui.label("Trigger").classes("studio-heading")
             with ui.row().classes("studio-buttons"):
-                mode = ui.select(MODES, value="roll", label="Mode").props("dense outlined").classes("grow")
+                mode = ui.select(MODES, value=now.mode, label="Mode").props("dense outlined").classes("grow")
                 mode.props("data-test=trigger-mode")
-                kind = ui.select(EDGES, value="rising", label="On").props("dense outlined").classes("grow")
-            options = {f"{index:04X}:{sub:02X}": entry.label for (index, sub), entry in self._entries.items()}
-            usual = f"{cia402.VELOCITY_ACTUAL:04X}:00"
+                kind = ui.select(EDGES, value=now.edge, label="On").props("dense outlined").classes("grow")
+            options = {object_name(key): entry.label for key, entry in self._entries.items()}
+            usual = object_name(now.source)
             source = ui.select(options, value=usual if usual in options else next(iter(options)), label="Of the object",
                                with_input=True).props("dense outlined options-dense").classes("w-full")  # fmt: skip
             with ui.row().classes("studio-buttons"):
-                level = ui.input("Level, with its unit", value="30 rpm").props("dense outlined data-test=level")
+                level = ui.input("Level, with its unit", value=now.level).props("dense outlined data-test=level")
                 level.classes("grow")
-                before = ui.number("Before the trigger [%]", value=10, min=0, max=90).props("dense outlined")
+                before = ui.number("Before the trigger [%]", value=100.0 * now.before, min=0, max=90).props(
+                    "dense outlined"
+                )
                 before.classes("grow")
             button = ui.button("Arm", icon="bolt").props("outline no-caps data-test=arm")
 
@@ -259,21 +275,19 @@ class ScopePanel:
             source.set_enabled(has_level)
             level.set_enabled(has_level)
 
+        needed()
         kind.on_value_change(needed)
         mode.on_value_change(apply)
         button.on_click(apply)
 
     def _arm(self, mode: str, kind: str, source: str, level: str, before: float | None) -> None:
         axis, view = self._visitor.axis, self._view
-        key, raw = (cia402.STATUSWORD, 0), 0.0
-        if kind in ("rising", "falling"):
-            index, _, sub = source.partition(":")
-            key = int(index, 16), int(sub, 16)
-            entry = self._session.description.dictionary.find(key)
-            raw = float(quantities.parse(level, entry, self._session.scales[axis]))
-        view.trigger = ScopeTrigger(kind, axis, key, raw)
-        view.before = min(0.9, max(0.0, (10.0 if before is None else float(before)) / 100.0))
-        view.mode = mode
+        share = min(0.9, max(0.0, (10.0 if before is None else float(before)) / 100.0))
+        changes = {"mode": mode, "edge": kind, "source": object_key(source), "level": level, "before": share}
+        settings = replace(self._session.workspace.of(axis), **changes)
+        view.trigger = trigger_of(settings, axis, self._level(settings))
+        view.before, view.mode = settings.before, settings.mode
+        self._visitor.set(**changes)
         self._want()
         view.run()
 
@@ -321,11 +335,12 @@ class ScopePanel:
         ui.timer(0.5, options)
 
     def _between(self) -> tuple[float | None, float | None]:
-        a, b = self._cursors
+        a, b = self._view.cursors
         return (None, None) if a is None or b is None else (min(a, b), max(a, b))
 
     def _take_cursors(self, event: GenericEventArguments) -> None:
-        self._cursors = [None if one is None else float(one) for one in event.args]
+        a, b = (None if one is None else float(one) for one in event.args)
+        self._view.cursors = a, b
 
     def _keep(self) -> None:
         if not self._view.keep_as_reference():

@@ -1,4 +1,4 @@
-"""The scope of one page: channels in their units, rolling or from a trigger on, and recordings to keep.
+"""The scope of one axis: channels in their units, rolling or from a trigger on, and recordings to keep.
 
 It reads the recorder, and touches no drive.
 """
@@ -65,7 +65,7 @@ def channel_of(entry: Entry, axis: int, scale: Scale, *, several: bool) -> Scope
 
 
 class ScopeView:
-    """The scope of a page.
+    """The scope of an axis; the pages that show it share it.
 
     Args:
         recorder: What is sampled.
@@ -80,6 +80,7 @@ class ScopeView:
         columns: Of pixels.
         kept: The picture from the last trigger on, or the one at which it was halted.
         reference: Another one, laid under it.
+        cursors: Times of A and B [s], None while they are not shown.
     """
 
     def __init__(self, recorder: ScopeRecorder) -> None:
@@ -93,6 +94,7 @@ class ScopeView:
         self.columns = 800
         self.kept: ScopeRecording | None = None
         self.reference: ScopeRecording | None = None
+        self.cursors: tuple[float | None, float | None] = (None, None)
         self._generation = recorder.generation
         self._looked = recorder.ring.total  # samples that the trigger has seen
         self._fired: int | None = None  # number of the sample at which it fired, while the rest is awaited
@@ -129,6 +131,11 @@ class ScopeView:
         return self.kept if self.kept is not None else self._rolling()
 
     @property
+    def is_armed(self) -> bool:
+        """Whether it waits for its trigger, or for the rest of the picture from there on."""
+        return self.is_running and self.mode != "roll" and self.trigger is not None
+
+    @property
     def status(self) -> str:
         """Its state, in a word or two."""
         if not self.is_running:
@@ -146,7 +153,7 @@ class ScopeView:
         with recorder.lock:
             if recorder.generation != self._generation:  # other objects are sampled: numbers begin anew
                 self._generation, self._looked, self._fired = recorder.generation, 0, None
-            if not self.is_running or self.mode == "roll" or self.trigger is None:
+            if not self.is_armed or self.trigger is None:
                 return
             if self._fired is None:
                 self._look_for_trigger(self.trigger)

@@ -34,8 +34,10 @@ from drive_env.studio.axis_states import AxisState, AxisStates
 from drive_env.studio.errors import JobEndedError, JobStoppedError
 from drive_env.studio.presence import Presence
 from drive_env.studio.recorder import ScopeRecorder
+from drive_env.studio.scope_view import ScopeView
 from drive_env.studio.sentences import sentence
 from drive_env.studio.shared_drives import PIECE, SharedDrives
+from drive_env.studio.workspace import Workspace
 from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
@@ -103,6 +105,7 @@ class Session:
         title: Their name, for people.
         description: Of the device.
         address: How drives of a bus were opened: interface, channel, nodes, bitrate; empty for emulated ones.
+        workspace: What is set on the pages; None begins with what is usual.
 
     Attributes:
         state: "opening", "open", "failed", "closed".
@@ -112,6 +115,7 @@ class Session:
         presence: The pages there are.
         recorder: What is sampled.
         stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
+        scopes: The scope of each axis that a page has shown; it waits for its trigger while no page shows it.
     """
 
     def __init__(
@@ -120,6 +124,7 @@ class Session:
         title: str,
         description: Description,
         address: Mapping[str, Any] | None = None,
+        workspace: Workspace | None = None,
     ) -> None:
         self.title = title
         self.address = dict(address or {})
@@ -131,6 +136,8 @@ class Session:
         self.presence = Presence()
         self.recorder = ScopeRecorder(1, description.cycle)
         self.stored: dict[int, dict[Key, int]] = {}
+        self.workspace = workspace or Workspace(description)
+        self.scopes: dict[int, ScopeView] = {}
         self.events: deque[SessionEvent] = deque(maxlen=KEPT)
         self.num_events = 0
         self._open = open_drives

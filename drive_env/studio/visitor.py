@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from nicegui import Client, core, ui
 
@@ -33,7 +33,7 @@ class Visitor:
         self.session = session
         self.client = client
         self.axis = axis
-        self.jog_speed = "60 rpm"
+        self.jog_speed = session.workspace.of(axis).jog_speed
 
     @property
     def id(self) -> str:
@@ -45,6 +45,13 @@ class Visitor:
         """The state of its axis; None before the drives are open."""
         axes = self.session.axes
         return axes[self.axis] if self.axis < len(axes) else None
+
+    def set(self, **changes: Any) -> None:
+        """Keep settings of its axis, named as in `AxisSettings`, for the pages after this one."""
+        try:
+            self.session.workspace.change(self.axis, **changes)
+        except OSError as error:
+            self.say(sentence(error), "error")
 
     async def do(
         self, function: Callable[[Drives], T], title: str, *, paced: bool = True, quiet: bool = False

@@ -12,14 +12,14 @@
   const BOTTOM = 26;
   const GAP = 10;
   const CURSORS = ["A", "B"];
-  const CHANNELS = "studio-scope-channels"; // that this browser showed last
   const scope = (window.studioScope = { cursors: [null, null], active: 0, frames: 0, header: null });
   let canvas, pen, box, line, data, drawn = false;
   const ranges = new Map(); // unit -> [low, high], that do not jump with every frame
 
-  scope.start = (page) => {
+  scope.start = (page, cursors) => {
     canvas = document.querySelector(".studio-scope canvas");
-    if (!canvas) return setTimeout(() => scope.start(page), 50);
+    if (!canvas) return setTimeout(() => scope.start(page, cursors), 50);
+    scope.cursors = cursors;
     box = canvas.parentElement;
     pen = canvas.getContext("2d");
     const scheme = location.protocol === "https:" ? "wss" : "ws";
@@ -33,14 +33,7 @@
     open();
     new ResizeObserver(tell).observe(box);
     listen();
-    try {
-      const kept = JSON.parse(localStorage.getItem(CHANNELS) || "[]");
-      if (kept.length) emitEvent("scope_channels", kept);
-    } catch {
-      localStorage.removeItem(CHANNELS);
-    }
   };
-  scope.keep = (channels) => localStorage.setItem(CHANNELS, JSON.stringify(channels));
 
   function tell() {
     const columns = Math.max(50, Math.floor(box.clientWidth - LEFT - RIGHT));

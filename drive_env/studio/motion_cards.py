@@ -1,0 +1,102 @@
+"""What moves the axis of a page, on the pages Axes and Scope: enable, jog, move, home."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+from drive_env.studio import motion_jobs
+from drive_env.studio.axis_states import MODE_NAMES, AxisState
+from drive_env.studio.session import Session
+from drive_env.studio.visitor import Visitor
+
+REFRESH = 0.2  # s
+
+
+def card(title: str, name: str) -> ui.card:
+    """Return a card with a heading; `name` is its class."""
+    made = ui.card().classes(f"studio-card {name}")
+    with made:
+        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
+    return made
+
+
+def power_row(visitor: Visitor) -> None:
+    """Make the row that chooses the mode, enables and disables the axis of a page."""
+    with ui.row().classes("studio-buttons"):
+        modes = {name: f"{name}  {MODE_NAMES[name]}" for name in _modes(visitor.state)}
+        first = _first_mode(visitor.state)
+        mode = ui.select(modes, value=first, label="Mode of operation").props("dense outlined").classes("grow")
+        mode.props("data-test=mode")
+
+        async def enable() -> None:
+            await visitor.do(motion_jobs.enable(visitor.axis, str(mode.value)), f"Enable axis {visitor.axis}")
+
+        async def disable() -> None:
+            await visitor.do(motion_jobs.disable(visitor.axis), f"Disable axis {visitor.axis}")
+
+        async def select() -> None:
+            await visitor.do(motion_jobs.select_mode(visitor.axis, str(mode.value)), f"Mode {mode.value}")
+
+        def follow() -> None:
+            """Have the choice show a mode that the axis has changed to, whoever changed it."""
+            nonlocal first
+            state = visitor.state
+            if state is not None and state.mode != first and state.mode in modes:
+                first = state.mode
+                mode.set_value(first)
+
+        ui.timer(REFRESH, follow)
+        ui.button("Set mode", on_click=select).props("outline no-caps").props("data-test=set-mode")
+        ui.button("Enable", icon="power", on_click=enable).props("unelevated no-caps color=positive").props(
+            "data-test=enable"
+        )
+        ui.button("Disable", icon="power_off", on_click=disable).props("outline no-caps").props("data-test=disable")
+
+
+def _modes(state: AxisState | None) -> tuple[str, ...]:
+    return tuple(MODE_NAMES) if state is None else state.modes
+
+
+def _first_mode(state: AxisState | None) -> str:
+    """Return the mode that the axis is in, else the first that moves to places."""
+    modes = _modes(state)
+    if state is not None and state.mode in modes:
+        return state.mode
+    return "pp" if "pp" in modes else modes[0]
+
+
+def move_rows(session: Session, visitor: Visitor) -> None:
+    """Make the rows that jog, move and home the axis of a page."""
+    ui.label("Jog: as long as you hold").classes("studio-label")
+    with ui.row().classes("studio-buttons"):
+        speed = ui.input("Jog speed", value=visitor.jog_speed, placeholder="60 rpm").props("dense outlined")
+        speed.classes("grow").bind_value(visitor, "jog_speed").props("data-test=jog-speed")
+        speed.on("blur", lambda: visitor.set(jog_speed=speed.value))
+        for text, icon, direction in (("Backwards", "fast_rewind", -1), ("Forwards", "fast_forward", 1)):
+            button = ui.button(text, icon=icon).props(f"no-caps outline data-jog={direction}")
+            button.classes("studio-jog").tooltip("Hold the button, or Enter while it has the focus")
+    ui.label("Move to a place, or by a distance").classes("studio-label")
+    with ui.row().classes("studio-buttons"):
+        goal = (
+            ui.input("Position or distance", value="1 rev")
+            .props("dense outlined")
+            .classes("grow")
+            .props("data-test=goal")
+        )
+        rate = ui.input("Speed (empty: the drive's)", placeholder="300 rpm").props("dense outlined")
+        rate.classes("grow").props("data-test=rate")
+
+        async def go(relative: bool) -> None:
+            what = f"Move axis {visitor.axis} {'by' if relative else 'to'} {goal.value}"
+            job = motion_jobs.move(session, visitor.axis, goal.value, rate.value or "", relative=relative)
+            await visitor.do(job, what)
+
+        async def home() -> None:
+            await visitor.do(motion_jobs.home(visitor.axis), f"Home axis {visitor.axis}")
+
+        ui.button("Move to", on_click=lambda: go(False)).props("unelevated no-caps").props("data-test=move-to")
+        ui.button("Move by", on_click=lambda: go(True)).props("unelevated no-caps").props("data-test=move-by")
+        ui.button("Home", icon="home", on_click=home).props("outline no-caps").props("data-test=home")
+    ui.label("Units: rev, deg, rad; rpm, rev/s, rad/s; an integer alone is in the drive's own unit.").classes(
+        "studio-hint"
+    )

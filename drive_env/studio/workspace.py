@@ -1,0 +1,153 @@
+"""What people have set on the pages and find again: the scope and the jog speed of each axis, also in a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from drive_env import cia402
+from drive_env.cia402 import Key
+from drive_env.fieldbus.description import Description
+from drive_env.studio.scope_trigger import EDGES, ScopeTrigger
+from drive_env.studio.scope_view import MODES, MOST_CHANNELS, WINDOWS
+from drive_env.whole_file import write_whole
+from mechanics.untrusted import read_toml
+
+FORMAT = 1
+DEFAULT_CHANNELS = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+
+
+@dataclass(frozen=True)
+class AxisSettings:
+    """What is set for an axis.
+
+    Attributes:
+        jog_speed: As it was typed.
+        channels: Objects on the scope.
+        window: Time across the picture [s].
+        mode: A name of `scope_view.MODES`.
+        edge: A name of `scope_trigger.EDGES`.
+        source: The object whose edge is meant.
+        level: As it was typed, with its unit.
+        before: Share of the picture before the trigger.
+    """
+
+    jog_speed: str = "60 rpm"
+    channels: tuple[Key, ...] = ()
+    window: float = 2.0
+    mode: str = "roll"
+    edge: str = "rising"
+    source: Key = (cia402.VELOCITY_ACTUAL, 0)
+    level: str = "30 rpm"
+    before: float = 0.1
+
+
+class Workspace:
+    """The settings of each axis.
+
+    Args:
+        description: Of the device.
+        file: TOML that has them, and gets what is changed; None keeps them as long as the studio runs. A file that does
+            not exist yet is written with the first change.
+
+    Raises:
+        ValueError: For a file that is not a workspace of this device.
+        OSError: If it cannot be read.
+    """
+
+    def __init__(self, description: Description, file: Path | None = None) -> None:
+        self._description = description
+        self._file = file
+        self._axes: dict[int, AxisSettings] = {}
+        if file is not None and file.exists():
+            self._axes = _read(file, description)
+
+    def of(self, axis: int) -> AxisSettings:
+        """Return the settings of an axis."""
+        known = self._description
+        usual = tuple((index, 0) for index in DEFAULT_CHANNELS if known.has((index, 0)))
+        return self._axes.get(axis) or AxisSettings(channels=usual)
+
+    def change(self, axis: int, **changes: Any) -> None:
+        """Change settings of an axis, named as in `AxisSettings`; OSError if the file cannot be written."""
+        self._axes[axis] = replace(self.of(axis), **changes)
+        if self._file is not None:
+            write_whole(self._file, self._toml())
+
+    def _toml(self) -> str:
+        lines = [f"format = {FORMAT}", f"device = {json.dumps(self._description.name)}"]
+        for axis, one in sorted(self._axes.items()):
+            lines += ["", f"[axis.{axis}]"]
+            for name, value in vars(one).items():
+                lines.append(f"{name} = {json.dumps(_written(value))}")
+        return "\n".join(lines) + "\n"
+
+
+def object_name(key: Key) -> str:
+    """Return an object as the pages and the file name it: 606C:00."""
+    return f"{key[0]:04X}:{key[1]:02X}"
+
+
+def object_key(name: str) -> Key:
+    """Return the object of a name; ValueError for what is not one."""
+    index, _, sub = name.partition(":")
+    return int(index, 16), int(sub, 16)
+
+
+def _written(value: Any) -> Any:
+    """Return a setting as the file has it."""
+    if not isinstance(value, tuple):
+        return value
+    return object_name(value) if value and isinstance(value[0], int) else [object_name(key) for key in value]
+
+
+def _read(file: Path, description: Description) -> dict[int, AxisSettings]:
+    try:
+        data = read_toml(file)
+    except ValueError as error:
+        raise ValueError(f"{file} is not TOML: {error}; give a file that the studio wrote, or a new name") from None
+    if data.get("format") != FORMAT or not isinstance(data.get("axis", {}), dict):
+        raise ValueError(f"{file} is not a workspace of the studio; give a file that it wrote, or a new name")
+    if data.get("device") != description.name:
+        raise ValueError(f"{file} is of {data.get('device')}, and this is {description.name}; give another file")
+    try:
+        return {int(axis): _settings(table, description) for axis, table in data.get("axis", {}).items()}
+    except (ValueError, TypeError, AttributeError, KeyError) as error:
+        raise ValueError(f"{file}: {error}; mend the line, or give a new name") from None
+
+
+def _settings(table: Mapping[str, Any], description: Description) -> AxisSettings:
+    channels = tuple(object_key(name) for name in table["channels"])
+    found = AxisSettings(
+        **{**table, "channels": channels, "source": object_key(table["source"]), "window": float(table["window"])}
+    )
+    for key in (*channels, found.source):
+        if not description.has(key):
+            raise ValueError(f"{description.name} has no object {object_name(key)}")
+    for name, value, known in (
+        ("mode", found.mode, MODES),
+        ("edge", found.edge, EDGES),
+        ("window", found.window, WINDOWS),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} = {value!r} is not one of {', '.join(map(str, known))}")
+    if len(channels) > MOST_CHANNELS or not 0.0 <= found.before <= 0.9:
+        raise ValueError(f"there are {MOST_CHANNELS} channels at most, and before is 0 to 0.9")
+    if not isinstance(found.jog_speed, str) or not isinstance(found.level, str):
+        raise ValueError("jog_speed and level are texts with a unit")
+    return found
+
+
+def trigger_of(settings: AxisSettings, axis: int, level: float) -> ScopeTrigger:
+    """Return the trigger that is set; a change of state and a fault look at the statusword.
+
+    Args:
+        settings: Of the axis.
+        axis: The axis.
+        level: Of an edge, as the integer that the wire carries.
+    """
+    has_level = settings.edge in ("rising", "falling")
+    return ScopeTrigger(settings.edge, axis, settings.source if has_level else (cia402.STATUSWORD, 0), level)
