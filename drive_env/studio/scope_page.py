@@ -37,10 +37,11 @@ from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
 DEFAULT = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+OF_VL = (cia402.VL_VELOCITY_DEMAND, cia402.VL_VELOCITY_ACTUAL)  # of a drive that has none of them
 FIRST = (  # of the objects that can be chosen, those that people look for
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
-    cia402.DC_LINK_VOLTAGE,
+    cia402.DC_LINK_VOLTAGE, cia402.VL_TARGET_VELOCITY, *OF_VL,
 )  # fmt: skip
 
 _views: dict[str, ScopeView] = {}  # of each page that is open, by its visitor's id
@@ -97,6 +98,7 @@ class ScopePanel:
         self._cursors: list[float | None] = [None, None]
         known = session.description
         defaults = [(index, 0) for index in DEFAULT if known.has((index, 0))]
+        defaults = defaults or [(index, 0) for index in OF_VL if known.has((index, 0))]
         self._view.channels = tuple(self._channel(key, visitor.axis) for key in defaults)
 
     def build(self) -> None:
