@@ -60,7 +60,7 @@ _kept: list[dict[str, Any]] = []
 def keep(names: dict[str, Any]) -> None:
     """Hold one more reference to the names of an FMU's module.
 
-    PythonFMU (0.7.0, `findClass`) executes the module again for each instance, and then gives up a reference to its
+    PythonFMU (0.7.0) executes the module again for each instance, and then gives up a reference to its
     names that it had only borrowed: without another one the second instance would find them freed, and end the program.
     """
     _kept.append(names)
