@@ -96,18 +96,25 @@ def main():
     found["wrong input"] = refused(lambda: one.step(mode_of_operation=99))
     one.set(mode_of_operation=1)
     found["after refusals"], found["goes on"] = one.run(0), one.run(1)
-    if one.is_fmi3:  # FMI 2 has one instance a program
-        other = Instance(description, folder).begin()
-        found["other at rest"] = other.run(5)
-        other.states("setFMUState", other.states("deserializeFMUState", data))
-        found["other, from the bytes"] = other.run(50)
-        found["first, untouched"] = one.run(0)
+    other = Instance(description, folder).begin()
+    found["other at rest"] = other.run(5)
+    other.states("setFMUState", other.states("deserializeFMUState", data))
+    found["other, from the bytes"] = other.run(50)
+    found["first, untouched"] = one.run(0)
+    if one.is_fmi3:  # FMI 2's library cannot reset, and shows no log here
         one.fmu.reset()
         one.begin(**{P: 50, SPEED: 100_000})
         found["reset"] = [one.get(P), one.get(SPEED), *one.run(0)]
         found["said"], third = one.said, Instance(description, folder)
         found["wrong parameter"] = refused(lambda: third.begin(**{P: -1}))
         found["said of it"] = third.said
+    else:
+        one.fmu.terminate()
+        one.fmu.freeInstance()
+        found["other, alone"] = other.run(0)
+        other.fmu.terminate()
+        other.fmu.freeInstance()
+        found["third at rest"] = Instance(description, folder).begin().run(5)
     print(json.dumps(found))
 
 

@@ -149,6 +149,17 @@ def test_a_velocity_unit_and_a_part_of_the_peak_current_follow_their_own_scales(
             parse(text, entry(unit), TURN)
 
 
+def test_a_target_of_vl_follows_both_of_its_factors():
+    """604Ch: a velocity unit is 60 rpm; 604Bh: a target counts tenths of it."""
+    scale = AxisScale(TURN, 60.0, set_point=0.1)
+    assert (
+        parse("300 rpm", entry("set-point unit"), scale) == 50 and parse("300 rpm", entry("velocity unit"), scale) == 5
+    )
+    for unknown in (AxisScale(TURN, 60.0), AxisScale(TURN, set_point=0.1), TURN):
+        with pytest.raises(ValueError, match="has no unit that rpm could be turned into"):
+            parse("300 rpm", entry("set-point unit"), unknown)
+
+
 def test_what_has_a_scale_of_its_own_is_shown_with_it():
     assert show(10_000, entry("velocity unit"), OF_ITS_OWN) == "10000 velocity unit (30 rpm)"
     assert show(20_000, entry("velocity unit/s"), OF_ITS_OWN) == "20000 velocity unit/s (1 rev/s^2)"
@@ -174,7 +185,7 @@ def test_four_characters_are_written_as_a_text():
             Role.VELOCITY_NUMERATOR: (0x6094, 1), Role.VELOCITY_DIVISOR: (0x6094, 2), Role.PEAK_CURRENT: (0x2107, 0),
             Role.NOMINAL_CURRENT: (0x2106, 0),
         },
-        [(None, 0.001, 4.0, 1.0), (None, 3.5, 8.0, 3.0)],
+        [(None, 0.001, 4.0, 1.0, None), (None, 3.5, 8.0, 3.0, None)],
     ),
 ])  # fmt: skip
 def test_units_follow_what_the_drive_says_of_each_axis(values, roles, expected):

@@ -8,12 +8,15 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from rigs.small_eds import FOLDER
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.cia402 import State
+from drive_env.devices.new_device import new_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.fieldbus.description import describe
+from drive_env.motors import find_motor
 from drive_env.studio import dictionary_jobs, motion_jobs, presence
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.presence import Presence
@@ -30,8 +33,8 @@ def session():
 
 
 @contextmanager
-def opened(load):
-    made = Session(lambda: EmulatedDrives(load=load, num_threads=1), "a machine", describe("tmcm1636", None))
+def opened(load, device="tmcm1636", motor="qbl4208"):
+    made = Session(lambda: EmulatedDrives(device, load, motor, num_threads=1), "a machine", describe(device, None))
     made.presence.beat("page")
     made.start()
     until(lambda: made.state != "opening", 120.0)
@@ -248,6 +251,37 @@ def test_a_jog_lasts_as_long_as_its_page_holds_it(session):
         session.do(motion_jobs.end_turn(0), "release").result(10)
         until(lambda: speed_of(session) == 0)
         assert state_of(session) is State.OPERATION_ENABLED
+
+
+def test_a_drive_of_vl_without_a_position_turns_and_is_stopped_as_the_others(tmp_path):
+    inverter = new_device(FOLDER / "inverters" / "granit_fu3.eds", tmp_path / "granit", find_motor("qbl4208"))
+    with opened("inertia", str(inverter.folder)) as session:
+
+        def speed():
+            return abs(int(session.do(lambda drives: drives.read(cia402.VL_VELOCITY_ACTUAL)[0], "look").result(10)))
+
+        session.do(motion_jobs.enable(0, "vl"), "enable").result(10)
+        with Beats(session) as page:
+            page.held = session.presence.begin("page", FIRST, held=True).number
+            session.do(motion_jobs.turn(session, 0, "300 rpm", page.held), "jog").result(10)
+            until(lambda: speed() > 250)
+            until(lambda: session.axes[0].motion[0].unit == "rpm" and session.axes[0].motion[0].value > 250)
+            session.presence.end(page.held)
+            session.do(motion_jobs.end_turn(0), "release").result(10)
+            until(lambda: speed() < 5)
+            assert state_of(session) is State.OPERATION_ENABLED
+            page.held = session.presence.begin("page", FIRST, held=True).number
+            session.do(motion_jobs.turn(session, 0, "-300 rpm", page.held), "jog").result(10)
+            until(lambda: speed() > 250)
+            session.do(motion_jobs.disable(0), "disable").result(10)
+            assert speed() < 15, "braked: without its voltage it would coast"
+            session.do(motion_jobs.enable(0, "vl"), "enable").result(10)
+            page.held = session.presence.begin("page", FIRST, held=True).number
+            session.do(motion_jobs.turn(session, 0, "300 rpm", page.held), "jog").result(10)
+            until(lambda: speed() > 250)
+        until(lambda: speed() < 15, presence.HOLD + 2.0)
+        assert state_of(session) is not State.OPERATION_ENABLED
+        assert any("silent" in event.text for event in session.events)
 
 
 def test_a_page_that_is_silent_stops_its_jog(session):

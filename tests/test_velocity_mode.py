@@ -5,10 +5,13 @@ Ramps are closed forms: a speed of 6048h:01 is gained in 6048h:02, and so on. Al
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.pump import NODE
+from rigs.served_drives import node
 from rigs.small_eds import FOLDER, put
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
@@ -18,6 +21,7 @@ from drive_env.bus.world import World
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.devices.new_device import new_device
+from drive_env.dictionary.aborts import NO_SUCH_OBJECT
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.motors import find_motor
 from drive_env.safety.errors import SafetyError
@@ -482,3 +486,60 @@ def test_a_drive_of_which_no_mode_works_is_told_with_exit_code_1(tmp_path, chang
     assert "no mode of operation that works here" in done.stderr and why in done.stderr
     assert "6042h for vl, 60FFh for pv, 607Ah for pp" in done.stderr
     assert not (tmp_path / "some").exists()
+
+
+# --- what people turn it with -----------------------------------------------------------------------------------------
+def jog(drive, eds, *words, ramp=None):
+    """Run `drive-env jog` on a drive of a ramp (6048h:01), which its master knows by the vendor's EDS alone."""
+    with node(lockstep=False, machine=drive) as (_, bus):
+        on = ["--eds", str(eds), *bus]
+        if ramp is not None:
+            assert not CliRunner().invoke(app, ["set", "6048:1", str(ramp), "--yes", *on]).exit_code
+        found = CliRunner().invoke(app, ["jog", *words, "--json", *on])
+    return found.exit_code, json.loads(found.stdout or "null"), found.stderr
+
+
+@pytest.mark.parametrize(("speed", "out"), [(-300, ()), pytest.param(300, ("--out", "turn"), marks=pytest.mark.slow)])
+def test_jog_turns_it_in_vl_and_brings_it_to_rest(tmp_path, monkeypatch, folders, speed, out):
+    monkeypatch.chdir(tmp_path)
+    with emulated(folders["vl"]) as drive:
+        told = jog(drive, EDS["vl"], str(speed), "--for", "0.4", *out)
+        assert told == (0, {"speed": pytest.approx(speed, abs=6), "emergencies": [], "stopped": ""}, "")
+        assert abs(rpm(drive)) < 10 and one(drive, 0x6041) & 0x4F == 0x40 and one(drive, 0x6060) == cia402.VL
+    if not out:
+        return
+    rows = np.loadtxt(tmp_path / "turn.csv", delimiter=",", skiprows=1)
+    assert (tmp_path / "turn.csv").read_text().splitlines()[0].split(",")[2] == "6042h:00 vl target velocity"
+    assert (rows[:, 2] == speed).sum() == 400 and np.abs(rows[-1, 3]) < 10 < 0.9 * 300 < np.abs(rows[:, 3]).max()
+
+
+def test_jog_says_what_keeps_a_drive_of_vl_from_turning(inverter):
+    """Refused before it is enabled: a way without a position; a ramp that never rises. Else its speed tells it."""
+    code, _, why = jog(inverter, EDS["vl"], "300", "--by", "100")
+    assert code == 2 and "--by 100: granit_fu3 has no position to move to; use --for" in why
+    code, _, why = jog(inverter, EDS["vl"], "300", ramp=0)
+    assert code == 2 and "the drive's acceleration 6048h:01 is 0, so nothing would move" in why
+    code, told, why = jog(inverter, EDS["vl"], "300", "--for", "0.2", ramp=1)
+    assert code == 1 and told["speed"] == 0 and "the axis hardly moved" in why
+
+
+def test_jog_turns_a_drive_that_has_pv_too_in_pv(folders):
+    with emulated(folders["vl and pv"]) as drive:
+        code, told, _ = jog(drive, EDS["vl and pv"], "300", "--for", "0.4")
+        assert code == 0 and told["moved"] > 0 and one(drive, 0x6060) == cia402.PV
+
+
+@pytest.mark.parametrize(
+    ("values", "mode"),
+    [({0x6502: 0x2}, "vl"), ({0x6502: 0x6}, "pv"), ({0x6502: 0}, "pv"), ({0x6502: 0x1}, "pv"), ({}, "vl")],
+)
+def test_the_mode_that_turns_is_pv_where_6502h_or_without_it_60ffh_tells_of_it(values, mode):
+    """With 6502h the drive has 60FFh, and without neither."""
+
+    class Told:
+        def read(self, name):
+            if not values:
+                raise ObjectAccessError(NO_SUCH_OBJECT, "none")
+            return np.array([values.get(name, 0)])
+
+    assert motion.turning_mode(Told()) == mode

@@ -25,15 +25,23 @@ from drive_env.commands.options import (
     print_json,
     scales_of,
 )
-from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
+from drive_env.commands.scope import default_names, draw, new_files, write_table
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import Entry, ObjectDictionary
+    from drive_env.cia402 import Key
+    from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
     from drive_env.dictionary.quantities import Scale
     from drive_env.fieldbus.description import Description
     from drive_env.master.bus_drives import BusDrives
 
-DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
+POSITION = (cia402.POSITION_ACTUAL, 0)
+# Of each mode: the object that keeps an axis from moving if it is 0, its words, and a value for it.
+PROFILE = ((cia402.PROFILE_ACCELERATION, 0), "profile acceleration 6083h", "6083 '500 rev/s^2'")
+ACCELERATION = {
+    "pp": PROFILE,
+    "pv": PROFILE,
+    "vl": ((cia402.VL_ACCELERATION, 1), "acceleration 6048h:01", "6048:1 1000"),
+}
 BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and besides the time that it should take
 RELATIVE = cia402.ENABLE_OPERATION | cia402.RELATIVE
 INTERNAL_LIMIT = 0x0800  # bit 11 of the statusword
@@ -63,7 +71,8 @@ def jog(
     """Enable an axis, turn it for a while or by a distance, and switch it off again.
 
     The safety envelope is on: Ctrl-C, an exceeded limit and the end of this process all cause a quick stop. A negative
-        speed turns the other way. Exit code 1 if the movement was stopped, or the axis did not move.
+        speed turns the other way. A drive without pv turns in vl. Exit code 1 if the movement was stopped, or the axis
+        did not move.
     """
     with errors_as_exit_codes():
         from drive_env import motion
@@ -89,7 +98,7 @@ def jog(
             one = _OneAxis(drives, axis)
             scale = scales_of(drives)[axis]
             movement = _asked_for(one, known, scale, speed, by, duration)
-            start = one.read(cia402.POSITION_ACTUAL)
+            start = one.position()
             if dry_run:
                 _tell_plan(one, speed, by, duration, start, scale, json=json)
                 return
@@ -100,16 +109,22 @@ def jog(
             with _what_stops([]):
                 motion.disable(drives, where=one.where)
             drives.advance(0.1)
-            moved = one.read(cia402.POSITION_ACTUAL) - start
+            moved = None if start is None else one.read(cia402.POSITION_ACTUAL) - start
             emergencies = [message._asdict() for message in drives.emergencies() if message.axis == axis]
             if files is not None and trace is not None:
                 _write(files, trace, known, scale, axis)
-        meant = _speed_in_words(speed, movement.velocity, known.find(cia402.TARGET_VELOCITY), scale)
-        stopped = _verdict(moved, movement.way, reasons, emergencies, meant)
+        meant = _speed_in_words(speed, movement.velocity, known.find(one.target), scale)
+        share = one.reached / movement.velocity if moved is None else moved / movement.way
+        stopped = _verdict(share, reasons, emergencies, meant)
         if json:
-            print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
+            told = {"speed": one.reached} if moved is None else {"moved": moved, "start": start}
+            print_json(told | {"emergencies": emergencies, "stopped": stopped})
         else:
-            print(f"{one.name} moved by {quantities.show(moved, known.find(cia402.POSITION_ACTUAL), scale)}")
+            if moved is None:
+                shown = known.find(one.speed)
+                print(f"{one.name} turned: {shown.label} = {quantities.show(one.reached, shown, scale)}")
+            else:
+                print(f"{one.name} moved by {quantities.show(moved, known.find(cia402.POSITION_ACTUAL), scale)}")
             for message in filter(_is_error, emergencies):
                 print(f"emergency {_told(message)}")
             if files is not None:
@@ -133,17 +148,36 @@ def _check_has_current_limit(description: Description) -> None:
 
 
 class _OneAxis:
-    """The axis that turns, and the others of its node, which are let alone."""
+    """The axis that turns, and the others of its node, which are let alone.
+
+    Attributes:
+        mode: In which it turns at a speed.
+        target: The object of that speed.
+        has_position: Whether its drive shows where it is.
+        speed: The object that shows the speed.
+        reached: The speed before it was brought to rest, of a drive without a position.
+    """
 
     def __init__(self, drives: BusDrives, axis: int) -> None:
         import numpy as np
 
+        from drive_env import motion
+        from drive_env.safety.bounds import velocity_object
+
+        self.mode = motion.turning_mode(drives)
+        self.target = motion.FOLLOWED[self.mode][0]
+        self.has_position = drives.description.has(POSITION)
+        self.speed, self.reached = velocity_object(drives.description), 0
         self.drives, self.axis = drives, axis
         self.where = np.arange(drives.num_axes) == axis
         self.name = axis_name(drives, axis)
         self.cycle = drives.description.cycle
 
-    def read(self, name: int) -> int:
+    def position(self) -> int | None:
+        """Return where it is, None of a drive without a position."""
+        return self.read(cia402.POSITION_ACTUAL) if self.has_position else None
+
+    def read(self, name: ObjectName) -> int:
         """Return an object of it."""
         return int(self.drives.read(name)[self.axis])
 
@@ -163,7 +197,8 @@ class _OneAxis:
 
     def record(self, duration: float, play: dict[int, Any]) -> Any:
         """Return the samples of those default objects that the drive has, while something is played."""
-        keys = [key for key in DEFAULT_KEYS if self.drives.description.has(key)]
+        keys = _recorded(self.drives.description.dictionary)
+        keys += [] if self.has_position or self.speed in keys else [self.speed]
         return self.drives.record(keys, duration, play=play, period=self.cycle)
 
 
@@ -194,24 +229,32 @@ def _asked_for(
     from drive_env.dictionary import quantities
     from drive_env.dictionary.access import check_limits
 
-    velocity = quantities.parse(speed, known.find(cia402.TARGET_VELOCITY), scale)
+    velocity = quantities.parse(speed, known.find(one.target), scale)
     if velocity == 0:
         raise ValueError("a speed of 0 does not move the axis; give one, e.g. '60 rpm'")
-    distance = None if by is None else quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
-    check_limits(known.find(cia402.TARGET_VELOCITY), velocity)
-    check_limits(known.find(cia402.TARGET_POSITION), distance or 0)
-    has_acceleration = one.drives.description.has(cia402.PROFILE_ACCELERATION)
-    if has_acceleration and one.read(cia402.PROFILE_ACCELERATION) == 0:
+    check_limits(known.find(one.target), velocity)
+    distance = None
+    if by is not None:
+        if not (one.has_position and known.has(cia402.TARGET_POSITION)):
+            raise ValueError(f"--by {by}: {one.drives.description.name} has no position to move to; use --for")
+        distance = quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
+        check_limits(known.find(cia402.TARGET_POSITION), distance)
+    key, name, example = ACCELERATION[one.mode if by is None else "pp"]
+    if one.drives.description.has(key) and one.read(key) == 0:
         raise ValueError(
-            "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
-            "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
+            f"the drive's {name} is 0, so nothing would move; set it (drive-env set {example}), or commission the drive"
         )
     return _Movement(velocity, duration, distance)
 
 
+def _recorded(known: ObjectDictionary) -> list[Key]:
+    """Return the objects that are recorded of a movement: those of scope that the drive has."""
+    return [key for name in default_names(known) if known.has(key := (int(name, 16), 0))]
+
+
 def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale: Scale, axis: int) -> None:
     """Write a recorded movement as table and picture, as scope does."""
-    entries = [known.find(key) for key in DEFAULT_KEYS if known.has(key)]
+    entries = [known.find(key) for key in _recorded(known)]
     rows = {entry: trace[entry.index, entry.sub][:, axis : axis + 1] for entry in entries}
     write_table(files[0], entries, [""], trace.t, rows)
     draw(files[1], entries, [""], [scale], trace.t, rows)
@@ -244,9 +287,15 @@ def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> st
     return f"{text}; if {speed} rpm are meant, write '{speed} rpm'"
 
 
-def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]], meant: str) -> str:
-    """Return why a movement failed; "" if it did not. `meant` is the speed that was asked for, in words."""
-    share = moved / asked
+def _verdict(share: float, reasons: list[str], emergencies: list[dict[str, Any]], meant: str) -> str:
+    """Return why a movement failed; "" if it did not.
+
+    Args:
+        share: What came of the way, or of the speed, that was asked for.
+        reasons: What stopped it.
+        emergencies: That came.
+        meant: The speed that was asked for, in words.
+    """
     told = [_told(message) for message in filter(_is_error, emergencies)]
     if told and (reasons or share < ENOUGH):
         return (
@@ -258,7 +307,7 @@ def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dic
     if share < LEAST:
         return (
             f"the axis hardly moved, and the drive reports no cause. The speed was {meant}. Else check for a closed "
-            "brake, a blocked load, a low current limit (--max-current) or a small profile acceleration (6083h)"
+            "brake, a blocked load, a low current limit (--max-current) or a small acceleration (6083h, in vl 6048h)"
         )
     return ""
 
@@ -277,7 +326,7 @@ def _tell_plan(
     speed: str,
     by: str | None,
     duration: float,
-    start: int,
+    start: int | None,
     scale: Scale,
     *,
     json: bool,
@@ -292,28 +341,36 @@ def _tell_plan(
     if json:
         print_json({"would": what, "start": start, "statusword": status, "moved": 0})
         return
-    here = quantities.show(start, one.drives.description.dictionary.find(cia402.POSITION_ACTUAL), scale)
+    where = ""
+    if start is not None:
+        where = f"at {quantities.show(start, one.drives.description.dictionary.find(cia402.POSITION_ACTUAL), scale)} "
     print(
-        f"{one.name} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again "
+        f"{one.name} is {where}({status:04X}h) and would be enabled, {what}, and be switched off again "
         "(dry run: nothing was done)"
     )
 
 
 def _turn(motion: Any, one: _OneAxis, velocity: int, duration: float, is_recorded: bool) -> Any:
-    """Turn in pv, then let the drive brake with its own deceleration; return the samples that were wanted of it."""
+    """Turn at a speed, let the drive brake with its own deceleration; return the samples that were wanted of it."""
     drives, cycle = one.drives, one.cycle
     if is_recorded:  # mapping takes a while: not with an axis enabled
-        one.record(0.0, {cia402.TARGET_VELOCITY: one.rows([], 0)})
-    motion.enable(drives, mode="pv", where=one.where)
+        one.record(0.0, {one.target: one.rows([], 0)})
+    motion.enable(drives, mode=one.mode, where=one.where)
     trace = None
     if is_recorded:
-        rows = [0] * one.cycles(BEFORE) + [velocity] * one.cycles(duration) + [0] * one.cycles(AFTER)
-        trace = one.record(len(rows) * cycle, {cia402.TARGET_VELOCITY: one.rows(rows, 0)})
+        motion.turn(drives, 0, one.where)
+        turns = [0] * one.cycles(BEFORE) + [velocity] * one.cycles(duration)
+        rows = turns + [0] * one.cycles(AFTER)
+        trace = one.record(len(rows) * cycle, {one.target: one.rows(rows, 0)})
+        if not one.has_position:
+            one.reached = int(trace[one.speed][len(turns) - 1, one.axis])
     else:
-        one.write(cia402.TARGET_VELOCITY, velocity)
+        motion.turn(drives, velocity, one.where)
         drives.advance(one.cycles(duration) * cycle)
-    one.write(cia402.TARGET_VELOCITY, 0)
-    # Bit 10 in pv tells that the ramp has ended.
+        if not one.has_position:
+            one.reached = one.read(one.speed)
+    motion.turn(drives, 0, one.where)
+    # Bit 10 in pv and vl tells that the ramp has ended.
     motion.wait_for(drives, cia402.TARGET_REACHED, 10.0, "standstill", one.where)
     drives.advance(one.cycles(STANDSTILL) * cycle)
     return trace

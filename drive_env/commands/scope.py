@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from drive_env import cia402
 from drive_env.commands.options import (
     INTERRUPTED,
     REFUSED,
@@ -28,11 +29,13 @@ from drive_env.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectDictionary
     from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
 
 # Response and commands of the usual modes: what `drive-env model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
+OF_VL = ("6043", "6042", "6044", "6077")  # of a drive without pv
 LISTENED = 0.3  # how long other masters are listened for before anything is sent [s]
 CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]
 PIECE = 0.25  # recorded at a time afterwards [s]: as much is lost at most where the recording is broken off
@@ -78,7 +81,9 @@ def scope(
         refuse_other_masters(bus.interface, bus.channel, bus.nodes, bus.bitrate)
         with bus.connect(eds, safety=False) as drives:
             known = drives.description.dictionary
-            entries = [known.find(object_name(name)) for name in objects or default_samples(known, DEFAULT)]
+            entries = [
+                known.find(object_name(name)) for name in objects or default_samples(known, default_names(known))
+            ]
             condition = None if trigger is None else _parse(trigger, known)
             axes = axes_of_nodes(drives, bus.axis)
             every_scale = scales_of(drives)
@@ -105,6 +110,11 @@ def scope(
         if broken is not None:
             why, code = (str(broken), REFUSED) if isinstance(broken, Exception) else ("interrupted", INTERRUPTED)
             fail(f"{why}; the {len(t)} samples received before are in {table} and {picture}", code)
+
+
+def default_names(known: ObjectDictionary) -> tuple[str, ...]:
+    """Return the objects that are recorded where none are named; a drive need not have them all."""
+    return DEFAULT if known.has(cia402.TARGET_VELOCITY) or not known.has(cia402.VL_TARGET_VELOCITY) else OF_VL
 
 
 def new_files(out: Path) -> tuple[Path, Path]:

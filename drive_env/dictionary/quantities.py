@@ -16,7 +16,7 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.axis_objects import AxisObjects
 from drive_env.dictionary.entries import Entry, ObjectDictionary
-from drive_env.dictionary.position_scale import position_scale, velocity_ratio
+from drive_env.dictionary.position_scale import position_scale, set_point_ratio, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import MILLIAMPERE, split_unit
 from mechanics.arrays import Floats, Integers, Mask
@@ -32,13 +32,15 @@ class EnteredUnit(NamedTuple):
 class AxisScale(NamedTuple):
     """The scales of an axis' units, each None if it is not known.
 
-    These are position increments of a revolution, rpm of a velocity unit, and the motor's peak and nominal current [A].
+    These are position increments of a revolution, rpm of a velocity unit, the motor's peak and nominal current [A], and
+    velocity units of a target of vl.
     """
 
     increments: float | None = None
     rpm: float | None = None
     peak_current: float | None = None
     nominal_current: float | None = None
+    set_point: float | None = None
 
 
 # What units of an axis follow; of most drives that is the increments of a revolution alone. None: nothing is known.
@@ -70,7 +72,7 @@ UNITS = {
 }
 # Units that follow the increments of a revolution, the rpm of a velocity unit, a current of the motor.
 _INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
-_BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s"}
+_BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s", "set-point unit": "rpm"}
 # Field of the scale that a current is a part of, and the part.
 _OF_CURRENT = {
     "1/32767 M-Ipeak": ("peak_current", 1.0 / 32767.0),
@@ -88,7 +90,8 @@ def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
         return EnteredUnit(_INCREMENTAL[name], 1.0 / known.increments) if known.increments else None
     if name in _BY_RATIO:
         unit = UNITS[_BY_RATIO[name]]
-        return unit._replace(factor=known.rpm * unit.factor) if known.rpm else None
+        ratio = known.rpm if name != "set-point unit" else (known.rpm or 0.0) * (known.set_point or 0.0)
+        return unit._replace(factor=ratio * unit.factor) if ratio else None
     if name in _OF_CURRENT:
         field, part = _OF_CURRENT[name]
         whole = getattr(known, field)
@@ -113,16 +116,19 @@ def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
         known: Their objects.
     """
     increments, roles = _increments_of(drives, known), known.roles
-    ratio = velocity_ratio(roles)
+    ratio, of_targets = velocity_ratio(roles), set_point_ratio(roles)
     if ratio is None and Role.PEAK_CURRENT not in roles:
         return list(increments)
     unknown: list[float | None] = [None] * drives.num_axes
-    rpm = unknown if ratio is None else ratio.increments([drives.read(key).astype(float) for key in ratio.keys])
+    rpm, set_point = (
+        unknown if one is None else one.increments([drives.read(key).astype(float) for key in one.keys])
+        for one in (ratio, of_targets)
+    )
     peak, nominal = (
         MILLIAMPERE * drives.read(role).astype(float) if role in roles else unknown
         for role in (Role.PEAK_CURRENT, Role.NOMINAL_CURRENT)
     )
-    return [AxisScale(*one) for one in zip(increments, rpm, peak, nominal, strict=True)]
+    return [AxisScale(*one) for one in zip(increments, rpm, peak, nominal, set_point, strict=True)]
 
 
 def _increments_of(drives: AxisObjects, known: ObjectDictionary) -> list[float | None]:

@@ -28,20 +28,21 @@ class LimitAtRest:
     """Finds axes that stand with their current at its limit; raw integers of the wire throughout.
 
     Args:
-        drives: The drives. No axis is found on drives without a current limit of their own, as steppers, or known by
-            their EDS alone.
+        drives: The drives. No axis is found on drives without a current limit of their own, as steppers, without 606Ch,
+            or known by their EDS alone.
     """
 
     def __init__(self, drives: Drives) -> None:
         self.axes = drives.num_axes
         self._since: Floats = np.full(self.axes, np.nan)  # s, when it began
         device = drives.device
-        self.is_known = device is not None and Role.CURRENT_LIMIT in device.roles
+        speed = (cia402.VELOCITY_ACTUAL, 0)
+        self.is_known = device is not None and Role.CURRENT_LIMIT in device.roles and speed in device.bindings
         if device is not None and self.is_known:
             self._counts_per_limit = np.asarray(ampere_per_limit(drives) / ampere_per_count(drives), float)
             self._most = np.asarray(highest_current(drives) / ampere_per_count(drives), float)
             increments = np.asarray(drives.read(Role.POSITION_SCALE), float) / (2.0 * np.pi)
-            self._slow = device.standstill * increments * per_increment(drives, cia402.VELOCITY_ACTUAL)
+            self._slow = device.standstill * increments * per_increment(drives, speed)
 
     def look(self, now: float, status: ArrayLike, current: ArrayLike, speed: ArrayLike, limit: ArrayLike) -> Mask:
         """Return which axes have stood so for `HELD`, shape (num_axes,).

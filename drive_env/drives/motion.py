@@ -520,6 +520,23 @@ def turn(drives: BasicDrives, velocity: ArrayLike, where: Mask | None = None) ->
         drives.write(cia402.CONTROLWORD, cia402.FOLLOW_RAMP, where=axes & in_vl)
 
 
+def turning_mode(drives: BasicDrives) -> str:
+    """Return the mode in which drives turn at a velocity: pv, or vl of drives without it by 6502h, else by 60FFh."""
+    supported = _read_if_there(drives, cia402.SUPPORTED_MODES)
+    if supported is None or not supported.all():  # a drive that does not say
+        return "vl" if _read_if_there(drives, cia402.TARGET_VELOCITY) is None else "pv"
+    has_vl, has_pv = (supported >> (cia402.MODES[name] - 1) & 1 for name in ("vl", "pv"))
+    return "vl" if np.any(has_vl & ~has_pv) else "pv"
+
+
+def is_turning(drives: BasicDrives, axes: Mask, period: float) -> bool:
+    """Let a time [s] pass; return whether an axis moved by more than NEAR, or without 6064h is faster by 6044h."""
+    before = _read_if_there(drives, cia402.POSITION_ACTUAL)
+    drives.advance(period)
+    here = drives.read(cia402.VL_VELOCITY_ACTUAL if before is None else cia402.POSITION_ACTUAL)
+    return bool(np.any(np.abs(here - (0 if before is None else before))[axes] > NEAR))
+
+
 def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) -> None:
     """Run the homing method of 6098h and wait until home is attained; the axes are enabled, in hm, afterwards.
 

@@ -188,7 +188,10 @@ class EmulatedDrives(Saved):
         """Return the scale of each axis' units, read again after a change."""
         if self._scale[0] != self.inside.objects.scale_changes:
             found = self.inside.objects.context()
-            every = (found.position_scaler, found.velocity_ratio, found.peak_current, found.nominal_motor_current)
+            every = (
+                found.position_scaler, found.velocity_ratio, found.peak_current, found.nominal_motor_current,
+                found.set_point_ratio,
+            )  # fmt: skip
             rows = np.stack([np.broadcast_to(np.asarray(one, float), (self.num_axes,)) for one in every], axis=1)
             self._scale = self.inside.objects.scale_changes, [AxisScale(*row) for row in rows.tolist()]
         return self._scale[1]

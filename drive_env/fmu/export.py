@@ -26,12 +26,14 @@ SCRIPT = '''"""A drive of drive-env {version} as an FMU."""
 from {library} import {slave}
 
 try:
-    from drive_env.fmu.slave import DriveSlave
+    from drive_env.fmu.slave import DriveSlave, keep
 except ImportError as error:
     raise ImportError(
         "this FMU needs the Python package drive-env {version} in the Python of the program that loads it; "
         "install it there: pip install drive-env=={version}"
     ) from error
+
+keep(globals())
 
 
 class {name}(DriveSlave, {slave}):

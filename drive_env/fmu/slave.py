@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
+import ctypes
 import importlib
 import io
 import pickle
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, SubElement
@@ -51,6 +54,29 @@ STANDARDS = {  # FMI 2 has no integers beyond 32 bits: they are real numbers the
 }  # fmt: skip
 
 
+_kept: list[dict[str, Any]] = []
+
+
+def keep(names: dict[str, Any]) -> None:
+    """Hold one more reference to the names of an FMU's module.
+
+    PythonFMU (0.7.0) executes the module again for each instance, and then gives up a reference to its
+    names that it had only borrowed: without another one the second instance would find them freed, and end the program.
+    """
+    _kept.append(names)
+
+
+def _give_up_the_interpreter_once(resources: Path) -> None:
+    """Have the FMU's library give up its interpreter before the program ends, where that program is a Python.
+
+    On Linux, PythonFMU (0.7.0) and PythonFMU3 (0.3.4) give it up twice as they are unloaded: once too often where each
+    instance was freed, and the program then aborted, "corrupted double-linked list". What holds the library keeps it
+    from being unloaded earlier.
+    """
+    for file in resources.parent.glob("binaries/*linux*/*.so") if sys.orig_argv else ():
+        atexit.register(ctypes.CDLL(str(file)).finalizePythonInterpreter)
+
+
 class PlainData(pickle.Unpickler):
     """Reads states alone: numbers, text, and arrays of them. A serialised state comes from outside."""
 
@@ -80,6 +106,7 @@ class DriveSlave:
         super().__init__(**given)
         self._standard = STANDARDS[self.STANDARD]
         self._library = importlib.import_module(self._standard.library)
+        _give_up_the_interpreter_once(Path(self.resources))
         settings = read_settings(Path(self.resources))
         assert settings["device"] and settings["load"], "export_fmu writes them"
         self._drive = FmuDrive(settings["device"], settings["load"], settings["motor"])
@@ -119,8 +146,6 @@ class DriveSlave:
         if self.STANDARD == 3:
             found.set("fixedInternalStepSize", f"{self._drive.drives.device.cycle:g}")
         else:
-            # A second instance in one program was seen to end it: in the library, before it calls this class.
-            found.set("canBeInstantiatedOnlyOncePerProcess", "true")
             # The library leaves out which outputs are computed as the simulation begins: all of them.
             structure = root.find("ModelStructure")
             assert structure is not None, "the library writes it"

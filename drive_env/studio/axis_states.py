@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 SLOW = 0.5  # s between two readings of what changes slowly
 QUICK = 0.08  # s between two pictures of what is sampled
-SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+SAMPLED = (
+    cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.VL_VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL
+)  # fmt: skip
 INPUTS = ("negative limit switch", "positive limit switch", "home switch")  # bits 0 to 2 of 60FDh
 MODE_NAMES = {
     "pp": "profile position", "vl": "velocity", "pv": "profile velocity", "tq": "profile torque", "hm": "homing",
@@ -124,7 +126,10 @@ class AxisStates:
     def __init__(self, drives: Drives, description: Description) -> None:
         self._known = description
         self.scales: list[Scale] = scales_of(drives, description.dictionary)
-        self.sampled: tuple[Key, ...] = tuple((index, 0) for index in SAMPLED if description.has((index, 0)))
+        doubled = cia402.VL_VELOCITY_ACTUAL if description.has(cia402.VELOCITY_ACTUAL) else None
+        self.sampled: tuple[Key, ...] = tuple(
+            (index, 0) for index in SAMPLED if description.has((index, 0)) and index != doubled
+        )
         self._slow_at = self._quick_at = -1e9
         self._slow_entries = [entry for entry in description.dictionary if _is_slow(entry, description)]
         self._unreadable: set[Key] = set()

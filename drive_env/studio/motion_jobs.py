@@ -123,7 +123,7 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
 
 
 def turn(session: Session, axis: int, speed: str, number: int) -> MotionJob:
-    """Return the job that turns an axis in pv, as long as a motion of a page lasts.
+    """Return the job that turns an axis in pv, or in vl of drives without it, as long as a motion of a page lasts.
 
     Args:
         session: Knows the units, and the motion.
@@ -134,14 +134,15 @@ def turn(session: Session, axis: int, speed: str, number: int) -> MotionJob:
 
     def job(drives: Drives) -> None:
         where = only(drives, axis)
-        rate = parsed(session, axis, speed, cia402.TARGET_VELOCITY)
+        mode = motion.turning_mode(drives)
+        rate = parsed(session, axis, speed, motion.FOLLOWED[mode][0])
         _check_enabled(drives, axis)
         if not session.presence.is_on(number):
             return  # released before it began
-        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
-        motion.select_mode(drives, "pv", where=where)
+        motion.stay(drives, mode, where)
+        motion.select_mode(drives, mode, where=where)
         if session.presence.is_on(number):
-            drives.write(cia402.TARGET_VELOCITY, rate, where=where)
+            motion.turn(drives, rate, where)
 
     return job
 
@@ -151,7 +152,7 @@ def end_turn(axis: int) -> MotionJob:
 
     def job(drives: Drives) -> None:
         if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
-            drives.write(cia402.TARGET_VELOCITY, 0, where=only(drives, axis))
+            motion.stay(drives, motion.turning_mode(drives), only(drives, axis))
 
     return job
 
@@ -182,13 +183,8 @@ def _mode_of(drives: Drives, axis: int) -> str:
 
 def _await_rest(drives: Drives, axis: int, timeout: float = 5.0) -> None:
     """Let time pass until the quick stop of an axis is over, or it has left its state."""
-    waited = 0.0
-    before = int(drives.read(cia402.POSITION_ACTUAL)[axis])
-    while waited < timeout:
-        drives.advance(0.02)
+    waited, where = 0.0, only(drives, axis)
+    while waited < timeout and motion.is_turning(drives, where, 0.02):
         waited += 0.02
-        here = int(drives.read(cia402.POSITION_ACTUAL)[axis])
-        is_live = cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis]))
-        if not is_live or abs(here - before) <= motion.NEAR:
+        if not cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis])):
             return
-        before = here

@@ -35,14 +35,14 @@ from drive_env.studio.scope_view import (
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
-from drive_env.studio.workspace import AxisSettings, object_key, object_name, trigger_of
+from drive_env.studio.workspace import OF_VL, AxisSettings, object_key, object_name, trigger_of
 from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
 FIRST = (  # of the objects that can be chosen, those that people look for
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
-    cia402.DC_LINK_VOLTAGE,
+    cia402.DC_LINK_VOLTAGE, cia402.VL_TARGET_VELOCITY, *OF_VL,
 )  # fmt: skip
 
 _views: dict[str, ScopeView] = {}  # of each page that is open, by its visitor's id

@@ -509,7 +509,7 @@ class Session:
         with drives.lock:
             live = np.asarray(cia402.is_live(real.read(cia402.STATUSWORD)))
             waited = 0.0
-            while live.any() and waited < STOP_WAIT and _turns(real, live):
+            while live.any() and waited < STOP_WAIT and motion.is_turning(real, live, PIECE):
                 waited += PIECE
 
     def _obey(self) -> None:
@@ -552,7 +552,7 @@ class Session:
             with self._drives.lock:
                 live = _stop_live(real)
                 waited = 0.0
-                while live.any() and waited < STOP_WAIT and _turns(real, live):
+                while live.any() and waited < STOP_WAIT and motion.is_turning(real, live, PIECE):
                     real.advance(PIECE)
                     waited += PIECE
                 if live.any():
@@ -578,11 +578,3 @@ def _stop_live(drives: Drives, axes: Mask | None = None) -> Mask:
     if enabled.any():
         motion.quick_stop(drives, where=enabled)
     return np.asarray(live)
-
-
-def _turns(drives: Drives, axes: Mask) -> bool:
-    """Return whether an axis is still being stopped, or moves."""
-    before = drives.read(cia402.POSITION_ACTUAL)
-    drives.advance(PIECE)
-    moved = np.abs(drives.read(cia402.POSITION_ACTUAL) - before)
-    return bool(np.any(moved[axes] > motion.NEAR))

@@ -17,7 +17,8 @@ from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_toml
 
 FORMAT = 1
-DEFAULT_CHANNELS = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+CHANNELS = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+OF_VL = (cia402.VL_VELOCITY_DEMAND, cia402.VL_VELOCITY_ACTUAL)  # of a drive that has none of them
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,12 @@ class Workspace:
     def of(self, axis: int) -> AxisSettings:
         """Return the settings of an axis."""
         known = self._description
-        usual = tuple((index, 0) for index in DEFAULT_CHANNELS if known.has((index, 0)))
-        return self._axes.get(axis) or AxisSettings(channels=usual)
+        there = [(index, 0) for index in (*CHANNELS, *OF_VL) if known.has((index, 0))]
+        usual = tuple(key for key in there if key[0] in CHANNELS) or tuple(there)
+        source = (cia402.VELOCITY_ACTUAL, 0)
+        return self._axes.get(axis) or AxisSettings(
+            channels=usual, source=source if known.has(source) or not usual else usual[-1]
+        )
 
     def change(self, axis: int, **changes: Any) -> None:
         """Change settings of an axis, named as in `AxisSettings`; OSError if the file cannot be written."""

@@ -54,10 +54,10 @@ PATIENCE = 120.0  # s until a run has come so far; it is never this long
 
 
 @contextmanager
-def node(lockstep=True):
-    """An emulated drive on a hub: its machine, and the options that name it."""
+def node(lockstep=True, machine=None):
+    """An emulated drive on a hub: its machine, one of the first drive by default, and the options that name it."""
     world = World(lockstep=lockstep)
-    machine = EmulatedDrives(load="inertia", num_threads=1)
+    machine = machine or EmulatedDrives(load="inertia", num_threads=1)
     machine.advance(0.001)  # compiles: a node that does would not answer in time
     world.add(machine, [1])
     hub = Hub()
