@@ -6,6 +6,7 @@ from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.ethercat import ethercat_app
 from drive_env.commands.export import export_app
 from drive_env.commands.fault import fault
+from drive_env.commands.faults import faults
 from drive_env.commands.frames import frames_app
 from drive_env.commands.get import get, set_object
 from drive_env.commands.jog import jog
@@ -33,6 +34,7 @@ PANELS = {
         ("scan", scan),
         ("get", get),
         ("set", set_object),
+        ("faults", faults),
         ("monitor", monitor),
         ("scope", scope),
         ("jog", jog),
