@@ -9,11 +9,13 @@ from drive_env.commands.fault import fault
 from drive_env.commands.faults import faults
 from drive_env.commands.frames import frames_app
 from drive_env.commands.get import get, set_object
+from drive_env.commands.home import home
 from drive_env.commands.jog import jog
 from drive_env.commands.lss import lss_app
 from drive_env.commands.model import model
 from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
+from drive_env.commands.move import move
 from drive_env.commands.names import list_names
 from drive_env.commands.new import new_from_eds
 from drive_env.commands.objects import objects
@@ -38,6 +40,8 @@ PANELS = {
         ("monitor", monitor),
         ("scope", scope),
         ("jog", jog),
+        ("move", move),
+        ("home", home),
     ),
     "This installation": (
         ("list", list_names),
