@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import signal
 import struct
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 
 from drive_env.commands import recorded_frames
 from drive_env.commands.cli import app
-from drive_env.commands.frame_files import FrameFile
+from drive_env.commands.frame_files import FrameFile, FrameLines
 from drive_env.master.can import port
 
 FRAMES = {
@@ -54,6 +55,32 @@ PACKETS = {
     "FD": (3, 0, 0x181, 12, 0x05, 24 * "0"),
     "before the clock was set": (0, 0, 0x181, 1, 0, "01"),
 }
+
+
+SHOWN = {
+    "data": "    0.000000  181   [2]  37 02                     TPDO 1, node 1",
+    "sent by this program": "    0.000000  601   [8]  00 00 00 00 00 00 00 00   SDO request, node 1",
+    "empty": "    0.000000  080   [0]                           SYNC",
+    "remote": "    0.000000  701   [1]  remote request           heartbeat, node 1",
+    "extended": "    0.000000  123   [1]  FF                        extended",
+    "error": "    0.000000  000   [0]                           error frame",
+}
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_a_frame_on_the_screen_has_its_service(name, capsys):
+    with FrameLines(as_json=False) as lines:
+        lines(FRAMES[name])
+    assert " ".join(capsys.readouterr().out.split()) == " ".join(SHOWN[name].split())
+
+
+def test_a_frame_as_json_is_a_line_of_its_own_with_the_time_from_the_first(capsys):
+    with FrameLines(as_json=True) as lines:
+        lines(FRAMES["data"])
+        lines(FRAMES["remote"])
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["t"] for row in rows] == [0.0, 1.5] and rows[0]["data"] == "3702"
+    assert [row["service"] for row in rows] == ["TPDO 1, node 1", "heartbeat, node 1"]
 
 
 def packets(content):

@@ -20,7 +20,7 @@ from drive_env import EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.commands.one_axis import Outcome
+from drive_env.commands.one_axis import MoveOutcome
 from drive_env.dictionary.homing_methods import METHODS, method_text
 from drive_env.firmware.common.modes import hm
 
@@ -132,9 +132,12 @@ def test_a_homing_that_does_not_end_in_time_fails_and_stops(served, run):
 
 def test_an_emergency_on_the_way_to_the_target_stops_nothing_and_one_that_kept_from_it_did():
     jam = [{"code": 0x8611, "name": "following_error"}]
-    assert Outcome(0, 0, 0, [], jam, None).stopped(True) == ""
-    assert Outcome(0, 0, 0, [], jam, None).stopped(False) == "the movement was stopped: emergency 8611h following error"
-    assert Outcome(0, 0, 0, ["late"], [], None).stopped(True) == "late"
+    assert MoveOutcome(0, 0, 0, [], jam, None).stopped(True) == ""
+    assert (
+        MoveOutcome(0, 0, 0, [], jam, None).stopped(False)
+        == "the movement was stopped: emergency 8611h following error"
+    )
+    assert MoveOutcome(0, 0, 0, ["late"], [], None).stopped(True) == "late"
 
 
 # --- Ctrl-C ---------------------------------------------------------------------------------------------------------

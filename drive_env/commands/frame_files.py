@@ -1,4 +1,4 @@
-"""Files of frames as Wireshark opens them: candump's lines, and pcap in Linux SocketCAN framing."""
+"""Frames in files as Wireshark opens them (candump's lines, pcap in Linux SocketCAN framing), and on the screen."""
 
 from __future__ import annotations
 
@@ -84,3 +84,39 @@ class FrameFile:
         """Write a frame."""
         with naming(self._path):
             self._file.write(self._encode(message))
+
+
+class FrameLines:
+    """Frames on the screen as they come, a line each.
+
+    Args:
+        as_json: Whether a line is JSON.
+    """
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self._start: float | None = None
+
+    def __enter__(self) -> FrameLines:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def __call__(self, message: Any) -> None:
+        """Print a frame; its time [s] is from the first one on."""
+        from drive_env.canopen.frames import service_name
+        from drive_env.commands.options import print_json
+        from drive_env.master.can.dry_run import show_frame
+
+        if self._start is None:
+            self._start = message.timestamp
+        after, number = message.timestamp - self._start, message.arbitration_id
+        service = "extended" if message.is_extended_id else service_name(number)
+        service = "error frame" if message.is_error_frame else service
+        if self._as_json:
+            print_json({"t": round(after, 6), "id": number, "remote": message.is_remote_frame,
+                        "data": message.data.hex(), "service": service})  # fmt: skip
+            return
+        frame = show_frame(number, bytes(message.data), message.dlc if message.is_remote_frame else None)
+        print(f"{after:12.6f}  {frame:<34}  {service}".rstrip(), flush=True)

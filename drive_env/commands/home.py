@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from drive_env import cia402
-from drive_env.commands.one_axis import STANDSTILL, MaxCurrent, OneAxis, Outcome, check_axis, limits_of, print_outcome
+from drive_env.commands.one_axis import (
+    STANDSTILL,
+    MaxCurrent,
+    MoveOutcome,
+    OneAxis,
+    check_axis,
+    limits_of,
+    print_outcome,
+)
 from drive_env.commands.options import (
     REFUSED,
     AxesInOrderOptions,
@@ -53,7 +61,7 @@ class _Homing(NamedTuple):
         is_known = self.one.drives.description.device is not None
         return f"homed by method {self.method} ({_text(self.method, is_known)})"
 
-    def run(self, within: float) -> Outcome:
+    def run(self, within: float) -> MoveOutcome:
         """Home the axis, switch it off, and give the drive its own method back."""
         from drive_env.drives.lent_object import lent
 
@@ -195,7 +203,7 @@ def _find_home(one: OneAxis, within: float) -> None:
     raise RuntimeError("the drive reports home, and the axis is not at rest")
 
 
-def _report(homing: _Homing, outcome: Outcome, json: bool) -> None:
+def _report(homing: _Homing, outcome: MoveOutcome, json: bool) -> None:
     """Print the result of a homing; exit code 1 where the drive does not show that it attained home."""
     one = homing.one
     is_home = bool(cia402.matches(outcome.status, ATTAINED))

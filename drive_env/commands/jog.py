@@ -14,8 +14,8 @@ from drive_env.commands.one_axis import (
     LEAST,
     STANDSTILL,
     MaxCurrent,
+    MoveOutcome,
     OneAxis,
-    Outcome,
     Recording,
     check_axis,
     go,
@@ -126,7 +126,7 @@ def _asked_for(one: OneAxis, speed: str, by: str | None, duration: float) -> _Mo
     return _Movement(velocity, duration, distance)
 
 
-def _verdict(share: float, outcome: Outcome, meant: str) -> str:
+def _verdict(share: float, outcome: MoveOutcome, meant: str) -> str:
     """Return why a movement failed; "" if it did not.
 
     Args:

@@ -33,7 +33,7 @@ STANDSTILL = 0.05  # s, that the drives get to come to rest
 LEAST = 0.01  # of the way asked for: an axis that has moved less has not moved, one that is so near has arrived
 
 
-class Outcome(NamedTuple):
+class MoveOutcome(NamedTuple):
     """The end of a movement: what the drive itself shows, and what stopped it.
 
     Attributes:
@@ -58,7 +58,7 @@ class Outcome(NamedTuple):
         return [told(message) for message in self.emergencies if is_error(message)]
 
     def stopped(self, is_there: bool) -> str:
-        """Return what stopped the movement; "" if nothing did. `is_there`: an emergency on the way stopped nothing."""
+        """Return the reason of an early stop; "" without one. `is_there`: an emergency on the way stopped nothing."""
         if self.errors and (self.reasons or not is_there):
             why = [", ".join(dict.fromkeys(self.errors)), *self.reasons]
             return f"the movement was stopped: emergency {'; '.join(why)}"
@@ -137,7 +137,7 @@ class OneAxis:
         write_table(files[0], entries, [""], trace.t, rows)
         draw(files[1], entries, [""], [self.scale], trace.t, rows)
 
-    def carry_out(self, act: Callable[[], Any]) -> Outcome:
+    def carry_out(self, act: Callable[[], Any]) -> MoveOutcome:
         """Run a movement, which enables the axis and may return a recording; then switch the axis off."""
         from drive_env import motion
 
@@ -151,7 +151,7 @@ class OneAxis:
         self.drives.advance(0.1)
         end = self.read(cia402.POSITION_ACTUAL)
         emergencies = [one._asdict() for one in self.drives.emergencies() if one.axis == self.axis]
-        return Outcome(status, reached, end, reasons, emergencies, trace)
+        return MoveOutcome(status, reached, end, reasons, emergencies, trace)
 
     def tell_plan(self, what: str, start: int, *, is_dry: bool, json: bool) -> None:
         """Print where the axis is and what is to be done; RuntimeError for one in fault, which could not be enabled."""
@@ -227,7 +227,7 @@ def what_stops(reasons: list[str]) -> Iterator[None]:
         reasons.append(str(error).partition(";")[0])
 
 
-def print_outcome(line: str, outcome: Outcome, files: tuple[Path, Path] | None) -> None:
+def print_outcome(line: str, outcome: MoveOutcome, files: tuple[Path, Path] | None) -> None:
     """Print a movement's result: a line, its emergencies, and its recording, if files were asked for."""
     print(line)
     for error in outcome.errors:
