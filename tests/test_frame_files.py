@@ -117,6 +117,32 @@ def test_a_packet_is_socketcan_s(tmp_path, name):
     assert packets(write(tmp_path / "a.pcap", [FRAMES[name]])) == [PACKETS[name]]
 
 
+def blocks(content):
+    """Read the blocks of a pcapng as its specification has it (draft-ietf-opsawg-pcapng): kind and content."""
+    found = []
+    while content:
+        kind, length = struct.unpack_from("<II", content)
+        assert length % 4 == 0 and struct.unpack_from("<I", content, length - 4) == (length,)
+        found.append((kind, content[8 : length - 4]))
+        content = content[length:]
+    return found
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_pcapng_has_the_packet_and_the_time_of_the_pcap(tmp_path, name):
+    section, interface, packet = blocks(write(tmp_path / "a.pcapng", [FRAMES[name]]))
+    assert section == (0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    assert interface == (1, struct.pack("<HHI", 227, 0, 65_535))
+    kind, content = packet
+    number, high, low, kept, length = struct.unpack_from("<IIIII", content)
+    assert (kind, number, kept) == (6, 0, length)
+    seconds, microseconds = divmod((high << 32) + low, 1_000_000)
+    (of_pcap,) = packets(write(tmp_path / "a.pcap", [FRAMES[name]]))
+    assert (seconds, microseconds) == of_pcap[:2]
+    assert content[20 : 20 + kept] == (tmp_path / "a.pcap").read_bytes()[24 + 16 :]
+    assert len(content) == 20 + kept + -kept % 4
+
+
 def test_python_can_reads_the_lines(tmp_path):
     write(tmp_path / "a.log", FRAMES.values())
     with can.LogReader(str(tmp_path / "a.log")) as reader:

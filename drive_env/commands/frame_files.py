@@ -36,17 +36,40 @@ def candump_line(message: Any) -> bytes:
     return f"({max(message.timestamp, 0.0):017.6f}) {channel} {content}\n".encode()
 
 
-def pcap_record(message: Any) -> bytes:
-    """Return a record of link type 227: where a frame came from, which pcap has no field for, is left out."""
+def _packet(message: Any) -> bytes:
+    """Return a packet of link type 227: where a frame came from, for which it has no field, is left out."""
     if message.is_error_frame:
         can_id, data, length = ERROR | BUS_ERROR, ERROR_DATA, len(ERROR_DATA)
     else:
         can_id = message.arbitration_id | message.is_extended_id * EXTENDED | message.is_remote_frame * REMOTE
         data = b"" if message.is_remote_frame else bytes(message.data)
         length = message.dlc if message.is_remote_frame else len(data)
-    packet = FRAME.pack(can_id, length, _fd_flags(message), 0, 0) + data
-    seconds, microseconds = divmod(round(max(message.timestamp, 0.0) * 1e6), 1_000_000)
+    return FRAME.pack(can_id, length, _fd_flags(message), 0, 0) + data
+
+
+def pcap_record(message: Any) -> bytes:
+    """Return a record of a pcap file."""
+    packet = _packet(message)
+    seconds, microseconds = divmod(_microseconds(message), 1_000_000)
     return RECORD.pack(seconds, microseconds, len(packet), len(packet)) + packet
+
+
+def pcapng_record(message: Any) -> bytes:
+    """Return an enhanced packet block of a pcapng file."""
+    packet = _packet(message)
+    high, low = divmod(_microseconds(message), 1 << 32)
+    content = struct.pack("<IIIII", 0, high, low, len(packet), len(packet)) + packet
+    return _block(6, content + bytes(-len(packet) % 4))
+
+
+def _block(kind: int, content: bytes) -> bytes:
+    """Return a block of a pcapng file: its length stands before and after the content."""
+    length = struct.pack("<I", len(content) + 12)
+    return struct.pack("<I", kind) + length + content + length
+
+
+def _microseconds(message: Any) -> int:
+    return round(max(message.timestamp, 0.0) * 1e6)
 
 
 def _fd_flags(message: Any) -> int:
@@ -55,8 +78,16 @@ def _fd_flags(message: Any) -> int:
     return FD | bool(message.bitrate_switch) * BIT_RATE_SWITCH | bool(message.error_state_indicator) * ERROR_STATE
 
 
+# pcapng (draft-ietf-opsawg-pcapng): section (version 1.0, of unknown length), one interface, microseconds.
+PCAPNG_HEADER = _block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)) + _block(
+    1, struct.pack("<HHI", LINKTYPE_CAN_SOCKETCAN, 0, 65_535)
+)
 # Ending -> what a file begins with, and what a frame becomes in it.
-FRAME_FILES = {".log": (b"", candump_line), ".pcap": (PCAP_HEADER, pcap_record)}
+FRAME_FILES = {
+    ".log": (b"", candump_line),
+    ".pcap": (PCAP_HEADER, pcap_record),
+    ".pcapng": (PCAPNG_HEADER, pcapng_record),
+}
 
 
 class FrameFile:

@@ -34,7 +34,7 @@ MOST_CHANNELS = 0xFFFF
 HIGHEST_ID, LONGEST_DATA = 0x7FF, 8  # of the frames that are sent
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
-WRITTEN = (*FORMATS, ".pcap")
+WRITTEN = (*FORMATS, ".pcap", ".pcapng")
 NOT_HELD = {".trc": "remote frames and no CAN FD", ".csv": "CAN FD", ".db": "CAN FD"}  # of python-can's writers
 
 frames_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
@@ -50,8 +50,8 @@ def log(
     file: Annotated[
         Path,
         typer.Argument(
-            help="New file; Wireshark opens .log (candump's) and .pcap, .blf is Vector's, also .asc .csv .trc; "
-            "- prints the frames as they come."
+            help="New file; Wireshark opens .log (candump's), .pcap and .pcapng, .blf is Vector's, also .asc .csv "
+            ".trc; - prints the frames as they come."
         ),
     ],
     interface: Interface = None,
