@@ -69,7 +69,8 @@ def _block(kind: int, content: bytes) -> bytes:
 
 
 def _microseconds(message: Any) -> int:
-    return round(max(message.timestamp, 0.0) * 1e6)
+    since_1970: float = message.timestamp  # s
+    return round(max(since_1970, 0.0) * 1e6)
 
 
 def _fd_flags(message: Any) -> int:

@@ -12,7 +12,7 @@ from drive_env.firmware.common.protection import CUT, STOP
 
 if TYPE_CHECKING:
     from drive_env.drives.emergency import EmergencyMessage
-    from drive_env.drives.interface import BasicDrives
+    from drive_env.drives.interface import Drives
     from drive_env.fieldbus.description import Description
 
 ERROR_REGISTER, ERROR_HISTORY = 0x1001, 0x1003
@@ -41,7 +41,7 @@ class FaultReport(NamedTuple):
         return bool(cia402.matches(self.status, cia402.FAULT_BIT))
 
 
-def read_faults(drives: BasicDrives, known: Description) -> list[FaultReport]:
+def read_faults(drives: Drives, known: Description) -> list[FaultReport]:
     """Read what every axis reports of its fault; nothing is written.
 
     Args:
@@ -64,7 +64,7 @@ def read_faults(drives: BasicDrives, known: Description) -> list[FaultReport]:
 
 
 def _named(
-    drives: BasicDrives, known: Description, axis: int, register: int | None, heard: list[EmergencyMessage]
+    drives: Drives, known: Description, axis: int, register: int | None, heard: list[EmergencyMessage]
 ) -> tuple[str, list[str]]:
     """Return the names of the causes of an axis' fault, and the source that tells the most of them."""
     if told := [message.name for message in heard if message.axis == axis and message.code]:
@@ -76,7 +76,7 @@ def _named(
     return _deduced(drives, known, axis, register)
 
 
-def _newest(drives: BasicDrives, known: Description, axis: int) -> int:
+def _newest(drives: Drives, known: Description, axis: int) -> int:
     """Return the newest entry of 1003h that is about an axis; 0 if there is none.
 
     A known device has the axis in bits 16 to 23; with other drives these bits are the maker's (CiA 301).
@@ -96,7 +96,7 @@ def _newest(drives: BasicDrives, known: Description, axis: int) -> int:
     return 0
 
 
-def _deduced(drives: BasicDrives, known: Description, axis: int, register: int | None) -> tuple[str, list[str]]:
+def _deduced(drives: Drives, known: Description, axis: int, register: int | None) -> tuple[str, list[str]]:
     """Return those of a known device's causes that 1001h and its status flags allow; [] for an unknown device."""
     if known.device is None or register is None:
         return "", []
