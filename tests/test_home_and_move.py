@@ -16,7 +16,7 @@ from rigs.served_drives import environment, node, status_is, wait_until
 from typer.testing import CliRunner
 
 import drive_env.commands.cli
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -86,6 +86,13 @@ def test_a_dry_run_says_where_to_and_moves_nothing(served, run):
     assert found.exit_code == DONE and "would be enabled, moved by 16384 inc (0.25 rev) to " in found.stdout
     assert run("home", "--method", "17", "--dry-run").exit_code == DONE
     assert abs(float(drives.machine.rotor_angle[0]) - before) < 0.01
+
+
+def test_a_home_that_the_drive_does_not_show_is_not_claimed(run, monkeypatch):
+    monkeypatch.setattr(motion, "home", lambda drives, **others: motion.enable(drives, mode="hm"))
+    found = run("home", "--method", "17", "--yes")
+    assert found.exit_code == REFUSED and "not homed" in found.stdout
+    assert "the drive does not show that home is attained" in found.stderr
 
 
 def test_a_speed_of_0_is_named_before_the_axis_is_enabled(served, run):
