@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import signal
 import struct
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 
 from drive_env.commands import recorded_frames
 from drive_env.commands.cli import app
-from drive_env.commands.frame_files import FrameFile
+from drive_env.commands.frame_files import FrameFile, FrameLines
 from drive_env.master.can import port
 
 FRAMES = {
@@ -56,6 +57,32 @@ PACKETS = {
 }
 
 
+SHOWN = {
+    "data": "    0.000000  181   [2]  37 02                     TPDO 1, node 1",
+    "sent by this program": "    0.000000  601   [8]  00 00 00 00 00 00 00 00   SDO request, node 1",
+    "empty": "    0.000000  080   [0]                           SYNC",
+    "remote": "    0.000000  701   [1]  remote request           heartbeat, node 1",
+    "extended": "    0.000000  123   [1]  FF                        extended",
+    "error": "    0.000000  000   [0]                           error frame",
+}
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_a_frame_on_the_screen_has_its_service(name, capsys):
+    with FrameLines(as_json=False) as lines:
+        lines(FRAMES[name])
+    assert " ".join(capsys.readouterr().out.split()) == " ".join(SHOWN[name].split())
+
+
+def test_a_frame_as_json_is_a_line_of_its_own_with_the_time_from_the_first(capsys):
+    with FrameLines(as_json=True) as lines:
+        lines(FRAMES["data"])
+        lines(FRAMES["remote"])
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["t"] for row in rows] == [0.0, 1.5] and rows[0]["data"] == "3702"
+    assert [row["service"] for row in rows] == ["TPDO 1, node 1", "heartbeat, node 1"]
+
+
 def packets(content):
     """Read a pcap as its specification has it (draft-ietf-opsawg-pcap; tcpdump.org, LINKTYPE_CAN_SOCKETCAN)."""
     magic, major, minor, _, _, longest, link = struct.unpack_from("<IHHiIII", content)
@@ -88,6 +115,32 @@ def test_a_line_is_candump_s(tmp_path, name):
 @pytest.mark.parametrize("name", FRAMES)
 def test_a_packet_is_socketcan_s(tmp_path, name):
     assert packets(write(tmp_path / "a.pcap", [FRAMES[name]])) == [PACKETS[name]]
+
+
+def blocks(content):
+    """Read the blocks of a pcapng as its specification has it (draft-ietf-opsawg-pcapng): kind and content."""
+    found = []
+    while content:
+        kind, length = struct.unpack_from("<II", content)
+        assert length % 4 == 0 and struct.unpack_from("<I", content, length - 4) == (length,)
+        found.append((kind, content[8 : length - 4]))
+        content = content[length:]
+    return found
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_pcapng_has_the_packet_and_the_time_of_the_pcap(tmp_path, name):
+    section, interface, packet = blocks(write(tmp_path / "a.pcapng", [FRAMES[name]]))
+    assert section == (0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    assert interface == (1, struct.pack("<HHI", 227, 0, 65_535))
+    kind, content = packet
+    number, high, low, kept, length = struct.unpack_from("<IIIII", content)
+    assert (kind, number, kept) == (6, 0, length)
+    seconds, microseconds = divmod((high << 32) + low, 1_000_000)
+    (of_pcap,) = packets(write(tmp_path / "a.pcap", [FRAMES[name]]))
+    assert (seconds, microseconds) == of_pcap[:2]
+    assert content[20 : 20 + kept] == (tmp_path / "a.pcap").read_bytes()[24 + 16 :]
+    assert len(content) == 20 + kept + -kept % 4
 
 
 def test_python_can_reads_the_lines(tmp_path):

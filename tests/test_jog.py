@@ -14,7 +14,7 @@ from drive_env import EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.commands import jog as jog_command
+from drive_env.commands.one_axis import is_error
 
 TURN = 65536
 
@@ -78,7 +78,7 @@ def test_a_speed_above_the_envelope_s_limit_names_no_argument_of_python(jog):
 
 
 def test_an_emergency_that_tells_of_no_error_any_more_is_none():
-    assert [message["code"] for message in filter(jog_command._is_error, [{"code": 0}, {"code": 0x2310}])] == [0x2310]
+    assert [message["code"] for message in filter(is_error, [{"code": 0}, {"code": 0x2310}])] == [0x2310]
 
 
 @pytest.mark.slow

@@ -98,6 +98,7 @@ VALUES: dict[str, str] = {
     "dynamics": "soft", "inertia_range": "0.8/4",
     "replay": "move.csv", "out": "new", "drive-env scope out": "new.csv", "drive-env jog out": "new.csv",
     "eds": "own.eds", "config": "config.toml", "journal": "new.journal", "store": "new",
+    "position": "1 rev", "drive-env move out": "new.csv",
     "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env frames replay speed": "2", "max_current": "1 A",
     "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc",
     "sampler": "tpe", "objectives": "cost", "gains": "velocity_p", "axes": "apart", "travel": "-1:1",
@@ -111,6 +112,16 @@ WITHOUT_DRIVES = {
     ("drive-agent evaluate", "--card"): "environment: ServoDrive/Tracking-v0",  # prints how an agent was trained
     ("drive-env frames replay", "--dry-run"): "1 frames shown",  # prints what is in a file
 }
+
+
+# About the bus or its nodes as a whole; a page has all axes, and one is chosen there.
+OF_NO_AXIS = {"drive-env studio"}
+
+
+def test_every_command_about_the_axes_of_drives_on_a_bus_has_axis():
+    about = [one for one in ON_A_BUS if one.program == "drive-env" and {"node", "eds"} <= one.options.keys()]
+    assert len(about) > 10
+    assert {str(one) for one in about if "axis" not in one.options} == OF_NO_AXIS
 
 
 def value(command: Command, option: Option) -> str:

@@ -30,6 +30,7 @@ class Frame(NamedTuple):
 NMT = 0x000
 SYNC = 0x080
 EMCY = 0x080
+TIME = 0x100
 TPDO = (0x180, 0x280, 0x380, 0x480)
 RPDO = (0x200, 0x300, 0x400, 0x500)
 SDO_RESPONSE = 0x580
@@ -53,6 +54,18 @@ PRODUCE = 1 << 30  # SYNC, TIME: 1 makes the device produce it
 CONSUME_TIME = 1 << 31
 EXTENDED = 1 << 29
 IDENTIFIER = 0x7FF
+
+
+def service_name(can_id: int) -> str:
+    """Return the service and the node of an identifier in the predefined connection set; "" for one of no service."""
+    node = can_id & 0x7F
+    if node == 0:
+        return {NMT: "NMT", SYNC: "SYNC", TIME: "TIME"}.get(can_id, "")
+    names = {EMCY: "EMCY", SDO_RESPONSE: "SDO response", SDO_REQUEST: "SDO request", ERROR_CONTROL: "heartbeat"}
+    names |= {first: f"TPDO {k}" for k, first in enumerate(TPDO, 1)}
+    names |= {first: f"RPDO {k}" for k, first in enumerate(RPDO, 1)}
+    name = names.get(can_id - node)
+    return "" if name is None else f"{name}, node {node}"
 
 
 def is_restricted(can_id: int) -> bool:

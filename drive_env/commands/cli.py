@@ -6,13 +6,16 @@ from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.ethercat import ethercat_app
 from drive_env.commands.export import export_app
 from drive_env.commands.fault import fault
+from drive_env.commands.faults import faults
 from drive_env.commands.frames import frames_app
 from drive_env.commands.get import get, set_object
+from drive_env.commands.home import home
 from drive_env.commands.jog import jog
 from drive_env.commands.lss import lss_app
 from drive_env.commands.model import model
 from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
+from drive_env.commands.move import move
 from drive_env.commands.names import list_names
 from drive_env.commands.new import new_from_eds
 from drive_env.commands.objects import objects
@@ -33,9 +36,12 @@ PANELS = {
         ("scan", scan),
         ("get", get),
         ("set", set_object),
+        ("faults", faults),
         ("monitor", monitor),
         ("scope", scope),
         ("jog", jog),
+        ("move", move),
+        ("home", home),
     ),
     "This installation": (
         ("list", list_names),

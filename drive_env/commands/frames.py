@@ -34,7 +34,7 @@ MOST_CHANNELS = 0xFFFF
 HIGHEST_ID, LONGEST_DATA = 0x7FF, 8  # of the frames that are sent
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
-WRITTEN = (*FORMATS, ".pcap")
+WRITTEN = (*FORMATS, ".pcap", ".pcapng")
 NOT_HELD = {".trc": "remote frames and no CAN FD", ".csv": "CAN FD", ".db": "CAN FD"}  # of python-can's writers
 
 frames_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
@@ -50,7 +50,8 @@ def log(
     file: Annotated[
         Path,
         typer.Argument(
-            help="New file; Wireshark opens .log (candump's) and .pcap, .blf is Vector's, also .asc .csv .trc."
+            help="New file; Wireshark opens .log (candump's), .pcap and .pcapng, .blf is Vector's, also .asc .csv "
+            ".trc; - prints the frames as they come."
         ),
     ],
     interface: Interface = None,
@@ -61,28 +62,32 @@ def log(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Write every frame of the bus to a file; nothing is sent. If the bus is lost, the frames so far are kept."""
+    """Write every frame of the bus to a file, or to the screen; nothing is sent.
+
+    If the bus is lost, the frames so far are kept. On the screen: time [s], identifier, length, data, and the service
+    of CiA 301's predefined connection set; with --json a line for each frame.
+    """
     with errors_as_exit_codes():
         import can
         from can.util import channel2int
 
-        from drive_env.commands.frame_files import FRAME_FILES, FrameFile
+        from drive_env.commands.frame_files import FRAME_FILES, FrameFile, FrameLines
         from drive_env.held_signals import held_signals
         from drive_env.master.can.port import open_bus
 
-        ending = file.suffix.lower()
-        _check_format(file, ending, WRITTEN)
+        ending, is_shown = file.suffix.lower(), str(file) == "-"
+        if not is_shown:
+            _check_new(file, ending)
         check_time("--duration", duration)
-        if not file.parent.is_dir():
-            raise ValueError(f"there is no folder {file.parent}; choose another file")
-        check_free(file)
         bus = open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {}))
         count = left_out = 0
         lost: Exception | None = None
         taken = _take_interrupts()
         end = time.monotonic() + (float("inf") if duration is None else duration)
         try:
-            with held_signals() as noted, FrameFile(file) if ending in FRAME_FILES else can.Logger(str(file)) as writer:
+            made = (FrameLines(json) if is_shown
+                    else FrameFile(file) if ending in FRAME_FILES else can.Logger(str(file)))  # fmt: skip
+            with held_signals() as noted, made as writer:
                 while not noted and (left := end - time.monotonic()) > 0.0:
                     try:
                         message = bus.recv(min(left, 0.1))
@@ -103,11 +108,14 @@ def log(
             if taken is not None:
                 signal.signal(signal.SIGINT, taken)
             bus.shutdown()
+        if is_shown and lost is None:
+            return
         result = {"frames": count, "file": str(file), "left_out": left_out}
         if lost is not None:
             if json:
                 print_json({**result, "lost": str(lost)})
-            fail(f"the bus was lost: {lost}; the {count} frames received before are in {file}", REFUSED)
+            kept = "above" if is_shown else f"in {file}"
+            fail(f"the bus was lost: {lost}; the {count} frames received before are {kept}", REFUSED)
         if left_out:
             print(f"drive-env: {ending} has no {NOT_HELD[ending]}: {left_out} frames are left out", file=sys.stderr)
         _say(f"{count} frames written to {file}", result, json)
@@ -242,6 +250,14 @@ def _take_interrupts() -> Any:
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         return None
     return signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _check_new(file: Path, ending: str) -> None:
+    """Raise ValueError for a file that could not be written."""
+    _check_format(file, ending, WRITTEN)
+    if not file.parent.is_dir():
+        raise ValueError(f"there is no folder {file.parent}; choose another file")
+    check_free(file)
 
 
 def _check_format(file: Path, ending: str, formats: tuple[str, ...]) -> None:

@@ -65,6 +65,12 @@ AxisOfNode = Annotated[
     typer.Option("--axis", help="Axis of nodes with several, from 0.", show_default="all that have the object"),
 ]
 AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
+AxesInOrder = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--axis", help="Axis of a node with several, from 0; may be repeated, in the order wanted.", show_default="0"
+    ),
+]
 DeviceName = Annotated[
     str, typer.Option("--device", help="Device by name, or your own by its path: a folder, or a variant's .toml.")
 ]
@@ -187,6 +193,18 @@ class AxisOptions(NodeOptions):
     """The same of one axis of one node."""
 
     axis: AxisNumber = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxesInOrderOptions(NodeOptions):
+    """The same of axes of one node, one after the other."""
+
+    axis: AxesInOrder = None
+
+    @property
+    def axes(self) -> list[int]:
+        """The axes that are named, in their order, or the first."""
+        return self.axis or [0]
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:

@@ -170,7 +170,21 @@ class Description:
         same_code = [name for name, row in rows.items() if row.code == code]
         if len(same_code) == 1:
             return same_code[0], 0
-        return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h"), 0
+        return _cia_301_name(code), 0
+
+    def emergency_names(self, code: int, number: int | None = None) -> list[str]:
+        """Return the names that an error code may have, as 603Fh and 1003h show it.
+
+        Args:
+            code: The emergency's code.
+            number: The device's own number of the error, which some devices have in 1003h; None: not known.
+        """
+        has_number = number is not None and self.device is not None and self.device.canopen.quirks.history_tells_number
+        rows = {} if self.device is None else self.device.emergencies
+        found = [
+            name for name, row in rows.items() if row.code == code and (not has_number or row.extra[0] & 0x3F == number)
+        ]
+        return found or [_cia_301_name(code)]
 
     def role(self, role: Role) -> Key | None:
         """Return the object that plays a part, None where this drive has none that does."""
@@ -179,6 +193,11 @@ class Description:
     def has(self, name: ObjectName) -> bool:
         """Return whether the dictionary has an object."""
         return self.dictionary.has(name)
+
+
+def _cia_301_name(code: int) -> str:
+    """Return the name that CiA 301 gives a code, or the code."""
+    return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h")
 
 
 def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = False) -> Description:

@@ -14,9 +14,9 @@ from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.quantities import SHOWN, UNITS, Scale, find_unit, scales_of
 from drive_env.dictionary.roles import Role
 from drive_env.drives.emergency import EmergencyMessage
+from drive_env.drives.fault_texts import FaultText, fault_text
 from drive_env.drives.interface import Drives
 from drive_env.drives.limit_at_rest import SAYS, LimitAtRest
-from drive_env.studio.fault_texts import FaultText, fault_text
 from drive_env.studio.recorder import ScopeRecorder
 
 if TYPE_CHECKING:

@@ -54,10 +54,10 @@ PATIENCE = 120.0  # s until a run has come so far; it is never this long
 
 
 @contextmanager
-def node(lockstep=True, machine=None):
+def node(lockstep=True, load="inertia", machine=None):
     """An emulated drive on a hub: its machine, one of the first drive by default, and the options that name it."""
     world = World(lockstep=lockstep)
-    machine = machine or EmulatedDrives(load="inertia", num_threads=1)
+    machine = machine or EmulatedDrives(load=load, num_threads=1)
     machine.advance(0.001)  # compiles: a node that does would not answer in time
     world.add(machine, [1])
     hub = Hub()
