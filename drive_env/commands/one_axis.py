@@ -190,8 +190,8 @@ class OneAxis:
             )
         if json:
             if is_dry:
-                here = start if self.has_position else None
-                print_json({"would": what, "start": here, "statusword": status, "moved": 0})
+                there = start if self.has_position else None
+                print_json({"would": what, "start": there, "statusword": status, "moved": 0})
             return
         end = " (dry run: nothing was done)" if is_dry else ""
         here = f"at {self.show(start)} " if self.has_position else ""

@@ -283,7 +283,13 @@ class ScopePanel:
     def _arm(self, mode: str, kind: str, source: str, level: str, before: float | None) -> None:
         axis, view = self._visitor.axis, self._view
         share = min(0.9, max(0.0, (10.0 if before is None else float(before)) / 100.0))
-        changes = {"mode": mode, "edge": kind, "source": object_key(source), "level": level, "before": share}
+        changes: dict[str, Any] = {
+            "mode": mode,
+            "edge": kind,
+            "source": object_key(source),
+            "level": level,
+            "before": share,
+        }
         settings = replace(self._session.workspace.of(axis), **changes)
         view.trigger = trigger_of(settings, axis, self._level(settings))
         view.before, view.mode = settings.before, settings.mode
