@@ -216,6 +216,8 @@ def _report(homing: _Homing, outcome: MoveOutcome, json: bool) -> None:
     else:
         state = "not homed" if stopped else f"homed by method {homing.method}"
         print_outcome(f"{one.name} {state}, at {one.show(outcome.end)}", outcome, None)
+    if stopped and not cia402.matches(outcome.status, cia402.OPERATION_ENABLED):  # the envelope's stop, or a fault
+        fail(f"{one.name}: homing was stopped: {stopped}", REFUSED)
     if stopped:
         fail(
             f"{one.name}: {stopped}. Check that the switches of method {homing.method} are there, and the speeds 6099h "
