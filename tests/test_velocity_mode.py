@@ -520,7 +520,7 @@ def test_jog_says_what_keeps_a_drive_of_vl_from_turning(inverter):
     code, _, why = jog(inverter, EDS["vl"], "300", ramp=0)
     assert code == 2 and "the drive's acceleration 6048h:01 is 0, so nothing would move" in why
     code, told, why = jog(inverter, EDS["vl"], "300", "--for", "0.2", ramp=1)
-    assert code == 1 and told["speed"] == 0 and "the axis hardly moved" in why
+    assert code == 1 and abs(told["speed"]) < 3 and "the axis hardly moved" in why  # a busy computer gives it longer
 
 
 def test_jog_turns_a_drive_that_has_pv_too_in_pv(folders):
