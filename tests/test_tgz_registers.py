@@ -545,7 +545,8 @@ def test_names_are_kept_and_texts_of_the_amplifier_read(drives):
 
 
 def test_a_fast_port_and_a_user_program_that_are_not_there_are_refused(drives):
-    for name, code in (("C-Enable_1G", 0x06090030), ("C-UserProgStart", 0x06090031)):  # the second's EDS has 0 as highest
+    """Of the second the EDS has 0 as the highest value."""
+    for name, code in (("C-Enable_1G", 0x06090030), ("C-UserProgStart", 0x06090031)):
         with pytest.raises(ObjectAccessError) as caught:
             drives.write(name, 1)
         assert caught.value.abort_code == code

@@ -513,14 +513,15 @@ def test_jog_turns_it_in_vl_and_brings_it_to_rest(tmp_path, monkeypatch, folders
     assert (rows[:, 2] == speed).sum() == 400 and np.abs(rows[-1, 3]) < 10 < 0.9 * 300 < np.abs(rows[:, 3]).max()
 
 
-def test_jog_says_what_keeps_a_drive_of_vl_from_turning(inverter):
+def test_jog_says_what_keeps_a_drive_of_vl_from_turning(folders):
     """Refused before it is enabled: a way without a position; a ramp that never rises. Else its speed tells it."""
-    code, _, why = jog(inverter, EDS["vl"], "300", "--by", "100")
-    assert code == 2 and "--by 100: granit_fu3 has no position to move to; use --for" in why
-    code, _, why = jog(inverter, EDS["vl"], "300", ramp=0)
-    assert code == 2 and "the drive's acceleration 6048h:01 is 0, so nothing would move" in why
-    code, told, why = jog(inverter, EDS["vl"], "300", "--for", "0.2", ramp=1)
-    assert code == 1 and abs(told["speed"]) < 3 and "the axis hardly moved" in why  # a busy computer gives it longer
+    with emulated(folders["vl"]) as drive:  # of its own: one that still turns would be held at its speed
+        code, _, why = jog(drive, EDS["vl"], "300", "--by", "100")
+        assert code == 2 and "--by 100: granit_fu3 has no position to move to; use --for" in why
+        code, _, why = jog(drive, EDS["vl"], "300", ramp=0)
+        assert code == 2 and "the drive's acceleration 6048h:01 is 0, so nothing would move" in why
+        code, told, why = jog(drive, EDS["vl"], "300", "--for", "0.2", ramp=1)
+        assert code == 1 and abs(told["speed"]) < 3 and "the axis hardly moved" in why
 
 
 def test_jog_turns_a_drive_that_has_pv_too_in_pv(folders):
