@@ -39,7 +39,9 @@ if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
 
 SETTLING = 40  # looks, a STANDSTILL apart, in which an axis must come to rest at home
-ATTAINED = cia402.Pattern(0x3000, 0x1000)  # bit 12, without bit 13, which reports an error
+REACHED = cia402.TARGET_REACHED.mask  # at rest, which the command sees by the position
+# Bit 12, without bit 13, which reports an error.
+ATTAINED = cia402.Pattern(cia402.HOMING_BITS ^ REACHED, cia402.HOMED ^ REACHED)
 
 
 class _Homing(NamedTuple):
