@@ -38,7 +38,7 @@ def power_row(visitor: Visitor) -> None:
             await visitor.do(motion_jobs.select_mode(visitor.axis, str(mode.value)), f"Mode {mode.value}")
 
         def follow() -> None:
-            """Have the choice show a mode that the axis has changed to, whoever changed it."""
+            """Have the choice show a mode that the axis has changed to, by this page or by another one."""
             nonlocal first
             state = visitor.state
             if state is not None and state.mode != first and state.mode in modes:

@@ -128,7 +128,7 @@ class ScopePanel:
         return view
 
     def _level(self, settings: AxisSettings) -> float:
-        """Return the level of an edge as the integer that the wire carries; ValueError for a text that is none."""
+        """Return the level of an edge as the integer that the wire carries; ValueError for another text."""
         if settings.edge not in ("rising", "falling"):
             return 0.0
         entry = self._session.description.dictionary.find(settings.source)
