@@ -135,7 +135,7 @@ def test_a_node_is_watched_once(two_entries):
         tx 585  60 16 10 01 00 00 00 00
         rx 605  23 16 10 02 C8 00 08 00
         tx 585  60 16 10 02 00 00 00 00
-        rx 605  23 16 10 02 00 00 07 00   # a time of 0 watches nobody
+        rx 605  23 16 10 02 00 00 07 00   # with a time of 0 no node is watched
         tx 585  60 16 10 02 00 00 00 00
     """)
 

@@ -81,12 +81,26 @@ def test_of_several_axes_the_one_in_fault_is_named():
             world.cycle()
         code, rows = found(run)
         assert code == REFUSED and [row["fault"] for row in rows] == [False, True]
-        assert rows[1]["source"] == "EMCY"  # it came just then
         for row in (rows[1], found(run)[1][1]):
             assert [cause["name"] for cause in row["causes"]] == ["motor parameter"]
         assert row["source"].startswith("1003h = ")
         assert found(run, "--axis", "0")[0] == DONE
         assert run("--axis", "2").exit_code == 2
+
+
+def test_each_axis_is_told_its_own_cause_by_1003h_whichever_is_newer():
+    drives = EmulatedDrives("tgz_d", "inertia", num_machines=2, num_threads=1)
+    with on_a_bus(drives) as (run, world):
+        motion.enable(drives, mode="pv")
+        for bits in ([1 << 15, 0], [1 << 15, 1 << 27]):  # axis 0: angle error; later axis 1: motor parameter
+            drives.machine.error_bits = np.array(bits)
+            for _ in range(50):
+                world.cycle()
+        found(run)  # hears what is still on its way
+        rows = found(run)[1]
+        assert all(row["source"].startswith("1003h = ") for row in rows), rows
+        first, second = ([cause["name"] for cause in row["causes"]] for row in rows)
+        assert first != second == ["motor parameter"], rows
 
 
 class ByItsEds:

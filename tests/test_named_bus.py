@@ -98,7 +98,7 @@ VALUES: dict[str, str] = {
     "dynamics": "soft", "inertia_range": "0.8/4",
     "replay": "move.csv", "out": "new", "drive-env scope out": "new.csv", "drive-env jog out": "new.csv",
     "eds": "own.eds", "config": "config.toml", "journal": "new.journal", "store": "new",
-    "position": "1 rev", "drive-env move out": "new.csv",
+    "position": "1 rev", "drive-env move out": "new.csv", "workspace": "machine.toml",
     "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env frames replay speed": "2", "max_current": "1 A",
     "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc",
     "sampler": "tpe", "objectives": "cost", "gains": "velocity_p", "axes": "apart", "travel": "-1:1",

@@ -6,6 +6,7 @@ import io
 import json
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from drive_env.fieldbus.description import describe
 from drive_env.studio.decimation import min_max, stride_of
 from drive_env.studio.recorder import SampleRing, ScopeRecorder
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
+from drive_env.studio.scope_page import ScopePanel
 from drive_env.studio.scope_trigger import EDGES, ScopeTrigger, first_fired
 from drive_env.studio.scope_view import ScopeChannel, ScopeRecording, ScopeView, channel_of, with_channels
 from drive_env.studio.workspace import Workspace, trigger_of
@@ -315,7 +317,7 @@ def test_a_workspace_is_found_again_from_its_file(tmp_path):
         ('"single"', '"once"', "'once' is not one of roll, auto"),
         ("window = 2.0", "window = 3.0", "3.0 is not one of 0.1, 0.2"),
         ("before = 0.1", "before = 1.5", "before is 0 to 0.9"),
-        ("before = 0.1", "behind = 0.1", "behind"),
+        ("before = 0.1", "behind = 0.1", "missing, or are not known: before, behind"),
         ("before = 0.1", "before = [", "is not TOML"),
     ],
 )
@@ -336,3 +338,23 @@ def test_the_trigger_that_is_set(edge):
     has_level = edge in ("rising", "falling")
     assert (trigger.kind, trigger.axis) == (edge, 2)
     assert trigger.key == ((0x606C, 0) if has_level else (0x6041, 0))
+
+
+def test_a_page_opens_though_the_file_has_what_the_scope_cannot_show(tmp_path):
+    """A level that is no quantity, or an object that no process data carry: the page says so, and rolls."""
+    told = []
+    visitor = SimpleNamespace(axis=0, say=lambda text, kind: told.append(text))
+    for settings, message in (
+        ({"level": "fast"}, "the trigger is not set"),
+        ({"source": (0x1018, 1)}, "1018:01 cannot be sampled"),
+    ):
+        workspace = Workspace(DEVICE, tmp_path / "machine.toml")
+        workspace.change(0, mode="single", channels=((0x1018, 1), VELOCITY), **{"level": "30 rpm", **settings})
+        session = SimpleNamespace(
+            description=DEVICE, scales=[65536.0], num_axes=1, scopes={}, recorder=recorder_of(),
+            workspace=Workspace(DEVICE, tmp_path / "machine.toml"),
+        )  # fmt: skip
+        ScopePanel(session, visitor)
+        view = session.scopes[0]
+        assert message in told[-1] and (view.mode, view.is_armed) == ("roll", False)
+        assert [channel.key for channel in view.channels] == [VELOCITY]

@@ -85,7 +85,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def pages() -> list[Path]:
-    """Return README and the pages of the site, without decisions, which nobody follows at a keyboard."""
+    """Return README and the pages of the site, without decisions, which have nothing to type."""
     return [ROOT / "README.md", *sorted(page for page in DOCS.rglob("*.md") if "decisions" not in page.parts)]
 
 

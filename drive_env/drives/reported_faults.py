@@ -77,7 +77,7 @@ def _named(
 
 
 def _newest(drives: Drives, known: Description, axis: int) -> int:
-    """Return the newest entry of 1003h that is about an axis; 0 if there is none.
+    """Return the newest entry of 1003h that is about an axis; 0 if no entry is.
 
     A known device has the axis in bits 16 to 23; with other drives these bits are the maker's (CiA 301).
     """

@@ -94,8 +94,8 @@ class ScopePanel:
     def __init__(self, session: Session, visitor: Visitor) -> None:
         self._session = session
         self._visitor = visitor
-        self._view = session.scopes.get(visitor.axis) or self._view_of(session, visitor.axis)
         self._entries = _choices(session)
+        self._view = session.scopes.get(visitor.axis) or self._view_of(session, visitor.axis)
         self._sampled = f"the scope of axis {visitor.axis}"
 
     def build(self) -> None:
@@ -118,19 +118,28 @@ class ScopePanel:
         ui.run_javascript(f"studioScope.start({self._visitor.id!r}, {json.dumps(self._view.cursors)})")
 
     def _view_of(self, session: Session, axis: int) -> ScopeView:
-        """Return the scope of an axis as its settings have it; a trigger that is set is armed."""
+        """Return the scope of an axis as its settings have it; a trigger that is set is armed.
+
+        Objects that cannot be sampled are left out. A trigger whose level means nothing is not set: the page says so.
+        """
         settings = session.workspace.of(axis)
         view = session.scopes[axis] = ScopeView(session.recorder)
-        view.channels = tuple(self._channel(key, axis) for key in settings.channels)
-        view.window, view.before, view.mode = settings.window, settings.before, settings.mode
+        view.channels = tuple(self._channel(key, axis) for key in settings.channels if key in self._entries)
+        view.window, view.before = settings.window, settings.before
         if settings.mode != "roll":
-            view.trigger = trigger_of(settings, axis, self._level(settings))
+            try:
+                view.trigger = trigger_of(settings, axis, self._level(settings))
+                view.mode = settings.mode
+            except ValueError as error:
+                self._visitor.say(f"the trigger is not set: {error}", "warning")
         return view
 
     def _level(self, settings: AxisSettings) -> float:
         """Return the level of an edge as the integer that the wire carries; ValueError for another text."""
         if settings.edge not in ("rising", "falling"):
             return 0.0
+        if settings.source not in self._entries:
+            raise ValueError(f"{object_name(settings.source)} cannot be sampled; choose another object")
         entry = self._session.description.dictionary.find(settings.source)
         return float(quantities.parse(settings.level, entry, self._session.scales[self._visitor.axis]))
 
@@ -248,7 +257,7 @@ class ScopePanel:
         with ui.card().classes("studio-card"):
             ui.label("Trigger").classes("studio-heading")
             with ui.row().classes("studio-buttons"):
-                mode = ui.select(MODES, value=now.mode, label="Mode").props("dense outlined").classes("grow")
+                mode = ui.select(MODES, value=self._view.mode, label="Mode").props("dense outlined").classes("grow")
                 mode.props("data-test=trigger-mode")
                 kind = ui.select(EDGES, value=now.edge, label="On").props("dense outlined").classes("grow")
             options = {object_name(key): entry.label for key, entry in self._entries.items()}

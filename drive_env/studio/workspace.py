@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +125,9 @@ def _read(file: Path, description: Description) -> dict[int, AxisSettings]:
 
 
 def _settings(table: Mapping[str, Any], description: Description) -> AxisSettings:
+    missing = {one.name for one in fields(AxisSettings)} ^ set(table)
+    if missing:
+        raise ValueError(f"these keys are missing, or are not known: {', '.join(sorted(missing))}")
     channels = tuple(object_key(name) for name in table["channels"])
     found = AxisSettings(
         **{**table, "channels": channels, "source": object_key(table["source"]), "window": float(table["window"])}

@@ -19,7 +19,7 @@ pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 pytest.importorskip("selenium", reason="selenium is not installed (extra `test`)")
 
 from selenium import webdriver
-from selenium.common.exceptions import WebDriverException
+from selenium.common.exceptions import StaleElementReferenceException, WebDriverException
 from selenium.webdriver import ActionChains
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
@@ -181,7 +181,11 @@ class Tab:
     @property
     def state(self):
         found = self.all(".studio-chip")
-        return found[0].text.split("\n")[1] if found and "\n" in found[0].text else ""
+        try:
+            text = found[0].text if found else ""
+        except StaleElementReferenceException:  # the page has loaded itself anew between the two questions
+            text = ""
+        return text.split("\n")[1] if "\n" in text else ""
 
     def await_state(self, name, patience=20.0):
         end = time.monotonic() + patience
