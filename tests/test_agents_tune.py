@@ -249,6 +249,7 @@ def unstable(*_):
     return [(SimpleNamespace(device=device, slack=lambda dynamics, sets: np.full(len(sets), -1.0)), np.array([0]))]
 
 
+@pytest.mark.slow
 def test_a_proposal_that_breaks_the_margins_is_not_tried_and_that_is_said(tmp_path):
     """Margins are computed from the identified plant: a tuner that raises all gains tenfold moves none with them."""
     with emulated("tmcm1636", "inertia", "qbl4208") as target:

@@ -107,6 +107,7 @@ def frames():
     logging.getLogger("drive_env").setLevel(logging.NOTSET)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(kind, frames):
     assert [k for k in (frames // 3, 2 * frames // 3) if one(kind, k)[2]] == []

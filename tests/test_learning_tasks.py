@@ -81,14 +81,14 @@ def digest(name):
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize("name", QUICK)
 def test_what_has_learnt_nothing_scores_less_than_0_6(name):
     scores = unlearnt_scores(name, MACHINES[TASKS[name].environment])
     assert max(scores.values()) < UNLEARNT, scores
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize("name", QUICK)
 def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
     scores = {}

@@ -42,6 +42,7 @@ def at_rest(tab):
 
 
 # --- every page ---------------------------------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize("path", PAGES)
 def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)

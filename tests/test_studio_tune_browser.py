@@ -82,6 +82,7 @@ def parameters(emulated):
 
 
 # --- every page ---------------------------------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize("path", PAGES)
 def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)

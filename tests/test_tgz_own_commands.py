@@ -150,10 +150,11 @@ FAULTS = {  # of one frame: what arrives, in its order
 }
 
 
+@pytest.mark.parametrize("step", [25, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("fault", FAULTS)
-def test_whatever_happens_to_a_frame_of_the_native_image_the_axes_end_at_rest_and_off(gantry, fault):
+def test_whatever_happens_to_a_frame_of_the_native_image_the_axes_end_at_rest_and_off(gantry, fault, step):
     fastest = 0.0
-    for at in range(0, len(FRAMES) - 1, 6):
+    for at in range(0, len(FRAMES) - 1, step):
         gantry.machine.reset()
         native = Native(gantry)
         start = list(native.positions)

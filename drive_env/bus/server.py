@@ -65,7 +65,8 @@ class Server:
         self.transport.flush()
 
     def start(self) -> None:
-        """Serve in a thread of its own."""
+        """Serve in a thread of its own; all nodes are on when this returns."""
+        self.world.power_on()
         self._thread = threading.Thread(target=self._run_guarded, name="bus server", daemon=True)
         self._thread.start()
 

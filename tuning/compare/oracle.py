@@ -82,7 +82,8 @@ def find_oracles(
             scores = yardstick.score(gains)
         for k, machine in enumerate(group):
             row, now = rows[digest(machine)], float(scores.performance[k])
-            if scores.slack[k] > 0.0 and abs(now / row.performance - 1.0) < STALE:
+            # Of a machine that no gains satisfy the row stays true as it is.
+            if (scores.slack[k] > 0.0 or row.slack <= 0.0) and abs(now / row.performance - 1.0) < STALE:
                 found[machine.name] = row._replace(performance=now, slack=float(scores.slack[k]))
     left = [machine for machine in machines if machine.name not in found]
     for number, machine in enumerate(left):
