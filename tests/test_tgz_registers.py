@@ -224,7 +224,7 @@ def test_f_extincrenc_counts_the_shaft_of_the_first_motor(drives):
     turned = (drives.machine.rotor_angle[0] - angle) / (2.0 * math.pi)
     assert turned > 0.9
     assert drives.read(external)[0] - before == pytest.approx(10_000 * turned, abs=110)  # 1 ms of 10 rev/s
-    drives.machine.brake = "closed"
+    drives.write(cia402.TARGET_VELOCITY, 0)
     drives.advance(0.5)
     drives.machine.power_cycle()
     drives.write("F-ExtIncrEnc", 2500)
