@@ -96,8 +96,8 @@ _TMCM1636 = Recipe(
 
 _NOT_COMPARED = "trained for a comparison: drive-tune auto tunes this drive"
 
-# The gains are those of the TMCM-1636 in form and units (devices/tgz_d/gains.toml), and the rule is the same. Loads are
-# made for motors of 0.1 N m; these have 2.0 and 2.8 N m, and 17 times the rotor.
+# The loops are those of the TMCM-1636, and so is the rule; of an integration time ln counts what its inverse does.
+# Loads are made for motors of 0.1 N m; these have 2.0 and 2.8 N m, and 17 times the rotor.
 _TGZ = _TMCM1636._replace(
     device="tgz_d",
     rows=(

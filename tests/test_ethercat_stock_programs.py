@@ -88,7 +88,7 @@ def printed(space, *command, expected, code=0):
         ("tgz_d", "gantry", {
             "-sdo": (
                 "Calculated workcounter 3", "Output size: 320bits", "Input size: 320bits", "State: 4",
-                "CoE Object Description found, 160 entries.", '0x6d02      "Supported drive modes axis 1"',
+                "CoE Object Description found, 365 entries.", '0x6d02      "Supported drive modes axis 1"',
                 "End program",
             ),
             "-map": (

@@ -375,6 +375,25 @@ def test_dead_time_is_not_taken_for_a_slower_velocity_filter(dead_time):
         assert found.value == pytest.approx(400.0, rel=0.15)
 
 
+def test_of_a_tgz_as_auto_tunes_it_the_margins_are_the_model_s_but_for_what_its_dead_time_takes():
+    """Gains that count integration times. At 560 V dead time swallows small currents: some degrees at the crossover."""
+    gains, lag = np.array([[3944, 2985, 13_238, 12_866, 357_034, 1000]]), []
+    for dead_time in (0.0, 2e-6):
+        with emulated("tgz_d", "inertia", num_threads=1, parameters={"stage.dead_time": dead_time}) as target:
+            write_gains(target.drives, gains)
+            plant, response = true_plant(target.drives), measure(target)
+        lines = response.trusted[:, 0] & ~response.traced & (response.f > 60.0) & (response.f < 160.0)
+        model = velocity_open_loop(target.device, plant, gains[0], response.f[lines])
+        lag.append(np.degrees(np.angle(response.open_loop[lines, 0] / model)).mean())
+        if dead_time == 0.0:
+            expected = margins(GRID, velocity_open_loop(target.device, plant, gains[0], GRID))
+            found = response.margins()
+            assert found.phase_deg == pytest.approx(expected.phase_deg, abs=2.0)
+            assert found.gain_db == pytest.approx(expected.gain_db, abs=0.5)
+            assert found.ms == pytest.approx(expected.ms, rel=0.05)
+    assert abs(lag[0]) < 2.5 and lag[1] < lag[0] - 3.0
+
+
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 def test_a_loop_without_gains_is_not_shaken():
     with pytest.raises(ValueError, match="a P gain is 0 on every axis and the loop is open: give the drives gains"):

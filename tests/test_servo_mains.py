@@ -431,9 +431,27 @@ def by_brake(drives):
     drives.write(cia402.TARGET_VELOCITY, rpm(drives, 500))
 
 
+def press(drives):
+    drives.machine.brake = "closed"
+    motion.enable(drives, mode="cst")
+    drives.write(cia402.TARGET_TORQUE, "3 A")
+
+
+def by_open_phase(drives):
+    drives.machine.set("motor.open_b", 1.0)
+    press(drives)
+
+
+def by_current(drives):
+    put(drives, "overcurrent", 1.0)
+    press(drives)
+
+
 @pytest.mark.parametrize(
     ("code", "make"),
     [
+        (0x2200, by_open_phase),
+        (0x5110, by_current),
         (0x3130, by_parameter("stage.mains_phase_lost", 1.0)),
         (0x3100, by_supply),
         (0x3110, by_high_supply),
@@ -447,7 +465,7 @@ def by_brake(drives):
         (0x4210, by_temperature(25.0, 120.0)),
         (0x7303, by_parameter("motor.encoder_broken", 1.0)),
         (0x8400, by_speed),
-        (0x2200, by_parameter("stage.short_conductance", 1.0)),
+        (0x5110, by_parameter("stage.short_conductance", 1.0)),
         (0xF001, by_parameter("stage.emergency_stop", 1.0)),
         (0x6320, by_parameters),
     ],
@@ -519,7 +537,7 @@ def test_nor_has_one_that_oscillates_in_few_periods_of_supervision(integration):
         trace = drives.record([cia402.VELOCITY_ACTUAL], 0.6, play={cia402.TARGET_POSITION: targets})
         turns = np.abs(np.diff(np.sign(trace[cia402.VELOCITY_ACTUAL][200:]), axis=0)).sum(axis=0) / 2
         assert np.count_nonzero(turns > 100) >= 4, "some of them swing"
-        assert {hex(one.code) for one in drives.emergencies()} <= {"0x2200", "0x8400"}
+        assert {hex(one.code) for one in drives.emergencies()} <= {"0x5110", "0x8400"}
 
 
 def test_a_cyclic_set_point_that_no_motor_could_follow_is_no_trajectory(drives):

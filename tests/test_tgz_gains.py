@@ -42,11 +42,19 @@ MOTORS = (
 
 @pytest.mark.parametrize("motor", MOTORS, ids=("am3041_e", "am3033_e", "larger"))
 def test_the_current_loop_is_commissioned_by_the_makers_rules(motor):
-    """C-K = L_2ph [mH] 100,000 / V_DC, C-Ti = 1000 L_2ph [mH] / R_2ph [ohm], between two terminals: twice a phase's."""
+    """C-K = L_2ph [mH] 100,000 / V_DC, C-Ti = 1000 L_2ph [mH] / R_2ph [ohm], between two terminals: twice a phase's.
+
+    M-Inull = 1000 I_n, M-Ipeak = 1414 I_max with I_max = 2 I_n; C-Lim M-Inull / 1000 lets all of it through.
+    """
     found = DEVICE.preset(motor)
     line_mh, line_ohm = 2e3 * motor.L_q, 2.0 * motor.R_s
     assert found["C-K"] == round(line_mh * 100_000.0 / min(motor.voltage, VOLTS))
     assert found["C-Ti"] == round(1000.0 * line_mh / line_ohm)
+    rms = motor.rated_current / math.sqrt(2.0)
+    assert found["M-Inull"] == round(1000.0 * rms)
+    assert found["M-Ipeak"] == pytest.approx(1414.0 * min(2.0 * rms, DEVICE.nominal_current / math.sqrt(2.0)), abs=60)
+    for name in ("C-LimN", "C-LimP"):
+        assert 0 <= found[name] * found["M-Inull"] / 1000.0 - found["M-Ipeak"] < found["M-Inull"] / 1000.0
 
 
 def test_c_k_is_volts_for_amperes_and_c_kdr_its_share_across_them():

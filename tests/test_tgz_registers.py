@@ -212,6 +212,26 @@ def test_dsl_status_is_that_a_dsl_feedback_answers(drives):
     assert drives.read("DSL_status")[0] == 0 and FEEDBACK in errors(drives)
 
 
+def test_f_extincrenc_counts_the_shaft_of_the_first_motor(drives):
+    """Four counts a pulse, from power-on on; without pulses there is no encoder."""
+    external = 0x333E
+    turn(drives, 600)
+    assert drives.read(external)[0] == 0
+    drives.write("F-ExtIncrEnc", 2500)
+    drives.advance(0.002)
+    before, angle = drives.read(external)[0], drives.machine.rotor_angle[0]
+    drives.advance(0.1)
+    turned = (drives.machine.rotor_angle[0] - angle) / (2.0 * math.pi)
+    assert turned > 0.9
+    assert drives.read(external)[0] - before == pytest.approx(10_000 * turned, abs=110)  # 1 ms of 10 rev/s
+    drives.write(cia402.TARGET_VELOCITY, 0)
+    drives.advance(0.5)
+    drives.machine.power_cycle()
+    drives.write("F-ExtIncrEnc", 2500)
+    drives.advance(0.002)
+    assert abs(drives.read(external)[0]) <= 1
+
+
 # --- the link ---------------------------------------------------------------------------------------------------------
 def test_the_levels_of_the_link_are_those_of_both_axes():
     with new_drives("gantry") as drives:
@@ -446,6 +466,21 @@ def test_acc_dec_and_posspeed_are_those_of_moves(drives):
     assert np.argmax(way >= 4.0 - 1e-9) == pytest.approx(1e3 * duration, abs=3)
     assert trace["PG Rdy"][-1, 0] == 1 and trace["PG Rdy"][300, 0] == 0
     assert drives.machine.rotor_angle[0] / (2.0 * math.pi) == pytest.approx(4.0, abs=0.01)
+
+
+def test_rdy_that_is_written_0_waits_for_the_next_arrival(drives):
+    drives.write(cia402.PROFILE_VELOCITY, "3000 rpm")
+    motion.enable(drives, mode="pp")
+    motion.move_to(drives, 2**19)
+    assert drives.read("PG Rdy")[0] == 1
+    drives.write("PG Rdy", 0)
+    drives.advance(0.05)
+    assert drives.read("PG Rdy")[0] == 0 and drives.read(cia402.STATUSWORD)[0] & 0x0400, "the target is reached still"
+    motion.start_move(drives, 2**19, relative=True)
+    drives.advance(0.01)
+    assert drives.read("PG Rdy")[0] == 0
+    drives.advance(1.0)
+    assert drives.read("PG Rdy")[0] == 1
 
 
 def test_speed_is_that_of_the_velocity_profile_and_a_unit_changes_its_meaning(drives):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+
 import numpy as np
 import pytest
 from rigs.ethercat_segment import EmulatedSegment
@@ -10,8 +13,10 @@ from rigs.namespaces import spaces as spaces
 from rigs.tgz_sequences import SEQUENCES, move
 
 from drive_env.ethercat.application import AlState
+from drive_env.ethercat.pcap_log import PcapLog
 from drive_env.master.ethercat.ethercat_master import ImageSizes, Sync0
 
+TSHARK = shutil.which("tshark")
 MOVED = pytest.approx([0.25, 0.25], abs=0.003)  # turns
 
 
@@ -24,9 +29,11 @@ def segment():
 @pytest.mark.every(2)
 @pytest.mark.parametrize("clock", [None, Sync0(0.001, True), Sync0(0.001, True, True)], ids=["free", "sync0", "sync1"])
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_our_frame_master_moves_both_axes(segment, name, clock):
+def test_our_frame_master_moves_both_axes(segment, name, clock, tmp_path):
     segment.drives.machine.reset()
-    sequence, master = SEQUENCES[name], segment.master()
+    sequence, master, path = SEQUENCES[name], segment.master(), tmp_path / "sequence.pcap"
+    log = PcapLog(path)
+    segment.world.segment.listeners[:] = [log.add]
     assert master.begin() == 1
     for index, sub, data in sequence.rows:
         master.download(0, index, sub, data, 5.0)
@@ -42,6 +49,12 @@ def test_our_frame_master_moves_both_axes(segment, name, clock):
     assert list(turned) == pytest.approx([0.25, 0.25], abs=0.01)
     assert segment.slaves[0].state is AlState.OP
     master.close()
+    segment.world.segment.listeners.clear()
+    log.close()
+    if TSHARK is not None and clock is None:
+        read = [TSHARK, "-r", path, "-Y", "ecat"]
+        assert len(subprocess.run(read, capture_output=True, check=True).stdout.splitlines()) > 1000
+        assert subprocess.run([*read[:-1], "_ws.malformed"], capture_output=True, check=True).stdout == b""
 
 
 @pytest.mark.slow

@@ -69,13 +69,17 @@ def export_eds(context: typer.Context, file: File, *, drive: CommissionedOptions
     """
     from drive_env.devices import find_device
     from drive_env.dictionary.entries import eds_text
+    from drive_env.ethercat.sii_content import described
 
     with errors_as_exit_codes():
         _check_name(file, ".eds")
         if names_a_bus(context) or (drive.eds, drive.motor, drive.axis) != (None, None, None):
             _write_commissioned(context, file, drive, node_id=None)
         else:
-            _write(file, eds_text(find_device(drive.device).eds), f"EDS of {drive.device}")
+            device = find_device(drive.device)
+            own, other = ([(one.index, one.sub) for one in of.new_dictionary()] for of in (device, described(device)))
+            # Of the same objects there is one file, as its maker has it.
+            _write(file, eds_text((described(device) if own == other else device).eds), f"EDS of {drive.device}")
 
 
 @export_app.command("dcf")

@@ -1,8 +1,8 @@
 """What two-axis servo amplifiers on mains watch: the errors of the TGZ manual's table, by their physical cause.
 
 A cause's status flag is its bit of the error register. Errors without a cause in this model (an internal error, the
-brake's switch, the ramp of another axis, the supplies of IGBT drivers and brake) are those that a machine sets:
-error_bits does it for every error of the table.
+brake's switch, the ramp of another axis, the supply of the brake) are those that a machine sets: error_bits does it for
+every error of the table.
 """
 
 from __future__ import annotations
@@ -153,10 +153,15 @@ def trajectory(drive, lane, told):
 
 @stage
 def current_regulation(drive, lane, told):
-    """Return whether a phase has too much current, or none although there should be, or the link is shorted."""
+    """Return whether a phase has no current although there should be some."""
+    return open_load_a(drive, lane, told) or open_load_b(drive, lane, told)
+
+
+@stage
+def igbt_driver_voltage(drive, lane, told):
+    """Return whether a phase has too much current, or the link is shorted: the transistors' drivers detect it."""
     too_much = overcurrent_a(drive, lane, told) or overcurrent_b(drive, lane, told)
-    none = open_load_a(drive, lane, told) or open_load_b(drive, lane, told)
-    return too_much or none or overcurrent_link(drive, lane, told)
+    return too_much or overcurrent_link(drive, lane, told)
 
 
 @stage
@@ -238,7 +243,7 @@ CAUSES = (
     _error(18, "drive_ramp_e2", STOP),
     _error(19, "current_regulation", CUT, current_regulation, register=CURRENT, held=True),
     _error(20, "emergency_stop", STOP, emergency_stop),
-    _error(21, "igbt_driver_voltage", CUT, register=CURRENT),
+    _error(21, "igbt_driver_voltage", CUT, igbt_driver_voltage, register=CURRENT, held=True),
     _error(22, "brake_resistance", STOP, brake_resistance),
     _error(23, "brake_supply", STOP),
     _error(25, "i2t", STOP, i2t, held=True),

@@ -1,14 +1,18 @@
 """Registers of the amplifier's maker: settings that become what the stages read, and readings that only show.
 
 A feedback's resolution is told by its type (F-Type): by itself (Hiperface DSL, EnDat), by F-Resolution, or as four
-counts a pulse of F-IncrEnc. With M-StaticBrake the drive moves a brake at its output: current flows for
+counts a pulse of F-IncrEnc. An external encoder of F-ExtIncrEnc pulses sits on the shaft of the module's first
+motor, and counts from power-on. With M-StaticBrake the drive moves a brake at its output: current flows for
 D-DelayUnbrake_Enable before the brake is released, and for D-DelayDisable_Brake after it was applied. The enable input
 must have been closed for D-DelayEnable_Hwen before an axis is enabled.
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from drive_env.firmware.common import brake, inputs, start_up
+from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment
 from mechanics.compiled import inlined, stage
@@ -75,6 +79,9 @@ def find_readings(drive, dt):
         drive.sensor_resistance[lane] = 0.0 if drive.feedback_type[lane] == INCREMENTAL else sensor
         linked = drive.feedback_type[lane] == DSL and drive.encoder_broken[lane] < 0.5
         drive.feedback_link[lane] = 1.0 if linked else 0.0
+        turned = (drive.theta_m[lane] - drive.external_zero[lane]) / TWO_PI
+        external = np.floor(COUNTS_PER_PULSE * drive.external_pulses[lane] * turned)
+        drive.external_count[lane] = external - COUNTER_PERIOD * np.floor(external / COUNTER_PERIOD + 0.5)
         count = drive.period_count[lane] + 1.0
         drive.period_count[lane] = 0.0 if count >= COUNTER_PERIOD else count
 
@@ -91,7 +98,10 @@ def energise(drive, lane, dt):
 
 @stage
 def tell_status(drive, lane):
-    """Write the error register, a bit for each error that holds or is shown until the reset, and aDriveStatus."""
+    """Write the error register, a bit for each error that holds or is shown until the reset, aDriveStatus and Rdy."""
+    reached = drive.target_reached[lane]
+    drive.profile_ready[lane] = reached if reached != drive.reached_before[lane] else drive.profile_ready[lane]
+    drive.reached_before[lane] = reached
     errors = drive.cause_flags[lane]
     drive.status_flags[lane] = errors
     bits = ON if drive.stage_on[lane] > 0.0 else 0
@@ -112,5 +122,6 @@ def forget_readings(drive, lane):
     drive.hardware_time[lane] = 0.0
     drive.motor_square[lane] = 0.0
     drive.period_count[lane] = 0.0
+    drive.external_zero[lane] = drive.theta_m[lane]
     for phase in range(3):
         drive.phase_square[phase, lane] = 0.0
