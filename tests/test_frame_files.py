@@ -81,6 +81,7 @@ def test_a_frame_as_json_is_a_line_of_its_own_with_the_time_from_the_first(capsy
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [row["t"] for row in rows] == [0.0, 1.5] and rows[0]["data"] == "3702"
     assert [row["service"] for row in rows] == ["TPDO 1, node 1", "heartbeat, node 1"]
+    assert [(row["remote"], row["length"]) for row in rows] == [(False, 2), (True, 1)]
 
 
 def packets(content):

@@ -179,7 +179,7 @@ MANNERS = {
 
 def files() -> dict[str, bytes]:
     """The content of every maker's file by its name: those of tests/data/eds, and those made here."""
-    found = {path.stem: path.read_bytes() for path in sorted(FOLDER.glob("*.eds"))}
+    found = {path.stem: path.read_bytes() for path in sorted(FOLDER.rglob("*.eds"))}
     for name, manner in MANNERS.items():
         for k, part in enumerate(({}, *manner.parts)):
             own = {key: value for key, value in part.items() if key in Manner.__dataclass_fields__}
