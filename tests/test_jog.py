@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import uuid
 
@@ -120,5 +121,9 @@ def test_a_speed_in_words(speed, text):
     entry = find_device("tmcm1636").new_dictionary().find(0x60FF)
     assert _speed_in_words(speed, 300, entry, 65536.0) == text
     assert _speed_in_words("300", 300, entry, None) == "300 pps; if 300 rpm are meant, write '300 rpm'"
+    assert (
+        _speed_in_words("300", 300, dataclasses.replace(entry, unit=""), None)
+        == "300, in a unit that the EDS does not tell"
+    )
     rpm = find_device("tmcm1636_fw109").new_dictionary().find(0x60FF)
     assert _speed_in_words("300", 300, rpm, 65536.0) == "300 rpm"
