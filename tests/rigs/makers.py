@@ -142,7 +142,8 @@ MANNERS = {
                  "608F:1": {"DefaultValue": 65536}},
         encoding="utf-8-sig", node_id="0x{:X}+$NODEID",
         parts=({"608F:1": {"DefaultValue": "80000h"}, "607D:1": {"LowLimit": -2147483647},
-                "607D:2": {"HighLimit": 2147483646}}, {"6075": {"HighLimit": 2000}, "without": ("6080", "6073")}),
+                "607D:2": {"HighLimit": 2147483646}}, {"6065": {"HighLimit": 500000}, "6075": {"HighLimit": 2000},
+                                                      "without": ("6080", "6073")}),
     ),
     # Limits that contradict the standard's formats; mappings of sub-index 0 alone, others described once.
     "iberis": Manner(
