@@ -484,7 +484,10 @@ def _with_driven_kinds(load: Load, model: mujoco.MjModel) -> mujoco.MjModel:
     """Return the model; ValueError where it has joints that no drive turns and no copy can have, or none at all."""
     wrong = ~np.isin(model.jnt_type, (_SLIDE, _HINGE))
     if np.any(wrong):
-        names = ", ".join(repr(model.joint(int(k)).name) for k in np.flatnonzero(wrong))
+        joints = [model.joint(int(k)) for k in np.flatnonzero(wrong)]
+        names = ", ".join(
+            repr(one.name) if one.name else f"one of body {model.body(int(one.bodyid[0])).name!r}" for one in joints
+        )
         raise ValueError(
             f"load {load.name!r} has free or ball joints ({names}); drives turn hinge and slide joints, and a copy's "
             "coordinates must be its degrees of freedom: take a free joint out, so that its body stands still, and "

@@ -459,7 +459,7 @@ def test_set_points_to_drives_of_which_none_is_enabled_are_told_once(two):
     drives.record(0x6064, 0.0, play={0x60FF: np.zeros(0, int)})
     drives.record(0x6064, 0.001, play={0x60FF: [1], 0x6040: [6]})  # who plays controlwords may enable
     with pytest.warns(UserWarning, match=r"^60FFh is played, but no axis is enabled \(6041h = 0000h\): nothing moves"):
-        drives.record(0x6064, 0.001, play={0x60FF: [1]})
+        drives.record(0x6064, 0.001, play={"Target velocity": [1]})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         drives.record(0x6064, 0.001, play={0x60FF: [1]})

@@ -81,6 +81,7 @@ def test_a_frame_as_json_is_a_line_of_its_own_with_the_time_from_the_first(capsy
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [row["t"] for row in rows] == [0.0, 1.5] and rows[0]["data"] == "3702"
     assert [row["service"] for row in rows] == ["TPDO 1, node 1", "heartbeat, node 1"]
+    assert [(row["remote"], row["length"]) for row in rows] == [(False, 2), (True, 1)]
 
 
 def packets(content):
@@ -191,6 +192,8 @@ BUSMASTER = """***BUSMASTER Ver 3.2.2***
 ***SYSTEM MODE***
 ***<Time><Tx/Rx><Channel><CAN ID><Type><DLC><DataBytes>***
 """
+TRC_EPOCH = -2_209_161_600.0  # 1899-12-30 [s]
+TRC = ";$FILEVERSION=1.1\n;$STARTTIME=0\n"
 SDO = (0x601, "2b40600000000000")
 FOREIGN = {
     "asc without a line of internal events": (
@@ -229,6 +232,11 @@ FOREIGN = {
         "1500000,00000601,false,Tx,0,8,2B,40,60,00,00,00,00,00,\n1750000,00000080,false,Rx,0,0,\n",
         [(1.5, *SDO), (1.75, 0x080, "")],
     ),
+    "PCAN-View": (
+        "a.trc",
+        TRC + "1) 1.5 Tx 0601 8 2B 40 60 00 00 00 00 00\n2) 1.75 Warng FFFFFFFF 4 00 00 00 04\n3) 2 Tx 0701 3 RTR\n",
+        [(TRC_EPOCH + 0.0015, *SDO), (TRC_EPOCH + 0.002, 0x701, 3)],
+    ),
     "candump -L, packed": ("a.b.log.gz", "(1.5) can0 601#2B40600000000000\n(1.75) can0 701#R4\n", [
         (1.5, *SDO), (1.75, 0x701, 4)
     ]),
@@ -263,6 +271,8 @@ def test_logs_of_other_tools_are_read(tmp_path, in_process, name):
     ("a.log", BUSMASTER.format(base="HEX") + "Rx\n", "'Rx' is no line of BUSMASTER (near frame 1)"),
     ("a.asc", "base hex  timestamps relative\n0.5 1 601 Rx d 0\n", "save it with absolute ones"),
     ("a.asc", "base hex  timestamps absolute\n0.5 1 601 Rx d 8 2B", "its last line has no end"),
+    ("a.asc", "base hex  timestamps absolute\n0.5 1 601 Rx d 8 2B\n", "a frame of 8 bytes has 1"),
+    ("a.trc", TRC + "1)  0.5 Tx 0601 8 2B 40 60\n", "'1)  0.5 Tx 0601 8 2B 40 60' is no line of a .trc (near frame 1)"),
     ("a.csv", "Time Stamp,ID,Extended,Dir,Bus,LEN\n1,601,false,Tx,0,2,2B\n", "a frame of 2 bytes has 1"),
     ("a.log.gz", "no gzip\n", "cannot be read as .gz: Not a gzipped file"),
     ("a.db.gz", "\n", "unpack it with gzip -d"),

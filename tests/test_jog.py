@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import uuid
 
@@ -14,7 +15,8 @@ from drive_env import EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.commands.one_axis import is_error
+from drive_env.commands.one_axis import is_error, what_stops
+from drive_env.safety.errors import SafetyError
 
 TURN = 65536
 
@@ -77,6 +79,23 @@ def test_a_speed_above_the_envelope_s_limit_names_no_argument_of_python(jog):
     assert "Limits(" not in found.output
 
 
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("= 9 is beyond the limit 8. Choose less, or raise Limits(velocity=...): no", "the limit 8. Choose less: no"),
+        ("Wait until it is slower, or raise Limits(velocity=...): no", "Wait until it is slower: no"),
+        ("Write less there first, or raise Limits(velocity=...): no", "Write less there first: no"),
+        ("beyond Limits(current=...)", "beyond --max-current"),
+        ("the limit is 2 s; disable it, or set Limits(stall=...)", "the limit is 2 s; disable it"),
+    ],
+)
+def test_no_limit_of_the_envelope_is_told_as_an_argument_of_python(said, told):
+    reasons: list[str] = []
+    with what_stops(reasons):
+        raise SafetyError(said)
+    assert reasons[0].endswith(told) and "Limits(" not in reasons[0]
+
+
 def test_an_emergency_that_tells_of_no_error_any_more_is_none():
     assert [message["code"] for message in filter(is_error, [{"code": 0}, {"code": 0x2310}])] == [0x2310]
 
@@ -102,5 +121,9 @@ def test_a_speed_in_words(speed, text):
     entry = find_device("tmcm1636").new_dictionary().find(0x60FF)
     assert _speed_in_words(speed, 300, entry, 65536.0) == text
     assert _speed_in_words("300", 300, entry, None) == "300 pps; if 300 rpm are meant, write '300 rpm'"
+    assert (
+        _speed_in_words("300", 300, dataclasses.replace(entry, unit=""), None)
+        == "300, in a unit that the EDS does not tell"
+    )
     rpm = find_device("tmcm1636_fw109").new_dictionary().find(0x60FF)
     assert _speed_in_words("300", 300, rpm, 65536.0) == "300 rpm"

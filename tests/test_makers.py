@@ -80,6 +80,7 @@ def mastered(path, device, **options):
         ("helvia_1", (0x6073, 0), 1500, "2000 lies outside its limits 0 to 1500"),
         ("helvia_2", (0x6067, 0), 1000, "1573 lies outside its limits 1 to 1000"),
         ("helvia_3", (0x6072, 0), 1500, "2000 lies outside its limits 1 to 1500"),  # which limits the current there
+        ("helvia_3", (0x6065, 0), 500000, "655360 lies outside its limits 0 to 500000"),
     ],
 )
 def test_no_limit_is_the_files_default_or_the_widest_and_told(made, name, key, raw, why):
@@ -109,6 +110,7 @@ def test_what_can_say_no_limit_says_it(made):
     [
         ("glarus_1", (0x6080, 0), 0xFFFFFFFF),  # a lowest speed alone, and no default: not 0, but no limit
         ("helvia_1", (0x6072, 0), 1500),
+        ("helvia_3", (0x6065, 0), 500000),
         ("helvia_3", (0x6075, 0), 2000),  # no limit by itself: the nearest
     ],
 )

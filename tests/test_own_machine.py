@@ -242,8 +242,10 @@ def test_files_that_are_no_models_are_refused(file, tmp_path):
 
 
 def test_a_body_that_flies_is_refused(file):
-    text = PLAIN.replace("</worldbody>", '<body name="b"><freejoint name="fly"/><geom size="0.1"/></body></worldbody>')
-    with pytest.raises(ValueError, match=r"has free or ball joints \('fly'\).*take a free joint out.*three hinges"):
+    flies = '<body name="b"><freejoint name="fly"/><geom size="0.1"/></body>'
+    text = PLAIN.replace("</worldbody>", flies + '<body name="cube"><freejoint/><geom size="1"/></body></worldbody>')
+    told = r"has free or ball joints \('fly', one of body 'cube'\).*take a free joint out.*three hinges"
+    with pytest.raises(ValueError, match=told):
         EmulatedDrives(load=Load(file(text), joints="axle"))
 
 

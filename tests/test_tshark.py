@@ -5,11 +5,13 @@ from __future__ import annotations
 import shutil
 import subprocess
 
+import can
 import pytest
 
 from drive_env import EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.commands.frame_files import FrameFile, FrameLines
 
 TSHARK = shutil.which("tshark")
 pytestmark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed (Debian: apt install tshark)")
@@ -68,6 +70,10 @@ def log_line(number, frame):
 def dissected(path, lines, *arguments):
     """Return what tshark prints of a log in candump's format."""
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return read_by_tshark(path, *arguments)
+
+
+def read_by_tshark(path, *arguments):
     done = subprocess.run(
         [TSHARK, "-r", path, "-d", "can.subdissector,canopen", *arguments], capture_output=True, text=True, timeout=60
     )
@@ -101,6 +107,17 @@ def test_it_would_be_found(conversation, tmp_path):
     bad = [*conversation, log_line(len(conversation), Frame(0x585, bytes.fromhex("43 00")))]
     found = dissected(tmp_path / "bad.log", bad, "-Y", "_ws.malformed")
     assert len(found) == 1
+
+
+@pytest.mark.parametrize("ending", [".log", ".pcap", ".pcapng"])
+def test_a_remote_frame_has_the_length_that_is_shown_for_it(ending, tmp_path, capsys):
+    frame = can.Message(arbitration_id=0x705, is_remote_frame=True, dlc=3, is_extended_id=False)
+    with FrameFile(tmp_path / f"a{ending}") as file, FrameLines(as_json=False) as lines:
+        file(frame)
+        lines(frame)
+    shown = read_by_tshark(tmp_path / f"a{ending}", "-T", "fields", "-e", "can.flags.rtr", "-e", "can.len")
+    assert [line.split() for line in shown] == [["1", "3"]]
+    assert "[3]  remote request" in capsys.readouterr().out
 
 
 @pytest.mark.every(3)

@@ -12,7 +12,7 @@ import pytest
 from rigs.canopen_wire import Wire
 from rigs.pump import NODE
 from rigs.served_drives import node
-from rigs.small_eds import FOLDER, put
+from rigs.small_eds import FOLDER, entry, put
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
@@ -23,6 +23,7 @@ from drive_env.devices import find_device
 from drive_env.devices.new_device import new_device
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT
 from drive_env.dictionary.access import ObjectAccessError
+from drive_env.fmu.drive import FmuDrive
 from drive_env.motors import find_motor
 from drive_env.safety.errors import SafetyError
 
@@ -267,13 +268,33 @@ def test_a_turn_needs_a_mode_of_a_velocity(folders):
         motion.turn(drives, 100)
 
 
+def test_targets_that_are_played_to_an_axis_that_is_not_enabled_are_told(folders):
+    told = r"^6042h is played, but no axis is enabled"
+    with emulated(folders["vl"]) as drives, pytest.warns(UserWarning, match=told):
+        drives.record([0x6043], 0.001, play={"vl target velocity": [300]})
+
+
+def test_as_an_fmu_it_has_its_target_and_its_speed(folders):
+    drive = FmuDrive(str(folders["vl"].folder), "inertia", MOTOR)
+    by_name = {one.name: one for one in drive.variables}
+    assert "target_velocity" not in by_name
+    for word in (6, 7, ENABLED, RUN):
+        for name, value in {"mode_of_operation": cia402.VL, "controlword": word, "vl_target_velocity": 300}.items():
+            drive.set(by_name[name], value)
+        drive.step(0.001)
+    drive.step(0.5)
+    assert drive.get(by_name["vl_velocity_demand"]) == 300
+    assert drive.get(by_name["vl_velocity_actual_value"]) == pytest.approx(300, rel=0.05)
+
+
 def test_a_drive_without_6048h_gets_a_ramp_of_the_emulators_own(tmp_path):
     text = EDS["vl"].read_text(encoding="utf-8")
     path = tmp_path / "bare.eds"
     head, rest = text.split("[6048]", 1)
-    path.write_text(head + "[6049]" + rest.split("[6049]", 1)[1], encoding="utf-8")
+    path.write_text(head + "[6049]" + rest.split("[6049]", 1)[1] + entry("604F", "Ramp time"), encoding="utf-8")
     made = new_device(path, tmp_path / "bare", find_motor(MOTOR))
     assert any("no 6048h" in note.why for note in made.fill_in)
+    assert {note.what: note.why for note in made.without_effect}["604Fh"].startswith("ramps of vl are those of 6048h")
     with emulated(made) as drives:
         turning(drives, 300)
 

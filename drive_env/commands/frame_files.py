@@ -147,7 +147,7 @@ class FrameLines:
         service = "extended" if message.is_extended_id else service_name(number)
         service = "error frame" if message.is_error_frame else service
         if self._as_json:
-            print_json({"t": round(after, 6), "id": number, "remote": message.is_remote_frame,
+            print_json({"t": round(after, 6), "id": number, "remote": message.is_remote_frame, "length": message.dlc,
                         "data": message.data.hex(), "service": service})  # fmt: skip
             return
         frame = show_frame(number, bytes(message.data), message.dlc if message.is_remote_frame else None)

@@ -85,9 +85,17 @@ def log(
         taken = _take_interrupts()
         end = time.monotonic() + (float("inf") if duration is None else duration)
         try:
-            made = (FrameLines(json) if is_shown
-                    else FrameFile(file) if ending in FRAME_FILES else can.Logger(str(file)))  # fmt: skip
-            with held_signals() as noted, made as writer:
+            # Signals are held before the file is there, which tells a script that the log has begun.
+            with (
+                held_signals() as noted,
+                (
+                    FrameLines(json)
+                    if is_shown
+                    else FrameFile(file)
+                    if ending in FRAME_FILES
+                    else can.Logger(str(file))
+                ) as writer,
+            ):
                 while not noted and (left := end - time.monotonic()) > 0.0:
                     try:
                         message = bus.recv(min(left, 0.1))

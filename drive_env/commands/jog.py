@@ -155,6 +155,8 @@ def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> st
     from drive_env.dictionary import quantities
 
     text = quantities.show(velocity, entry, scale)
+    if not entry.unit:
+        return f"{text}, in a unit that the EDS does not tell"
     if quantities.is_quantity(speed) or text.endswith(" rpm"):
         return text
     return f"{text}; if {speed} rpm are meant, write '{speed} rpm'"

@@ -254,7 +254,7 @@ def what_stops(reasons: list[str]) -> Iterator[None]:
         raise
     except SafetyError as error:
         text = str(error).replace("Limits(current=...)", "--max-current").partition(", or set Limits(")[0]
-        reasons.append(text.replace("Choose less, or raise Limits(velocity=...): ", "Choose less: "))
+        reasons.append(text.replace(", or raise Limits(velocity=...): ", ": "))
     except (RuntimeError, TimeoutError) as error:  # motion's, whose remedies are Python's
         reasons.append(str(error).partition(";")[0])
 

@@ -59,8 +59,10 @@ def _frames_as_bytes(file: Path, everything: bool) -> bytes:
                 if _is_taken(frame, everything):
                     if frame.is_fd:
                         left_out += 1
-                    else:
-                        rows.append(_row(frame))
+                        continue
+                    if not frame.is_remote_frame and len(frame.data) != frame.dlc:
+                        raise LogError(f"a frame of {frame.dlc} bytes has {len(frame.data)}")
+                    rows.append(_row(frame))
     except MemoryError:
         raise
     except LogError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator
 from itertools import chain
@@ -54,7 +55,7 @@ def frames_of_text(ending: str, lines: Lines) -> Iterator[Any]:
         if ending == format_ending and begins(first):
             return read(lines)
     readers: dict[str, Any] = {
-        ".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".csv": can.CSVReader, ".trc": can.TRCReader
+        ".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".csv": can.CSVReader
     }  # fmt: skip
     lines = _with_events_line(lines) if ending == ".asc" else lines
     return iter(readers[ending](line for line in lines))  # it closes what it reads, and a chain cannot be closed
@@ -132,9 +133,24 @@ def _savvycan(lines: Lines) -> Iterator[Any]:
         yield _with_data(frame, [byte for byte in data if byte], 16)
 
 
+def _trc(lines: Lines) -> Iterator[Any]:
+    """Yield the frames of a .trc; what python-can drops with a warning is refused."""
+    import can
+
+    def refuse(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.WARNING:
+            raise LogError(f"{next(iter(record.args or ('',)))!r} is no line of a .trc")
+        return True
+
+    reader = logging.getLogger("can.io.trc")
+    reader.addFilter(refuse)
+    try:
+        yield from can.TRCReader(line for line in lines)
+    finally:
+        reader.removeFilter(refuse)
+
+
 def _with_data(frame: Any, data: list[str], base: int) -> Any:
-    if not frame.is_remote_frame and len(data) != frame.dlc:
-        raise LogError(f"a frame of {frame.dlc} bytes has {len(data)}")
     frame.data = bytearray(int(byte, base) for byte in data)
     return frame
 
@@ -144,4 +160,5 @@ FOREIGN: tuple[tuple[str, Callable[[str], Any], Callable[[Lines], Iterator[Any]]
     (".log", lambda first: first.startswith("***BUSMASTER"), _busmaster),
     (".log", lambda first: CANDUMP.match(first.strip()), _candump),
     (".csv", lambda first: first.startswith(SAVVYCAN), _savvycan),
+    (".trc", bool, _trc),
 )

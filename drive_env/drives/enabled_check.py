@@ -7,9 +7,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from drive_env import cia402
+from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.drives.interface import BasicDrives
 
-SET_POINTS = (cia402.TARGET_POSITION, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE)
+SET_POINTS = (
+    cia402.TARGET_POSITION, cia402.TARGET_VELOCITY, cia402.TARGET_TORQUE, cia402.VL_TARGET_VELOCITY,
+    cia402.INTERPOLATION_DATA,
+)  # fmt: skip
 
 
 class EnabledCheck:
@@ -18,11 +22,13 @@ class EnabledCheck:
     def __init__(self) -> None:
         self._is_done = False
 
-    def __call__(self, drives: BasicDrives, play: Mapping[Any, Any] | None, cycles: int) -> None:
+    def __call__(
+        self, drives: BasicDrives, known: ObjectDictionary, play: Mapping[Any, Any] | None, cycles: int
+    ) -> None:
         """Warn if set-points are played for some cycles, without a controlword, while no axis is enabled."""
         if self._is_done or not play or not cycles:
             return
-        indices = {name[0] if isinstance(name, tuple) else name for name in play}
+        indices = {cia402.of_first_axis(known.find(name).index) for name in play}
         played = [index for index in SET_POINTS if index in indices]
         if not played or cia402.CONTROLWORD in indices:
             return

@@ -242,7 +242,7 @@ class EmulatedDrives(Saved):
         if every < 1:
             raise ValueError(f"period must be at least {self.device.cycle:g} s, not {period:g} s")
         objects, play = object_names(objects), play or {}
-        self._check_enabled(self, play, cycles)
+        self._check_enabled(self, self.inside.objects.entries, play, cycles)
         names = (*objects, None, *play)
         prepared = self._prepared.get(names)
         if prepared is not None and prepared.scale_changes == self.inside.objects.scale_changes:

@@ -203,7 +203,7 @@ class BusDrives:
         if every < 1:
             raise ValueError(f"period must be at least {self._description.cycle:g} s, not {period:g} s")
         given = play or {}
-        self._check_enabled(self, given, cycles)
+        self._check_enabled(self, self._description.dictionary, given, cycles)
         call = self._cycle_runner.call(object_names(objects), tuple(given))
         played = self._cycle_runner.rows(call, tuple(given.values()), cycles)
         found = self._cycle_runner.record(call, played, cycles, self.safety)

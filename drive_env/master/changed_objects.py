@@ -14,7 +14,7 @@ from drive_env.fieldbus.tidying import Tidying
 
 # 6007h, what an axis does when its connection is lost (CiA 402): nothing, or the quick stop.
 _ABORT_CONNECTION, _NO_ACTION, _QUICK_STOP = (cia402.ABORT_CONNECTION_OPTION, 0), b"\0\0", b"\3\0"
-REMEDY = "to move it without that, open it with Limits(silence=None) and keep the emergency stop at hand"
+REMEDY = "to move it without that, open it in Python with Limits(silence=None) and keep the emergency stop at hand"
 
 
 class ChangedObjects:

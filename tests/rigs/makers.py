@@ -142,7 +142,8 @@ MANNERS = {
                  "608F:1": {"DefaultValue": 65536}},
         encoding="utf-8-sig", node_id="0x{:X}+$NODEID",
         parts=({"608F:1": {"DefaultValue": "80000h"}, "607D:1": {"LowLimit": -2147483647},
-                "607D:2": {"HighLimit": 2147483646}}, {"6075": {"HighLimit": 2000}, "without": ("6080", "6073")}),
+                "607D:2": {"HighLimit": 2147483646}}, {"6065": {"HighLimit": 500000}, "6075": {"HighLimit": 2000},
+                                                      "without": ("6080", "6073")}),
     ),
     # Limits that contradict the standard's formats; mappings of sub-index 0 alone, others described once.
     "iberis": Manner(
@@ -179,7 +180,7 @@ MANNERS = {
 
 def files() -> dict[str, bytes]:
     """The content of every maker's file by its name: those of tests/data/eds, and those made here."""
-    found = {path.stem: path.read_bytes() for path in sorted(FOLDER.glob("*.eds"))}
+    found = {path.stem: path.read_bytes() for path in sorted(FOLDER.rglob("*.eds"))}
     for name, manner in MANNERS.items():
         for k, part in enumerate(({}, *manner.parts)):
             own = {key: value for key, value in part.items() if key in Manner.__dataclass_fields__}
