@@ -226,8 +226,9 @@ def test_homing_ends_at_its_edge_and_the_axis_goes_back_to_where_it_stood(fresh,
 def test_without_a_method_it_says_so_and_offers_those_of_the_drive(fresh, tmp_path):
     with CommissioningPath(fresh, CommissioningPlan(), tmp_path / "x") as path:
         path.run("motor", quiet)
-        (line,) = path.run("homing", quiet).lines
-        assert line.startswith("not homed: no method is chosen (6098h is 0)") and "17: left to the left limit" in line
+        found = path.run("homing", quiet)
+        assert found.state == "failed" and "17: left to the left limit switch" in found.lines[0]
+        assert found.lines[0].startswith("no homing method is chosen (6098h is 0); those of the drive are 17: left")
 
 
 @pytest.mark.parametrize(("limits", "step", "told"), [
@@ -333,7 +334,8 @@ def test_from_the_factory_to_the_certificate_over_can_and_back(tmp_path, monkeyp
         words = ["--method", "17", *(f"--limit={name}={value}" for name, value in SWITCHES["limits"].items())]
         found = commission(channel, "--yes", "--out", "x", *words, "--dynamics", "soft")
         assert found.exit_code == 0, found.output
-        assert "soft" in json.loads((tmp_path / "x" / "certificate.json").read_text())["dynamics"]["name"]
+        told = json.loads((tmp_path / "x" / "certificate.json").read_text())["axes"][0]
+        assert (told["accepted"], told["dynamics"]) == (True, "soft")
         stored = settings_of(drives)
         assert is_off(drives) and stored[0x6098, 0] == 17 and stored[0x2042, 1] > 0
         world.nodes[1].reset()
@@ -345,16 +347,14 @@ def test_from_the_factory_to_the_certificate_over_can_and_back(tmp_path, monkeyp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", ["identify", "tune", "verify"])
-def test_stopped_in_a_step_that_takes_long_the_drive_over_can_is_as_it_was_found(tmp_path, step):
+@pytest.mark.parametrize(("step", "share"), [("identify", 0.3), ("tune", 0.3), ("verify", 0.2)])
+def test_stopped_in_a_step_that_takes_long_the_drive_over_can_is_as_it_was_found(tmp_path, step, share):
     with served() as (_, drives, channel, _):
         before = settings_of(drives)
         options = {"interface": "slcan", "channel": channel, "nodes": [1], "pace": "lockstep", "timeout": 5.0}
-        calls = []
 
-        def stop(what, share):
-            calls.append(what)
-            if len(calls) > 3 and share > 0.2:
+        def stop(what, done):
+            if done >= share:
                 raise KeyboardInterrupt
 
         with (

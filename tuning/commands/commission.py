@@ -151,6 +151,7 @@ def _limits(given: Sequence[str] | None) -> dict[str, str]:
 
 def _walk(path: CommissioningPath, chosen: set[str], *, yes: bool, quiet: bool) -> None:
     """Do the steps in their order, until the last one, the user's word, or a failure without a terminal."""
+    from tuning.commissioning.homing import has_no_method, no_method
     from tuning.commissioning.steps import STEPS
 
     asks, names = sys.stdin.isatty() and not yes and not quiet, list(STEPS)
@@ -164,6 +165,9 @@ def _walk(path: CommissioningPath, chosen: set[str], *, yes: bool, quiet: bool) 
             path.skip(name)
             continue
         step = STEPS[name]
+        if name == "homing" and not asks and has_no_method(path.bench):
+            path.skip(name, no_method(path.bench.target))
+            continue
         if not quiet:
             _print_step(names.index(name) + 1, step, path.bench.target)
         answer = _answer(path, name) if asks else "y"
@@ -202,14 +206,11 @@ def _answer(path: CommissioningPath, name: str) -> str:
 
 
 def _ask_method(path: CommissioningPath) -> None:
-    from drive_env import cia402
-    from tuning.commissioning.homing import offered_methods
+    from tuning.commissioning.homing import has_no_method, offered_methods
 
-    plan, drives = path.bench.plan, path.bench.target.drives
-    if plan.method is None and not drives.read(cia402.HOMING_METHOD).any():
+    if has_no_method(path.bench):
         print_lines(f"  {number:>3}  {text}" for number, text in offered_methods(path.bench.target).items())
-        number = typer.prompt("  No method is chosen (6098h is 0). Number, or 0 to home by none", default=0, type=int)
-        plan.method = number or None
+        path.bench.plan.method = typer.prompt("  No method is chosen (6098h is 0). Number of the list", type=int)
 
 
 def _before(path: CommissioningPath, name: str, chosen: set[str]) -> str:

@@ -18,6 +18,7 @@ from drive_env.drives.speeds import per_increment
 from drive_env.fieldbus.description import describe
 from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Mask
+from tuning.commissioning.axis_limits import LIMITS
 from tuning.identify.working_state import ALIGNMENT_TIME, is_aligning
 
 if TYPE_CHECKING:
@@ -78,18 +79,31 @@ def offered_methods(target: Target) -> dict[int, str]:
     return {number: method_text(number, is_known=True) for number in methods_of(target.drives, known, 0)}
 
 
+def no_method(target: Target) -> str:
+    """Return that no method is chosen, and those that there are, in words."""
+    listed = "; ".join(f"{number}: {text}" for number, text in offered_methods(target).items())
+    return f"no homing method is chosen (6098h is 0); those of the drive are {listed}"
+
+
+def has_no_method(bench: CommissioningBench) -> bool:
+    """Return whether homing needs the choice of a method first."""
+    chosen = bench.plan.method is not None or bool(bench.target.drives.read(cia402.HOMING_METHOD).any())
+    return not chosen and not any(LIMITS[name].is_place for name in bench.plan.limits)
+
+
 def home_axes(bench: CommissioningBench) -> list[str]:
     """Home the axes one after the other, and bring each back to where it stood; return the results, in lines.
 
     Raises:
         ValueError: For a method that the drive does not have.
-        RuntimeError, TimeoutError: If an axis does not attain home.
+        RuntimeError, TimeoutError: If no method is chosen, or an axis does not attain home.
     """
     target, drives = bench.target, bench.target.drives
     own, wanted, there = drives.read(cia402.HOMING_METHOD), bench.plan.method, offered_methods(target)
     if wanted is None and not own.any():
-        listed = "; ".join(f"{number}: {text}" for number, text in there.items())
-        return [f"not homed: no method is chosen (6098h is 0). Those of the drive: {listed}"]
+        if has_no_method(bench):
+            raise RuntimeError(f"{no_method(target)}. Choose one that fits the machine's switches, or leave homing out")
+        return ["not homed: no method is chosen (6098h is 0), so positions count from where they do now"]
     if wanted is not None and wanted not in there:
         raise ValueError(f"homing method {wanted}: the drive has {', '.join(map(str, there))}")
     if wanted is not None:

@@ -133,9 +133,9 @@ class CommissioningPath:
         self.states[name] = StepState(DONE, tuple(lines))
         return self.states[name]
 
-    def skip(self, name: str) -> None:
+    def skip(self, name: str, why: str = "left out") -> None:
         """Leave a step out, and with tuning or storing the certificate, which is of both."""
-        self.states[name] = StepState(SKIPPED, ("left out",))
+        self.states[name] = StepState(SKIPPED, (why,))
         if name in ("tune", LAST):
             self.states["certificate"] = StepState(SKIPPED, (f"{STEPS[name].title} was left out",))
 
