@@ -17,7 +17,6 @@ from drive_env.studio.session import Session
 from tuning.snapshot import DEVICE_OBJECTS, take_of
 from tuning.studio.commissioning_jobs import room_of
 
-
 PATIENCE = 120.0  # s, of a computer that is busy: a bus in real time
 
 

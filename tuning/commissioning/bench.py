@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
+WHOLE = 2**32 - 1  # what 607Dh spans of a drive without limits of position
+
+
 @dataclass
 class CommissioningPlan:
     """What a user wants of a commissioning.
@@ -71,11 +74,10 @@ class CommissioningBench:
         low, high = target.low - gone, target.high - gone
         if target.device.new_dictionary().has((cia402.POSITION_LIMITS, 1)):
             own = [target.drives.read((cia402.POSITION_LIMITS, sub)) for sub in (1, 2)]
+            is_limited = (own[0] < own[1]) & (own[1] - own[0] < WHOLE)
             least, most = (((one - here) / target.increments()) for one in own)
-            low, high = (
-                np.where(least < most, np.maximum(low, least), low),
-                np.where(least < most, np.minimum(high, most), high),
-            )
+            low = np.where(is_limited, np.maximum(low, least), low)
+            high = np.where(is_limited, np.minimum(high, most), high)
         low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
         return replace(target, low=low, high=np.where(low < high, high, 1e-3))  # without any way: as good as none
 

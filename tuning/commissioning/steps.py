@@ -18,6 +18,7 @@ import numpy as np
 from drive_env.cia402 import Key
 from drive_env.devices.commissioning import BANDWIDTHS, ROTORS
 from drive_env.devices.gains import bandwidth_gains, cascade_columns, has_linear_model
+from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.dynamics import Dynamics, find_dynamics
 from drive_env.loops.margins import Margins, margins
@@ -26,7 +27,7 @@ from tuning.auto.loop_margins import GAIN_ERROR, MS_ERROR, PHASE_ERROR
 from tuning.auto.settings import ignore_unwired_switches, motor_parameters, told_unwired
 from tuning.commissioning.axis_limits import LIMITS, check_limits_of_motor, check_place_of_axes, limits_of, write_limits
 from tuning.commissioning.bench import CommissioningBench
-from tuning.commissioning.checks_alone import check_wiring, identify_windings
+from tuning.commissioning.first_experiments import FirstExperiments
 from tuning.commissioning.homing import HOMING_OBJECTS, home_axes, unfit_for_homing
 from tuning.estimate import Estimate, interval
 from tuning.identify.identification import identify
@@ -36,7 +37,9 @@ from tuning.snapshot import STORE, can_store, store, write_parameters
 from tuning.target import Target
 
 if TYPE_CHECKING:
+    from mechanics.arrays import Mask
     from tuning.auto.result import AxisResult, Result
+    from tuning.identify.identified_axis import Identification
     from tuning.stepper.result import StepperAxis, StepperResult
 
 Say = Callable[[str, float], None]  # what is under way, and the share of the step that is done, 0...1
@@ -89,15 +92,13 @@ def write_motor(bench: CommissioningBench, say: Say) -> list[str]:
 
 def wire_encoder(bench: CommissioningBench, say: Say) -> list[str]:
     """Check the wiring, correct the settings of encoder and halls, and check again."""
-    with swinging_allowed(bench.target.drives):
-        found, good = check_wiring(bench.here(), say)
+    found, good = _checked_wiring(bench, say)
     wanted = [changes(one.wiring) for one in found]
     lines = [text for one in found for text in corrected(bench.target.device, one.wiring)]
     if any(wanted):
         with bench.counting_anew():
             bench.wire(wanted)
-        with swinging_allowed(bench.target.drives):
-            found, good = check_wiring(bench.here(), say)
+        found, good = _checked_wiring(bench, say)
     for k in map(int, np.flatnonzero(~good)):
         raise RuntimeError(f"{_axis(bench, k)}{found[k].estimates['resistance'].reason}")
     for k, one in enumerate(found):
@@ -108,11 +109,17 @@ def wire_encoder(bench: CommissioningBench, say: Say) -> list[str]:
     return lines
 
 
+def _checked_wiring(bench: CommissioningBench, say: Say) -> tuple[list[Identification], Mask]:
+    check = FirstExperiments(bench.here(), say, pulses=False)
+    with swinging_allowed(bench.target.drives):
+        return check.run(), check.good
+
+
 def tune_current_loop(bench: CommissioningBench, say: Say) -> list[str]:
     """Identify the winding, and set P and I of the current loop for it."""
     target = bench.here()
     with swinging_allowed(target.drives):
-        found = identify_windings(target, say)
+        found = FirstExperiments(target, say, pulses=True).run()
     known, columns = target.device.gains, cascade_columns(target.device)[:2]
     gains, lines = read_gains(target.drives), []
     for k, one in enumerate(found):
@@ -301,6 +308,11 @@ def _of_linked(target: Target) -> str:
     return why if target.linked else _in_open_loop(target)
 
 
+def _motor_objects(target: Target) -> list[Key]:
+    switches = target.device.roles.get(Role.LIMIT_SWITCHES)
+    return [*motor_parameters(target), *([] if switches is None else [switches])]
+
+
 def _current_gains(target: Target) -> list[Key]:
     return [target.device.gains.keys[k] for k in cascade_columns(target.device)[:2]]
 
@@ -316,7 +328,7 @@ STEPS = {
         CommissioningStep(
             "motor", "Motor",
             "is it this motor, with this encoder, and this supply? Its own data sheet is a TOML file (--motor FILE)",
-            "nothing", lambda target: list(motor_parameters(target)), write_motor, moves=False,
+            "nothing", _motor_objects, write_motor, moves=False,
         ),
         CommissioningStep(
             "wiring", "Wiring and commutation",
