@@ -192,9 +192,12 @@ def photograph(driver: Chrome, base: str, shot: Shot, folder: Path) -> Path:
     return file
 
 
-def every(pages: tuple[str, ...] = ("axes", "scope", "dictionary", "commission", "tune", "machine", "runs")) -> list[Shot]:
+EVERY = ("axes", "scope", "dictionary", "commission", "tune", "machine", "runs")
+
+
+def every(pages: tuple[str, ...] = EVERY) -> list[Shot]:
     """Return every page at every size, light and dark."""
-    acts = {"scope": nothing, "axes": nothing, "dictionary": nothing}
+    acts = dict.fromkeys(("scope", "axes", "dictionary", "commission"), nothing)
     return [
         Shot(f"{page}-{width}-{'dark' if dark else 'light'}", f"/{page}", width, height, dark, acts.get(page, nothing))
         for page in pages

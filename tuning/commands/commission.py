@@ -253,20 +253,20 @@ def _tell_plan(target: Target, chosen: set[str], json: bool) -> None:
         why = "" if name in chosen else "left out"
         why = step.unfit(target) or why
         keys = [] if why else step.writes(target)
-        now = {f"{key[0]:04X}h:{key[1]:02X}": target.drives.read(key).tolist() for key in keys if key[0] >= 0x2000}
-        row = {"step": name, "moves": step.moves, "look at": step.look, "measured": step.measured}
-        rows.append(row | {"left out": why, "writes": [f"{i:04X}h:{s:02X}" for i, s in keys], "now": now})
+        present = {f"{key[0]:04X}h:{key[1]:02X}": target.drives.read(key).tolist() for key in keys if key[0] >= 0x2000}
+        row: dict[str, Any] = {"step": name, "moves": step.moves, "look at": step.look, "measured": step.measured}
+        rows.append(row | {"left out": why, "writes": [f"{i:04X}h:{s:02X}" for i, s in keys], "now": present})
     if json:
         print_json(rows)
         return
-    for number, (row, step) in enumerate(zip(rows, STEPS.values(), strict=True), 1):
-        if row["left out"]:
-            print_lines([f"{number}/{len(STEPS)} {step.title}: left out: {row['left out']}"])
+    for number, (told, step) in enumerate(zip(rows, STEPS.values(), strict=True), 1):
+        if told["left out"]:
+            print_lines([f"{number}/{len(STEPS)} {step.title}: left out: {told['left out']}"])
             continue
         _print_step(number, step, target)
-        if row["now"]:
-            present = ", ".join(f"{name} {', '.join(map(str, raw))}" for name, raw in row["now"].items())
-            print_lines([f"  now: {present}"])
+        if told["now"]:
+            now = (f"{key} {', '.join(map(str, raw))}" for key, raw in told["now"].items())
+            print_lines([f"  now: {', '.join(now)}"])
     find = target.device.new_dictionary().find
     lent = ", ".join(f"{entry.index:04X}h:{entry.sub:02X}" for entry in map(find, borrowed(target.device)))
     print_lines([f"Steps that move borrow besides, and give back: {lent}", "Nothing was written (dry run)."])
