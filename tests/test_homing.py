@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
+from drive_env.dictionary.homing_methods import METHODS, PLACES, SKETCHES
 from drive_env.firmware.record import get_lanes, set_lanes
 
 COUNT = 16  # axes side by side, one per start region
@@ -571,3 +572,29 @@ def test_limit_switches_stop_the_axis_again_in_other_modes(belt):
     belt.write(0x60FF, round(0.1 * INC))
     belt.advance(0.5)
     assert (carriage(belt) > LEFT + 0.01).all()
+
+
+@pytest.mark.parametrize(("method", "begins"), [(17, 0.0), (18, 0.0), (19, -0.15), (21, 0.1)])
+def test_the_sketch_of_a_method_turns_round_as_the_axis_does(belt, method, begins):
+    """Its legs, and on which side of its switch it begins; 0.002 m are what settling may be."""
+    bring(belt, np.full(COUNT, begins))
+    set_up(belt, method)
+    start(belt)
+    seen = [carriage(belt)[0]]
+    for _ in range(600):
+        belt.advance(0.01)
+        if abs(carriage(belt)[0] - seen[-1]) > 0.002:
+            seen.append(carriage(belt)[0])
+    legs = [way for k, way in enumerate(np.sign(np.diff(seen))) if k == 0 or way != np.sign(np.diff(seen))[k - 1]]
+    sketch = SKETCHES[method]
+    assert legs == list(np.sign(np.diff(sketch.way)))
+    low, high = PLACES[sketch.switch]
+    assert sketch.way[-1] in (low, high) and not low <= sketch.way[0] <= high
+
+
+def test_every_method_that_is_described_has_a_sketch_that_ends_at_its_edge_or_index():
+    assert set(SKETCHES) == set(METHODS) | {-1, -2, -3, -4}
+    for method in range(1, 15):
+        with_index, edge = SKETCHES[method], SKETCHES[method + 16]
+        assert with_index.has_index and with_index.way[:-1] == edge.way
+        assert np.sign(with_index.way[-1] - edge.way[-1]) == np.sign(edge.way[-1] - edge.way[-2])

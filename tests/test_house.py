@@ -30,7 +30,7 @@ ROOMS = (
     "tuning.runs", "tuning.target", "tuning.drive_audit", "tuning.link_energy", "tuning.outcome", "tuning.rules",
     "tuning.response", "tuning.identify", "tuning.certificate", "tuning.snapshot", "tuning.auto", "tuning.search",
     "tuning.compare", "tuning.stepper", "tuning.rehearsal",
-    "tuning.auto_to_files", "tuning.way_back", "tuning.commands", "tuning.studio",
+    "tuning.auto_to_files", "tuning.commissioning", "tuning.way_back", "tuning.commands", "tuning.studio",
     "agents", "agents.plain", "agents.seeds", "agents.shipped", "agents.tasks", "agents.policies", "agents.training",
     "agents.tuner", "agents.evaluation", "agents.benchmark", "agents.hyperparameter_search", "agents.commands",
     "agents.studio",

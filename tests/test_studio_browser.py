@@ -103,6 +103,16 @@ def test_a_move_of_an_axis_that_is_off_says_what_to_do(tab):
     until(lambda: any("enable it first" in line for line in tab.told()), f"the remedy; told: {tab.told()}")
 
 
+def test_home_says_that_no_method_is_chosen_and_offers_those_of_the_drive(tab):
+    at_rest(tab)
+    until(lambda: "no homing method chosen" in tab.named("homing-told").text, "what is missing")
+    tab.press("home")
+    until(lambda: "no homing method is chosen (6098h is 0)" in "".join(tab.told()), "why not")
+    choose(tab, "homing-method", "17 left to the left limit switch, then right: home is where it becomes inactive")
+    label = "return (document.querySelector('.studio-homing') || {}).ariaLabel || ''"
+    until(lambda: "method 17: left to the left limit" in tab.driver.execute_script(label), "its sketch")
+
+
 @pytest.mark.slow
 def test_transitions_are_pressed_in_the_diagram(tab):
     at_rest(tab)

@@ -295,6 +295,22 @@ def restore(
     return changed
 
 
+def write_parameters(drives: Drives, wanted: Mapping[Key, int]) -> list[list[Difference]]:
+    """Write parameters to every axis, each all or none; return the changes of each. The axes must not be enabled.
+
+    Raises:
+        NotRestoredError, RollbackError: If a drive refuses one.
+    """
+    single = _per_axis(drives)
+    return [write_all_or_none(single, wanted, place) for place in _places(drives)]
+
+
+def compare_parameters(drives: Drives, wanted: Mapping[Key, int]) -> list[list[Difference]]:
+    """Return which parameters of each axis have another value."""
+    single = _per_axis(drives)
+    return [compare(single, wanted, place) for place in _places(drives)]
+
+
 def _set_points(known: Description) -> list[Key]:
     return [(index, 0) for index in SET_POINTS if known.has(index) and known.dictionary.find(index).access != "wo"]
 
@@ -426,15 +442,20 @@ class Transaction:
         """Keep the present settings of axes, all by default."""
         self._committed |= True if where is None else where
 
-    def roll_back(self, where: Mask | None = None) -> None:
-        """Restore the settings of axes, all by default: the gains at once, the rest once they are disabled."""
-        drives = self._target.drives
+    def roll_back(self, where: Mask | None = None, to: Snapshot | None = None) -> None:
+        """Restore the settings of axes, all by default: the gains at once, the rest once they are disabled.
+
+        Args:
+            where: Which axes.
+            to: A later state than that before; None is that before.
+        """
+        drives, wanted = self._target.drives, self.before if to is None else to
         axes = np.ones(drives.num_axes, bool) if where is None else where
         for key in device_of(drives).gains.keys:
-            was = np.array([values.get(key, 0) for values in self.before.axes])
+            was = np.array([values.get(key, 0) for values in wanted.axes])
             drives.write(key, was, where=axes)
-        _switch_off(drives, axes)
-        restore(drives, self.before, axes, whole=False)
+        switch_off(drives, axes)
+        restore(drives, wanted, axes, whole=False)
 
     def store(self, where: Mask | None = None) -> bool:
         """Have the drives keep their parameters over a power cycle; the file says so first.
@@ -450,7 +471,7 @@ class Transaction:
         return True
 
 
-def _switch_off(drives: Drives, where: Mask) -> None:
+def switch_off(drives: Drives, where: Mask) -> None:
     """Switch the voltage off and wait until no axis may turn; one in fault is off once its reaction has ended."""
     drives.write(cia402.CONTROLWORD, 0x00, where=where)
     for _ in range(SWITCH_OFF):

@@ -146,6 +146,15 @@ def fail(driver: Chrome) -> None:
     driver.execute_script("document.activeElement.blur(); window.scrollTo(0, 0)")
 
 
+def commission(driver: Chrome) -> None:
+    """Begin a commissioning, and come to its homing."""
+    press(driver, "[data-test=begin]")
+    time.sleep(SETTLE)
+    for step in ("motor", "wiring", "current", "limits"):
+        press(driver, f"[data-test=do-{step}]")
+        time.sleep(2.0 * SETTLE)
+
+
 def nothing(driver: Chrome) -> None:
     """Do nothing."""
 
@@ -157,6 +166,7 @@ SHOTS = (
     Shot("tune", "/tune", 1920, 1500, False, tune),
     Shot("runs", "/runs", 1280, 960, False, nothing),
     Shot("axes-phone", "/axes", 360, 780, True, nothing),
+    Shot("commission", "/commission", 1280, 1500, False, commission),
     Shot("machine", "/machine", 1280, 1400, False, fail),
 )
 
@@ -182,9 +192,12 @@ def photograph(driver: Chrome, base: str, shot: Shot, folder: Path) -> Path:
     return file
 
 
-def every(pages: tuple[str, ...] = ("axes", "scope", "dictionary", "tune", "machine", "runs")) -> list[Shot]:
+EVERY = ("axes", "scope", "dictionary", "commission", "tune", "machine", "runs")
+
+
+def every(pages: tuple[str, ...] = EVERY) -> list[Shot]:
     """Return every page at every size, light and dark."""
-    acts = {"scope": nothing, "axes": nothing, "dictionary": nothing}
+    acts = dict.fromkeys(("scope", "axes", "dictionary", "commission"), nothing)
     return [
         Shot(f"{page}-{width}-{'dark' if dark else 'light'}", f"/{page}", width, height, dark, acts.get(page, nothing))
         for page in pages

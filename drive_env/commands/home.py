@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -34,9 +34,6 @@ from drive_env.commands.options import (
     print_json,
 )
 from drive_env.commands.tables import print_lines
-
-if TYPE_CHECKING:
-    from drive_env.fieldbus.description import Description
 
 SETTLING = 40  # looks, a STANDSTILL apart, in which an axis must come to rest at home
 REACHED = cia402.TARGET_REACHED.mask  # at rest, which the command sees by the position
@@ -120,18 +117,6 @@ def home(
                 _report(homing, outcome, json)
 
 
-def methods_of(one: OneAxis) -> list[int]:
-    """Return the homing methods that an axis has: those of 60E3h, and a known device's; [] where neither tells."""
-    known: Description = one.drives.description
-    found: set[int] = set()
-    if known.has((cia402.HOMING_METHODS, 1)):
-        count = one.read((cia402.HOMING_METHODS, 0))
-        found = {one.read((cia402.HOMING_METHODS, sub)) for sub in range(1, count + 1)}
-    if known.device is not None:
-        found |= set(known.device.allowed_values.get((cia402.HOMING_METHOD, 0), ()))
-    return sorted(found - {0})
-
-
 def _text(method: int, is_known: bool) -> str:
     from drive_env.dictionary.homing_methods import method_text
 
@@ -145,7 +130,10 @@ def _planned(one: OneAxis, method: int | None, json: bool) -> _Homing:
         ValueError: For a method that the axis does not have.
         RuntimeError: If no method is given, and the drive has none; those that it has are printed first.
     """
-    own, there = one.read(cia402.HOMING_METHOD), methods_of(one)
+    from drive_env.drives.homing import methods_of
+
+    own = one.read(cia402.HOMING_METHOD)
+    there = methods_of(one.drives, one.drives.description, one.axis)
     if method is not None and (method == 0 or (there and method not in there)):
         known = ", ".join(map(str, there)) or "those of its manual"
         raise ValueError(f"--method {method}: {one.name} has {known}; without --method its list shows what each does")
@@ -162,19 +150,13 @@ def _planned(one: OneAxis, method: int | None, json: bool) -> _Homing:
 
 def _check_speeds(one: OneAxis, method: int) -> None:
     """Raise ValueError where a speed or the acceleration that a method needs is 0: the axis would not move."""
-    from drive_env.dictionary.homing_methods import HERE, INDEX_ALONE
+    from drive_env.drives.homing import missing_speeds
 
-    needed = [] if method in HERE else [(cia402.HOMING_ACCELERATION, 0, "500 rev/s^2")]
-    if method not in (*HERE, *INDEX_ALONE):  # the search of a switch, or of a stop
-        needed.append((cia402.HOMING_SPEEDS, 1, "100 rpm"))
-    if method not in HERE and method > 0:  # an edge, or an index
-        needed.append((cia402.HOMING_SPEEDS, 2, "10 rpm"))
-    for index, sub, example in needed:
-        if one.drives.description.has((index, sub)) and one.read((index, sub)) == 0:
-            raise ValueError(
-                f"{index:04X}h:{sub:02X} of {one.name} is 0, so method {method} would not move the axis; set it, for "
-                f"example drive-env set {index:04X}:{sub} '{example}'"
-            )
+    for (index, sub), example in missing_speeds(one.drives, one.drives.description, one.axis, method).items():
+        raise ValueError(
+            f"{index:04X}h:{sub:02X} of {one.name} is 0, so method {method} would not move the axis; set it, for "
+            f"example drive-env set {index:04X}:{sub} '{example}'"
+        )
 
 
 def _print_methods(one: OneAxis, there: list[int], json: bool) -> None:

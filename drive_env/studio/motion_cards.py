@@ -6,6 +6,7 @@ from nicegui import ui
 
 from drive_env.studio import motion_jobs
 from drive_env.studio.axis_states import MODE_NAMES, AxisState
+from drive_env.studio.homing_sketch import homing_sketch
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
@@ -91,12 +92,44 @@ def move_rows(session: Session, visitor: Visitor) -> None:
             job = motion_jobs.move(session, visitor.axis, goal.value, rate.value or "", relative=relative)
             await visitor.do(job, what)
 
-        async def home() -> None:
-            await visitor.do(motion_jobs.home(visitor.axis), f"Home axis {visitor.axis}")
-
         ui.button("Move to", on_click=lambda: go(False)).props("unelevated no-caps").props("data-test=move-to")
         ui.button("Move by", on_click=lambda: go(True)).props("unelevated no-caps").props("data-test=move-by")
-        ui.button("Home", icon="home", on_click=home).props("outline no-caps").props("data-test=home")
+    home_rows(session, visitor)
     ui.label("Units: rev, deg, rad; rpm, rev/s, rad/s; an integer alone is in the drive's own unit.").classes(
         "studio-hint"
     )
+
+
+def home_rows(session: Session, visitor: Visitor) -> None:
+    """Make the rows that home the axis of a page, by its own method or by one of those that it has."""
+    known = session.description
+    with ui.row().classes("studio-buttons"):
+        method = ui.select({0: "reading"}, value=0, label="Homing method").props("dense outlined").classes("grow")
+        method.props("data-test=homing-method")
+
+        async def home() -> None:
+            job = motion_jobs.home(known, visitor.axis, int(method.value))
+            await visitor.do(job, f"Home axis {visitor.axis}")
+
+        ui.button("Home", icon="home", on_click=home).props("outline no-caps").props("data-test=home")
+    told = ui.label("").classes("studio-hint").props("data-test=homing-told")
+    picture = ui.html("", sanitize=False).classes("w-full")
+    own = 0
+
+    def show() -> None:
+        picture.set_content(homing_sketch(int(method.value) or own, is_known=known.device is not None))
+
+    async def load() -> None:
+        nonlocal own
+        found = await visitor.do(motion_jobs.homing_methods(known, visitor.axis), "Read the homing methods", quiet=True)
+        if found is None:
+            return
+        own, texts = found
+        first = f"{own}  the drive's (6098h)" if own else "none is chosen (6098h is 0)"
+        method.set_options({0: first} | {number: f"{number}  {text}" for number, text in texts.items()})
+        none = "The drive has no homing method chosen: take one of its list that fits the machine's switches."
+        told.set_text("" if own else none if texts else "The drive has no homing (6098h).")
+        show()
+
+    method.on_value_change(lambda _: show())
+    ui.timer(0.0, load, once=True)

@@ -12,7 +12,9 @@ from drive_env import cia402
 from drive_env.dictionary import quantities
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits
+from drive_env.dictionary.homing_methods import METHODS, method_text
 from drive_env.drives import motion
+from drive_env.drives.homing import methods_of, missing_speeds
 from drive_env.drives.interface import Drives
 from drive_env.drives.lent_object import lent
 from mechanics.arrays import Mask
@@ -92,9 +94,37 @@ def select_mode(axis: int, mode: str) -> MotionJob:
     return lambda drives: motion.select_mode(drives, mode, where=only(drives, axis))
 
 
-def home(axis: int) -> MotionJob:
-    """Return the job that runs the homing method of 6098h."""
-    return lambda drives: motion.home(drives, where=only(drives, axis))
+def home(known: Description, axis: int, method: int) -> MotionJob:
+    """Return the job that homes an axis by a method, which 6098h has meanwhile; by that of 6098h for 0."""
+
+    def job(drives: Drives) -> None:
+        where, own = only(drives, axis), int(drives.read(cia402.HOMING_METHOD)[axis])
+        missing = missing_speeds(drives, known, axis, method or own) if method or own else {}
+        for (index, sub), example in missing.items():
+            raise ValueError(
+                f"{index:04X}h:{sub:02X} is 0, so method {method or own} would not move the axis; set it on the page "
+                f"Dictionary, for example to {example}"
+            )
+        with nullcontext() if method in (0, own) else lent(drives, cia402.HOMING_METHOD, method, where):
+            motion.home(drives, where=where)
+
+    return job
+
+
+def homing_methods(known: Description, axis: int) -> Callable[[Drives], tuple[int, dict[int, str]]]:
+    """Return the job that reads 6098h, and the methods that an axis has, each with what it does.
+
+    Of a drive that does not list its own these are those of CiA 402.
+    """
+
+    def job(drives: Drives) -> tuple[int, dict[int, str]]:
+        if not known.has(cia402.HOMING_METHOD):
+            return 0, {}
+        numbers = methods_of(drives, known, axis) or list(METHODS)
+        texts = {number: method_text(number, is_known=known.device is not None) for number in numbers}
+        return int(drives.read(cia402.HOMING_METHOD)[axis]), texts
+
+    return job
 
 
 def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) -> MotionJob:

@@ -116,6 +116,7 @@ class Session:
         recorder: What is sampled.
         stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
         scopes: The scope of each axis that a page has shown; it waits for its trigger while no page shows it.
+        at_end: Called by the drives' thread before the drives are closed, once nothing turns: what puts changes back.
     """
 
     def __init__(
@@ -138,6 +139,7 @@ class Session:
         self.stored: dict[int, dict[Key, int]] = {}
         self.workspace = workspace or Workspace(description)
         self.scopes: dict[int, ScopeView] = {}
+        self.at_end: list[Callable[[], object]] = []
         self.events: deque[SessionEvent] = deque(maxlen=KEPT)
         self.num_events = 0
         self._open = open_drives
@@ -375,6 +377,11 @@ class Session:
         try:
             if real.safety is None:
                 self._bring_to_rest(real)
+            for put_back in self.at_end:
+                try:
+                    put_back()
+                except Exception as error:
+                    logger.error("%s", sentence(error))
             real.close()
         except BaseException as error:
             logger.error("closing the drives: %s", sentence(error))

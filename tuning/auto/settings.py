@@ -48,26 +48,35 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
     _wire(bench, identified, fresh)
     if not fresh.any():
         return fresh
-    for key, value in _commissioning(target).items():
+    for key, value in motor_parameters(target).items():
         if key not in findings(target.device):
             target.drives.write(key, value, where=fresh)
     bench.note(fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
-    if Role.LIMIT_SWITCHES not in target.device.roles:
-        return fresh
-    # No axis is at both ends: switches that say so are not there.
-    unwired = fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
-    target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
-    index, _ = target.device.roles[Role.LIMIT_SWITCHES]
-    bench.note(
-        unwired, f"both limit switches were active at once, so they are not connected: they are ignored ({index:04X}h)"
-    )
+    unwired = ignore_unwired_switches(target, fresh)
+    if unwired.any():
+        bench.note(unwired, told_unwired(target))
     return fresh
+
+
+def ignore_unwired_switches(target: Target, where: Mask) -> Mask:
+    """Have axes ignore limit switches that are both active, as none that are connected are; return which they are."""
+    if Role.LIMIT_SWITCHES not in target.device.roles:
+        return np.zeros_like(where)
+    unwired: Mask = where & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
+    target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+    return unwired
+
+
+def told_unwired(target: Target) -> str:
+    """Return the note on switches that are ignored."""
+    index, _ = target.device.roles[Role.LIMIT_SWITCHES]
+    return f"both limit switches were active at once, so they are not connected: they are ignored ({index:04X}h)"
 
 
 def _wire(bench: AutoBench, identified: IdentifiedAxes, fresh: Mask) -> None:
     """Write the wiring settings: as identified, or else the known ones of a factory-fresh drive's motor."""
     target = bench.target
-    known = {key: value for key, value in _commissioning(target).items() if key in findings(target.device)}
+    known = {key: value for key, value in motor_parameters(target).items() if key in findings(target.device)}
     wanted: list[dict[Key, int]] = []
     for k, found in enumerate(identified.found):
         seen = {} if found is None else found.wiring
@@ -101,7 +110,7 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
     if other.any():
         drives.write(cia402.MODE, bench.modes, where=other)
     wiring, roles = list(findings(bench.target.device)), bench.target.device.roles
-    commissioned = [*wiring, *_commissioning(bench.target)]
+    commissioned = [*wiring, *motor_parameters(bench.target)]
     if Role.LIMIT_SWITCHES in roles:
         commissioned.append(roles[Role.LIMIT_SWITCHES])
     axes = []
@@ -113,7 +122,7 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
     return going
 
 
-def _commissioning(target: Target) -> dict[Key, int]:
+def motor_parameters(target: Target) -> dict[Key, int]:
     """Return the motor's parameters for a drive by their keys, without those of the encoder's initialisation.
 
     Presets take the encoder's offset as known, which it is not here.

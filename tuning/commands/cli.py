@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_much
 from tuning.commands.auto import auto
+from tuning.commands.commission import commission
 from tuning.commands.identify import identify
 from tuning.commands.rank import rank
 from tuning.commands.response import response
@@ -15,7 +16,7 @@ from tuning.commands.verify import verify
 app = Program("drive-tune", "interrupted; nothing was written")
 
 PANELS = {
-    "A drive, emulated or on a bus": (identify, response, rules, auto),
+    "A drive, emulated or on a bus": (commission, identify, response, rules, auto),
     "Many emulated machines": (sweep, rank),
     "What a change leaves": (verify, undo),
 }

@@ -213,6 +213,21 @@ class Experiments:
 
     def turn(self, working: Working) -> None:
         """Make the experiments that need torque."""
+        working, holding = self.pulse_currents(working)
+        drives = working.target.drives
+        self.begin("inertia and friction", 0.3, MECHANICS)
+        mechanics, inertia = identify_mechanics(working, holding)
+        self._take_mechanics(working, mechanics)
+        working = self.calm(working)
+        self.begin("resonance, delay, filter", 0.7, RESPONSE)
+        self.respond(working, inertia)
+        working = self.calm(working)
+        on = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
+        if on.any():
+            go_back(replace(working, where=on), "csv", to=0.0)
+
+    def pulse_currents(self, working: Working) -> tuple[Working, Floats]:
+        """Identify the windings; return the axes that did not oscillate, in csv, and what holds each [A]."""
         target, drives = working.target, working.target.drives
         self.begin("current pulses", 0.15, NAMES)
         enable(working, "csp")
@@ -231,16 +246,7 @@ class Experiments:
             working, pulses, np.asarray(electrical, np.float64), float(target.motor.n_p) * float(sign[0])
         )
         self.take_windings(working, windings)
-        self.begin("inertia and friction", 0.3, MECHANICS)
-        mechanics, inertia = identify_mechanics(working, holding)
-        self._take_mechanics(working, mechanics)
-        working = self.calm(working)
-        self.begin("resonance, delay, filter", 0.7, RESPONSE)
-        self.respond(working, inertia)
-        working = self.calm(working)
-        on = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
-        if on.any():
-            go_back(replace(working, where=on), "csv", to=0.0)
+        return working, holding
 
     def hold(self, working: Working) -> Floats:
         """Return the currents that hold the axes at rest in csp [A]."""

@@ -213,7 +213,7 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
         if aligns.any():  # the flags are those of the millisecond before; and what was switched on comes to rest
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
-        while waited < ALIGNMENT_TIME and np.any(aligns & _is_aligning(working.target)):
+        while waited < ALIGNMENT_TIME and np.any(aligns & is_aligning(working.target)):
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
     except (TimeoutError, RuntimeError) as error:
@@ -221,7 +221,8 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
         raise RuntimeError(f"{error}{f' ({causes})' if causes else ''}") from error
 
 
-def _is_aligning(target: Target) -> Mask:
+def is_aligning(target: Target) -> Mask:
+    """Return which axes are enabled and turn to where their encoder is aligned, before they do anything else."""
     return np.asarray(read_role(target, Role.MOTOR_FLAGS) & STOP_MODE != 0)
 
 

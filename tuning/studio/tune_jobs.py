@@ -264,7 +264,7 @@ def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives],
 
         rest(drives)
         with desk.target(drives) as target:
-            found = measure(target, loop, where=only(drives, axis), progress=_told(desk, "shaking"))
+            found = measure(target, loop, where=only(drives, axis), progress=progress_of(desk, "shaking"))
         desk.responses[loop, axis] = found
         desk.gains = read_gains(drives)
         desk.touch()
@@ -285,7 +285,7 @@ def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
 
         rest(drives)
         with desk.target(drives) as target, swinging_allowed(drives):
-            found = identify(target, progress=lambda what, share: _told(desk, what)(share))
+            found = identify(target, progress=lambda what, share: progress_of(desk, what)(share))
             rules = []
             for axis, one in enumerate(found):
                 try:
@@ -307,7 +307,7 @@ def rest(drives: Drives) -> None:
             disable(axis)(drives)
 
 
-def _told(desk: TuneDesk, what: str) -> Callable[[float], None]:
+def progress_of(desk: TuneDesk, what: str) -> Callable[[float], None]:
     """Return a callback for the share done: the page shows it, and a job that was stopped ends."""
 
     def tell(share: float) -> None:
@@ -367,7 +367,7 @@ def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]
         if not run.lines or run.lines[-1] != what:
             run.lines.append(what)
         desk.touch()
-        _told(desk, what)(share)
+        progress_of(desk, what)(share)
 
     return tell
 

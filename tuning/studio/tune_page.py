@@ -7,7 +7,6 @@ import contextlib
 
 from nicegui import ui
 
-from drive_env.motors import MOTORS
 from drive_env.studio.page import StudioPage
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
@@ -16,16 +15,11 @@ from tuning.studio.gain_card import GainCard
 from tuning.studio.response_card import ResponseCard
 from tuning.studio.rules_card import RulesCard
 from tuning.studio.step_card import StepCard
-from tuning.studio.tune_panel import TunePanel, card
+from tuning.studio.tune_panel import TunePanel, card, machine_card
 from tuning.studio.tuner_card import TunerCard
-from tuning.target import AXES
 
 REFRESH = 0.2  # s
 REREAD = 2.0  # s between two readings of the gains, which another page or another master may write
-COUPLING = {
-    "apart": "separate machines", "coupled": "joints of one machine", "linked": "they drive one part, as a gantry",
-}  # fmt: skip
-assert tuple(COUPLING) == AXES
 
 
 def build(session: Session, visitor: Visitor) -> None:
@@ -59,7 +53,7 @@ class TunePage:
         ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
         with ui.element("div").classes("studio-tune"):
             with ui.element("div").classes("studio-stack"):
-                self._machine_card()
+                machine_card(self.panel)
                 self.gains.build()
                 self.tuner.build()
             with ui.element("div").classes("studio-stack"):
@@ -93,32 +87,6 @@ class TunePage:
             future = session.do(tune_jobs.look(self.panel.desk), "Read the gains", page=page, quiet=True)
             with contextlib.suppress(Exception):  # the next one may get through; what is wrong, other pages tell
                 await asyncio.wrap_future(future)
-
-    def _machine_card(self) -> None:
-        """Ask what no bus tells: motor, travel, supply, coupling."""
-        desk = self.panel.desk
-        emulated = desk.is_emulated
-        with card("Machine", "machine"):
-            with ui.row().classes("studio-buttons"):
-                if not emulated:
-                    names, usual = sorted(MOTORS), self.panel.device.default_motor
-                    motor = ui.select(names, value=desk.entries.motor or usual, label="Motor", with_input=True)
-                    motor.props("dense outlined").classes("grow")
-                    motor.on_value_change(lambda event: setattr(desk.entries, "motor", str(event.value or "")))
-                travel = ui.input(
-                    "Travel [turns]", value=desk.entries.travel, placeholder="the load's" if emulated else "-0.5:0.5"
-                ).props("dense outlined data-test=travel").classes("grow")  # fmt: skip
-                travel.on_value_change(lambda event: setattr(desk.entries, "travel", str(event.value or "")))
-                if not emulated and self.panel.session.num_axes > 1:
-                    axes = ui.select(COUPLING, value=desk.entries.axes, label="Axes").props("dense outlined")
-                    axes.on_value_change(lambda event: setattr(desk.entries, "axes", str(event.value)))
-                if not emulated:
-                    supply = ui.number("Supply [V]", value=self.panel.supply, min=1).props("dense outlined")
-                    supply.on_value_change(lambda event: setattr(desk.entries, "supply", event.value))
-            own = "; empty: as far as the load lets it" if emulated else ""
-            ui.label(f"How far the rotor may turn from where it stands: LOW:HIGH, as -0.5:0.5, or free{own}.").classes(
-                "studio-hint"
-            )
 
 
 page = StudioPage("/tune", "Tune", "tune", 40, build)

@@ -1,0 +1,37 @@
+"""Homing methods of an axis: those that it has, and the speeds that it needs to move by one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from drive_env import cia402
+from drive_env.cia402 import Key
+from drive_env.dictionary.homing_methods import HERE, INDEX_ALONE
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.axis_objects import AxisObjects
+    from drive_env.fieldbus.description import Description
+
+ACCELERATION = (cia402.HOMING_ACCELERATION, 0)
+SEARCH, EDGE = (cia402.HOMING_SPEEDS, 1), (cia402.HOMING_SPEEDS, 2)
+
+
+def methods_of(drives: AxisObjects, known: Description, axis: int) -> list[int]:
+    """Return the homing methods that an axis has: those of 60E3h, and a known device's; [] where neither tells."""
+    found: set[int] = set()
+    if known.has((cia402.HOMING_METHODS, 1)):
+        count = int(drives.read((cia402.HOMING_METHODS, 0))[axis])
+        found = {int(drives.read((cia402.HOMING_METHODS, sub))[axis]) for sub in range(1, count + 1)}
+    if known.device is not None:
+        found |= set(known.device.allowed_values.get((cia402.HOMING_METHOD, 0), ()))
+    return sorted(found - {0})
+
+
+def missing_speeds(drives: AxisObjects, known: Description, axis: int, method: int) -> dict[Key, str]:
+    """Return the speeds and the acceleration that a method needs and that are 0, each with an example of a value."""
+    needed = {} if method in HERE else {ACCELERATION: "500 rev/s^2"}
+    if method not in (*HERE, *INDEX_ALONE):  # the search of a switch, or of a stop
+        needed[SEARCH] = "100 rpm"
+    if method not in HERE and method > 0:  # an edge, or an index
+        needed[EDGE] = "10 rpm"
+    return {key: example for key, example in needed.items() if known.has(key) and drives.read(key)[axis] == 0}

@@ -1,0 +1,123 @@
+"""The limits that a commissioning sets: which objects have them, what is written, and whether they fit the motor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+from drive_env import cia402
+from drive_env.cia402 import Key
+from drive_env.dictionary import quantities
+from drive_env.dictionary.access import check_limits
+from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import read_current_limit
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+PEAK = 3.0  # of the motor's rated current: a limit above is not this motor's
+
+
+class LimitRow(NamedTuple):
+    """A limit: the objects or roles that have it, its meaning, and whether it counts from home."""
+
+    objects: tuple[Key | Role, ...]
+    meaning: str
+    is_place: bool = False
+
+
+LIMITS = {
+    "current": LimitRow((Role.CURRENT_LIMIT, Role.CURRENT_LIMIT_NEGATIVE), "greatest current"),
+    "speed": LimitRow(((cia402.MAX_PROFILE_VELOCITY, 0),), "greatest speed of a profile"),
+    "quick-stop": LimitRow(((cia402.QUICK_STOP_DECELERATION, 0),), "deceleration of a quick stop"),
+    "following-error": LimitRow(((cia402.FOLLOWING_WINDOW, 0),), "following error that stops the axis"),
+    "lowest": LimitRow(((cia402.POSITION_LIMITS, 1),), "lowest position, from home", is_place=True),
+    "highest": LimitRow(((cia402.POSITION_LIMITS, 2),), "highest position, from home", is_place=True),
+}
+
+
+def limits_of(target: Target) -> dict[str, list[Entry]]:
+    """Return the limits that a drive has, by name, with the objects that have each."""
+    roles, dictionary = target.device.roles, target.device.new_dictionary()
+    found = {}
+    for name, row in LIMITS.items():
+        keys = [roles.get(one) if isinstance(one, Role) else one for one in row.objects]
+        if entries := [dictionary.find(key) for key in keys if key is not None and dictionary.has(key)]:
+            found[name] = entries
+    return found
+
+
+def write_limits(target: Target, wanted: Mapping[str, str], *, places: bool) -> list[str]:
+    """Write limits that are given as texts, and return the values of each object, before and now, in words.
+
+    Args:
+        target: The drives.
+        wanted: By name; those of the other kind are left out.
+        places: Whether those that count from home are meant.
+
+    Raises:
+        ValueError: For a limit that the drive does not have, or a text that does not fit it, before anything is
+            written.
+    """
+    drives, there = target.drives, limits_of(target)
+    if unknown := next((name for name in wanted if name not in there), None):
+        raise ValueError(f"there is no limit {unknown!r}: a {target.device.name} has {', '.join(there)}")
+    scales = quantities.scales_of(drives, target.device.new_dictionary())
+    rows = []
+    for entry, text in (
+        (one, wanted[name]) for name in wanted for one in there[name] if LIMITS[name].is_place == places
+    ):
+        raw = quantities.integers(text, entry, scales)
+        for one in raw.tolist():
+            check_limits(entry, one)
+        rows.append((entry, raw))
+    told = []
+    for entry, raw in rows:
+        before = drives.read((entry.index, entry.sub))
+        drives.write((entry.index, entry.sub), raw)
+        then, now = (
+            quantities.show(int(x[0]), entry, scales[0]) for x in (before, drives.read((entry.index, entry.sub)))
+        )
+        told.append(f"{entry.label} is {now}, and was {then}")
+    return told
+
+
+def check_limits_of_motor(target: Target) -> list[str]:
+    """Return how limits protect the axes, in words.
+
+    Raises:
+        ValueError: For a current limit beyond the motor's, or a quick stop without a deceleration.
+    """
+    drives, motor, told = target.drives, target.motor, []
+    if Role.CURRENT_LIMIT in target.device.roles:
+        current, most = float(read_current_limit(drives).max()), PEAK * motor.rated_current
+        if current > most:
+            raise ValueError(
+                f"the current limit is {current:.3g} A, and {PEAK:g} times the rated current of {motor.name} are "
+                f"{most:.3g} A; give a lower limit `current`"
+            )
+        told.append(f"current limit {current:.3g} A; rated current of the motor {motor.rated_current:.3g} A")
+    dictionary, speed = target.device.new_dictionary(), target.speed / (2.0 * math.pi)
+    entry, raw = dictionary.find(cia402.QUICK_STOP_DECELERATION), drives.read(cia402.QUICK_STOP_DECELERATION)
+    ramps = quantities.in_unit(raw, entry, "rev/s^2", quantities.scales_of(drives, dictionary))
+    for axis, ramp in zip(target.axis_numbers, ramps.tolist(), strict=True):
+        if not ramp > 0.0:
+            raise ValueError(f"axis {axis}: 6085h is 0, so its quick stop has no ramp; give the limit `quick-stop`")
+        told.append(f"axis {axis}: a quick stop from {60.0 * speed:.0f} rpm takes {speed**2 / (2.0 * ramp):.3g} turns")
+    return told
+
+
+def check_place_of_axes(target: Target) -> None:
+    """Raise ValueError for an axis that stands outside of the drive's limits of position."""
+    low, high = (cia402.POSITION_LIMITS, 1), (cia402.POSITION_LIMITS, 2)
+    if not target.device.new_dictionary().has(low):
+        return
+    least, most, here = (target.drives.read(key) for key in (low, high, cia402.POSITION_ACTUAL))
+    for axis, a, b, x in zip(target.axis_numbers, least.tolist(), most.tolist(), here.tolist(), strict=True):
+        if a < b and not a <= x <= b:
+            raise ValueError(
+                f"axis {axis} stands at {x}, outside of {a} to {b} (607Dh): give `lowest` and `highest` from home, so "
+                "that it stands between them"
+            )

@@ -1,0 +1,40 @@
+"""The first experiments of an identification alone: the check of the wiring, and at most the current pulses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mechanics.arrays import Mask
+from tuning.identify.experiments import Experiments
+from tuning.identify.identified_axis import Progress
+from tuning.identify.working_state import Working
+from tuning.target import Target
+
+
+class FirstExperiments(Experiments):
+    """The first experiments, of all axes.
+
+    Args:
+        target, progress: As `identify` takes them.
+        pulses: Whether resistance and inductance are identified, too; otherwise no torque is commanded.
+
+    Attributes:
+        good: Of which axes torque may be commanded, (num_axes,).
+    """
+
+    thorough = False
+
+    def __init__(self, target: Target, progress: Progress, *, pulses: bool) -> None:
+        super().__init__(target, np.ones(target.num_axes, bool), progress)
+        self.good: Mask = np.zeros(target.num_axes, bool)
+        self._pulses = pulses
+
+    def check(self, working: Working) -> Mask:
+        """Check the encoders."""
+        self.good = super().check(working)
+        return self.good
+
+    def turn(self, working: Working) -> None:
+        """Identify the windings, or nothing."""
+        if self._pulses:
+            self.pulse_currents(working)

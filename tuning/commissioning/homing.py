@@ -1,0 +1,174 @@
+"""The step of a commissioning that finds home by a method of the drive, and brings the axis back to where it stood."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drive_env import cia402, motion
+from drive_env.cia402 import Key
+from drive_env.devices.commissioning import HOMING_SPEED, ROTORS, SLOW_SPEED, TORQUE
+from drive_env.dictionary.homing_methods import HERE, method_text
+from drive_env.drives.homing import ACCELERATION, EDGE, SEARCH, methods_of, missing_speeds
+from drive_env.drives.interface import Drives, Observer
+from drive_env.drives.observed import ObservedDrives
+from drive_env.drives.speeds import per_increment
+from drive_env.fieldbus.description import describe
+from drive_env.trials.positioning import wrapped
+from mechanics.arrays import Floats, Mask
+from tuning.commissioning.axis_limits import LIMITS
+from tuning.identify.working_state import ALIGNMENT_TIME, is_aligning
+
+if TYPE_CHECKING:
+    from drive_env.drives.trace import Trace
+    from drive_env.fieldbus.description import Description
+    from tuning.commissioning.bench import CommissioningBench
+    from tuning.target import Target
+
+HOMING_OBJECTS: tuple[Key, ...] = ((cia402.HOMING_METHOD, 0), SEARCH, EDGE, ACCELERATION)
+LONGEST = 60.0  # s
+FASTEST, NOISE = 4.0, 0.002  # a sample farther away than so many times the homing speed, and turns, has another zero
+MOVED = 0.01  # turns from where the axis stood, from which on it is brought back
+READY = 0.05  # s at rest before and after: samples are mapped before an axis is enabled
+
+
+class WayWatch(Observer):
+    """Adds up how far rotors go while the zero of their positions changes.
+
+    Args:
+        speeds: That are not exceeded [inc/s], (num_axes,).
+        noise: By which samples at rest may differ [inc], likewise.
+
+    Attributes:
+        way: So far [inc], likewise.
+    """
+
+    objects = (cia402.POSITION_ACTUAL,)
+
+    def __init__(self, speeds: Floats, noise: Floats) -> None:
+        self.way = np.zeros(len(speeds))
+        self._speeds, self._noise = speeds, noise
+        self._last: Any = None
+        self._at = 0.0
+
+    def passed(self, below: Drives, duration: float, trace: Trace, asked: Any, play: Any) -> None:
+        """Take what was sampled; on a bus in real time there may be a gap before it."""
+        rows, now = np.asarray(trace[cia402.POSITION_ACTUAL], float), time.monotonic()
+        spans = np.full((len(rows), 1), duration / len(rows))
+        if self._last is not None:
+            spans[0] += 0.0 if below.time_waits else max(now - duration - self._at, 0.0)
+            rows = np.vstack([self._last, rows])
+        steps = wrapped(np.diff(rows, axis=0))
+        is_way = np.abs(steps) <= self._speeds * spans[-len(steps) :] + self._noise
+        self.way += np.where(is_way, steps, 0.0).sum(axis=0)
+        self._last, self._at = rows[-1], now
+
+
+def unfit_for_homing(target: Target) -> str:
+    """Return why axes are not homed here; "" where they can be."""
+    if not target.device.new_dictionary().has(cia402.HOMING_METHOD):
+        return "the drive has no homing: it lacks 6098h"
+    return "the axes pull at one thing: none is homed without the others" if target.linked else ""
+
+
+def offered_methods(target: Target) -> dict[int, str]:
+    """Return the homing methods that the drives have, each with what it does."""
+    known = _description(target)
+    return {number: method_text(number, is_known=True) for number in methods_of(target.drives, known, 0)}
+
+
+def no_method(target: Target) -> str:
+    """Return that no method is chosen, and those that there are, in words."""
+    listed = "; ".join(f"{number}: {text}" for number, text in offered_methods(target).items())
+    return f"no homing method is chosen (6098h is 0); those of the drive are {listed}"
+
+
+def has_no_method(bench: CommissioningBench) -> bool:
+    """Return whether homing needs the choice of a method first."""
+    chosen = bench.plan.method is not None or bool(bench.target.drives.read(cia402.HOMING_METHOD).any())
+    return not chosen and not any(LIMITS[name].is_place for name in bench.plan.limits)
+
+
+def home_axes(bench: CommissioningBench) -> list[str]:
+    """Home the axes one after the other, and bring each back to where it stood; return the results, in lines.
+
+    Raises:
+        ValueError: For a method that the drive does not have.
+        RuntimeError, TimeoutError: If no method is chosen, or an axis does not attain home.
+    """
+    target, drives = bench.target, bench.target.drives
+    own, wanted, there = drives.read(cia402.HOMING_METHOD), bench.plan.method, offered_methods(target)
+    if wanted is None and not own.any():
+        if has_no_method(bench):
+            raise RuntimeError(f"{no_method(target)}. Choose one that fits the machine's switches, or leave homing out")
+        return ["not homed: no method is chosen (6098h is 0), so positions count from where they do now"]
+    if wanted is not None and wanted not in there:
+        raise ValueError(f"homing method {wanted}: the drive has {', '.join(map(str, there))}")
+    if wanted is not None:
+        drives.write(cia402.HOMING_METHOD, wanted)
+    lines = []
+    for axis, method in enumerate(drives.read(cia402.HOMING_METHOD).tolist()):
+        if method:
+            lines += _give_speeds(target, axis, method)
+            lines.append(_home(bench, axis, method))
+    return lines
+
+
+def _give_speeds(target: Target, axis: int, method: int) -> list[str]:
+    """Write the speeds and the acceleration that a method needs where they are 0, by the motor's rated ones."""
+    drives, motor = target.drives, target.motor
+    values = {
+        SEARCH: HOMING_SPEED * motor.rated_speed,
+        EDGE: SLOW_SPEED * motor.rated_speed,
+        ACCELERATION: TORQUE * motor.rated_torque / (ROTORS * motor.inertia),
+    }
+    lines = []
+    for key in missing_speeds(drives, _description(target), axis, method):
+        raw = np.rint(values[key] * target.increments() * per_increment(drives, key)).astype(np.int64)
+        drives.write(key, raw, where=_only(target, axis))
+        lines.append(f"{key[0]:04X}h:{key[1]:02X} is {raw[axis]}, and was 0")
+    return lines
+
+
+def _home(bench: CommissioningBench, axis: int, method: int) -> str:
+    """Home an axis, bring it back to where it stood, and switch it off."""
+    target, where = bench.target, _only(bench.target, axis)
+    turn = 2.0 * np.pi * target.increments()
+    speeds = target.drives.read(SEARCH) / per_increment(target.drives, SEARCH)
+    watch = WayWatch(FASTEST * np.asarray(speeds, float), NOISE * turn)
+    drives = ObservedDrives(target.drives, watch)
+    drives.advance(READY)
+    motion.enable(drives, mode="hm", where=where)
+    _settle(target, drives, where)  # home is where it then stands
+    motion.home(drives, where=where, timeout=LONGEST)
+    _settle(target, drives, where)
+    way, at = np.where(where, watch.way, 0.0), int(drives.read(cia402.POSITION_ACTUAL)[axis]) / turn[axis]
+    bench.note_way(watch.way / target.increments())
+    told = f"axis {target.axis_numbers[axis]}: home by method {method}: {method_text(method, is_known=True)}"
+    if method in HERE or abs(way[axis]) < MOVED * turn[axis]:
+        motion.disable(drives, where=where)
+        return f"{told}; it stands at {at:.4g} rev"
+    motion.select_mode(drives, "pp", where)
+    motion.move_to(drives, np.rint(-way).astype(np.int64), relative=True, where=where, timeout=LONGEST)
+    _settle(target, drives, where)
+    motion.disable(drives, where=where)
+    return f"{told}; that is {way[axis] / turn[axis]:.4g} turns from where it stood, and it is back there"
+
+
+def _settle(target: Target, drives: Drives, where: Mask) -> None:
+    """Let an axis come to rest, and its encoder be aligned, which some drives do when they are enabled first."""
+    drives.advance(READY)
+    waited = 0.0
+    while waited < ALIGNMENT_TIME and (np.any(where & is_aligning(target)) or motion.is_turning(drives, where, READY)):
+        drives.advance(READY)
+        waited += 2.0 * READY
+
+
+def _only(target: Target, axis: int) -> Mask:
+    return np.asarray(np.arange(target.num_axes) == axis)
+
+
+def _description(target: Target) -> Description:
+    return describe(target.device.name, None)
