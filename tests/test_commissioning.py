@@ -290,6 +290,15 @@ def test_over_can_it_asks_before_the_motor_turns_and_restores_what_it_wrote(tmp_
         assert settings_of(drives) == before and is_off(drives)
 
 
+def test_a_method_that_the_drive_does_not_have_is_refused_before_anything_moves(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with served() as (_, drives, channel, _):
+        before = settings_of(drives)
+        found = commission(channel, "--yes", "--method", "99")
+        assert found.exit_code == 2 and "homing method 99: the drive has 17, 18, 19, 21, 35" in found.stderr
+        assert found.stdout == "" and settings_of(drives) == before and not (tmp_path / "runs").exists()
+
+
 def test_a_failed_step_over_can_leaves_the_drive_as_it_was_found(tmp_path, monkeypatch):
     """Also where positions were turned round under limits of travel (2080h:01), and the axis was homed."""
     monkeypatch.chdir(tmp_path)

@@ -89,6 +89,7 @@ def commission(
     """
     with errors_as_exit_codes():
         from tuning.commissioning.bench import CommissioningPlan
+        from tuning.commissioning.homing import check_method
         from tuning.commissioning.path import BEFORE, CommissioningPath
         from tuning.runs import provenance
         from tuning.way_back import way_back
@@ -100,16 +101,15 @@ def commission(
         provenance.check_folder(folder)
         if dry_run:
             with drive.open_to_read() as target:
+                check_method(target, method)
                 _tell_plan(target, chosen, json)
             return
         file = folder / BEFORE if drive.bus else None
         drive.check()
-        with (
-            way_back(file, "drive-tune"),
-            open_target(drive) as target,
-            CommissioningPath(target, plan, folder) as path,
-        ):
-            _walk(path, chosen, yes=drive.yes, quiet=json)
+        with way_back(file, "drive-tune"), open_target(drive) as target:
+            check_method(target, method)
+            with CommissioningPath(target, plan, folder) as path:
+                _walk(path, chosen, yes=drive.yes, quiet=json)
         if json:
             rows = {name: {"state": one.state, "lines": one.lines} for name, one in path.states.items()}
             print_json({"steps": rows, "kept": path.is_kept, "before": str(path.file)})

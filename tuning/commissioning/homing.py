@@ -73,6 +73,12 @@ def unfit_for_homing(target: Target) -> str:
     return "the axes pull at one thing: none is homed without the others" if target.linked else ""
 
 
+def check_method(target: Target, method: int | None) -> None:
+    """Raise ValueError for a homing method that the drives do not have; None is the drive's own."""
+    if method is not None and method not in (there := offered_methods(target)):
+        raise ValueError(f"homing method {method}: the drive has {', '.join(map(str, there)) or 'none'}")
+
+
 def offered_methods(target: Target) -> dict[int, str]:
     """Return the homing methods that the drives have, each with what it does."""
     known = _description(target)
@@ -99,13 +105,12 @@ def home_axes(bench: CommissioningBench) -> list[str]:
         RuntimeError, TimeoutError: If no method is chosen, or an axis does not attain home.
     """
     target, drives = bench.target, bench.target.drives
-    own, wanted, there = drives.read(cia402.HOMING_METHOD), bench.plan.method, offered_methods(target)
+    own, wanted = drives.read(cia402.HOMING_METHOD), bench.plan.method
     if wanted is None and not own.any():
         if has_no_method(bench):
             raise RuntimeError(f"{no_method(target)}. Choose one that fits the machine's switches, or leave homing out")
         return ["not homed: no method is chosen (6098h is 0), so positions count from where they do now"]
-    if wanted is not None and wanted not in there:
-        raise ValueError(f"homing method {wanted}: the drive has {', '.join(map(str, there))}")
+    check_method(target, wanted)
     if wanted is not None:
         drives.write(cia402.HOMING_METHOD, wanted)
     lines = []
