@@ -73,6 +73,19 @@ def test_a_stepper_in_a_loop_is_commissioned(tmp_path):
     assert [axis.verdict == "rejected" for axis in result.axes] == [False] * drives.num_axes, result.axes
 
 
+@pytest.mark.slow
+def test_the_path_of_commission_ends_with_the_certificate_of_one_axis_of_a_module(tmp_path):
+    """The other axes have the objects that masters change alone saved, of those that the module has on EtherCAT."""
+    with served("tmcm3313") as (port, drives):
+        bus = ["--device", "tmcm3313", "--interface", "ethercat-udp", "--channel", port, "--node", "0", "--lockstep"]
+        more = ["--axis", "0", "--travel", "-5:5", "--method", "35", "--yes", "--out", str(tmp_path / "x")]
+        done = CliRunner().invoke(app, ["commission", *bus, *more])
+        drives.advance(0.1)
+        assert not drives.inside.records["stage_on"].any()
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "x" / "stepper-certificate.json").is_file()
+
+
 # --- in real time -----------------------------------------------------------------------------------------------------
 # Beside other programs nothing is in time; where this system lets them, these go first.
 FIRST = ["chrt", "-f", "10"] if shutil.which("chrt") and hasattr(os, "geteuid") and os.geteuid() == 0 else []

@@ -32,9 +32,7 @@ from drive_env.master.parameters import (
     check_at_rest,
     check_no_commands,
     compare,
-    parameters,
     read_parameters,
-    read_these,
     restorable,
     write_all_or_none,
 )
@@ -47,6 +45,7 @@ from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.entries import Entry
     from drive_env.drives.interface import BusSide, DescribedAxes
     from tuning.target import Target
 
@@ -159,14 +158,14 @@ def _borrowed(drives: Drives) -> dict[int, dict[Key, int]]:
     if bus is None:
         return {}
     known, others = bus.description, bus.description.of_further_axes()
-    keys = [
-        (entry.index, entry.sub)
-        for entry in parameters(bus)
-        if (entry.index < DEVICE_OBJECTS or entry.index == cia402.ABORT_CONNECTION_OPTION)
-        and (entry.index, entry.sub) not in others
-        and known.key(entry, 1) != (entry.index, entry.sub)
-    ]
-    return {axis: read_these(bus, keys, axis) for axis in range(bus.num_axes) if axis not in set(drives.axis_numbers)}
+
+    def is_borrowed(entry: Entry) -> bool:
+        key = entry.index, entry.sub
+        is_masters = entry.index < DEVICE_OBJECTS or entry.index == cia402.ABORT_CONNECTION_OPTION
+        return is_masters and key not in others and known.key(entry, 1) != key
+
+    left_out = [axis for axis in range(bus.num_axes) if axis not in set(drives.axis_numbers)]
+    return {axis: read_parameters(bus, axis, is_borrowed) for axis in left_out}
 
 
 def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:

@@ -6,7 +6,7 @@ A parameter is what stays: settings, not commands, not services. PDOs are remapp
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env import cia402
@@ -87,10 +87,12 @@ def parameters(drives: DescribedAxes) -> list[Entry]:
     ]
 
 
-def read_parameters(drives: DescribedAxes, axis: int = 0) -> dict[Key, int]:
-    """Return all parameters of an axis that the drive has; what it refuses to show is left out."""
+def read_parameters(
+    drives: DescribedAxes, axis: int = 0, chosen: Callable[[Entry], bool] = lambda entry: True
+) -> dict[Key, int]:
+    """Return the chosen parameters of an axis that the drive has; what it refuses to show is left out."""
     found = {}
-    for entry in parameters(drives):
+    for entry in filter(chosen, parameters(drives)):
         with contextlib.suppress(ObjectAccessError):
             found[entry.index, entry.sub] = int(drives.read_axis(entry, axis))
     return found
