@@ -101,6 +101,7 @@ VALUES: dict[str, str] = {
     "position": "1 rev", "drive-env move out": "new.csv", "workspace": "machine.toml",
     "pcap": "new.pcap", "trigger": "6041>0", "by": "1", "drive-env frames replay speed": "2", "max_current": "1 A",
     "identity": "286:1:1:1", "loop": "velocity", "signal": "multisine", "rule": "simc",
+    "limit": "current=1 A", "drive-tune commission step": "motor", "drive-tune commission skip": "tune",
     "sampler": "tpe", "objectives": "cost", "gains": "velocity_p", "axes": "apart", "travel": "-1:1",
     "cluster": "tcp://127.0.0.1:1", "against": "emulator", "sensor": "module:function", "listen": "127.0.0.1",
     "token": "12345678", "minari": "drives/tracking-v0", "fault": "encoder_stuck at=2",

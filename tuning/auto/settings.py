@@ -59,7 +59,7 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
 
 
 def ignore_unwired_switches(target: Target, where: Mask) -> Mask:
-    """Have axes ignore limit switches that are both active, as none that are connected are; return which they are."""
+    """Ignore the limit switches of axes where both are active, since they are not connected then; return these axes."""
     if Role.LIMIT_SWITCHES not in target.device.roles:
         return np.zeros_like(where)
     unwired: Mask = where & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)

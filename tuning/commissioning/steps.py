@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -275,9 +275,8 @@ def _beside(title: str, estimate: Estimate, sheet: float) -> str:
     return told
 
 
-def _gains(gains: object) -> str:
-    values = gains.values() if isinstance(gains, dict) else gains
-    return ", ".join(map(str, values))  # type: ignore[call-overload]
+def _gains(gains: Mapping[str, int] | Sequence[int]) -> str:
+    return ", ".join(map(str, gains.values() if isinstance(gains, Mapping) else gains))
 
 
 def _figures(found: Margins) -> str:
