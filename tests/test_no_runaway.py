@@ -2,7 +2,7 @@
 
 Where a master may refuse or stop in time, both will do; what counts is where the rotor was and how it ended. Numbers of
 the verdict are those of rigs/fault_injection.py: travel of 3 turns either way, a drive that notices its master's death
-after 0.1 s, half of the commissioned deceleration.
+after 0.3 s, half of the commissioned deceleration.
 """
 
 from __future__ import annotations
@@ -296,6 +296,23 @@ def test_a_stop_from_another_thread_while_nothing_is_enabled_does_nothing(emulat
         assert error is None
         ended_well(world)
         turned(world, SLOW)
+
+
+def test_what_is_read_before_the_first_enable_may_take_longer_than_the_drive_waits_for_its_master(emulated):
+    with bench(emulated) as (world, bus):
+        passed = []  # when 1016h was set, and when the first controlword went out [s]
+
+        def slow_answers(_, message):
+            if download(message, (0x1016, 0x6040)[min(len(passed), 1)]):
+                passed.append(time.monotonic())
+            if message.arbitration_id == 0x581 and len(passed) < 2:
+                time.sleep(0.02)
+
+        bus.meets = slow_answers
+        error = run(bus, lambda drives: turn_at(drives, SLOW), safety=Limits())
+        assert len(passed) >= 2, error
+        assert passed[1] - passed[0] > Limits().silence  # or nothing is shown
+        ended_well(world)
 
 
 @pytest.mark.every(2)

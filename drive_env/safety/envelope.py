@@ -552,6 +552,7 @@ class Envelope:
         try:
             if not self._drives.is_dry:
                 self._watchdogs.set()
+            self._watch.begin()
             self._lend()
             self._watch.first_look()
         except BaseException:
@@ -561,7 +562,6 @@ class Envelope:
             self._end_watching()
             raise
         self._axes.is_armed = True
-        self._watch.begin()
         signals.guard(self)
 
     def _lend(self) -> None:

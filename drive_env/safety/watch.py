@@ -83,6 +83,7 @@ class Watch:
         self._judging = Judging(self._known, axes, limits, self.modes, stops.stop_for, gate)
         self.looks = Looks(drives, axes, limits, self._observe_axis)
         self._supervisor: Supervisor | None = None
+        self._has_seen_all = False  # and the supervisor looks, too; before, it only keeps the watchdogs quiet
         self._missed = 0
         self._alive = time.monotonic()
         self._pending: SafetyError | None = None  # to be raised in the program's thread
@@ -97,7 +98,11 @@ class Watch:
         return self._supervisor is not None
 
     def begin(self) -> None:
-        """Start the thread, unless it runs, or time waits for the program."""
+        """Start the thread, unless it runs, or time waits for the program.
+
+        Until `first_look` has seen every axis it only keeps the watchdogs quiet: what is read and configured before
+        takes longer on a slow bus than a drive waits for its master.
+        """
         if not self._drives.time_waits and self._supervisor is None:
             self._missed = 0
             self.alive()
@@ -109,7 +114,7 @@ class Watch:
         if self._supervisor is not None:
             self._supervisor.close()
             self._supervisor = None
-        self._axes.is_armed = False
+        self._axes.is_armed = self._has_seen_all = False
         self._stops.current = None
         self._watchdogs.end()
         self._told_at = -math.inf
@@ -171,8 +176,12 @@ class Watch:
 
     def first_look(self) -> None:
         """See every axis once, or raise SafetyError: an axis that cannot be seen is not moved."""
-        if self._drives.is_dry:
-            return
+        if not self._drives.is_dry:
+            self._see_all()
+        self.alive()
+        self._has_seen_all = True
+
+    def _see_all(self) -> None:
         has = self._drives.description.has
         needed = ((has(POSITION) or has(VL_VELOCITY), "6064h"), (has(STATUSWORD), "6041h"))
         missing = [label for is_there, label in needed if not is_there]
@@ -301,14 +310,8 @@ class Watch:
             BusError: If the bus failed in one of them; the others are done all the same.
         """
         failure: BusError | None = None
-        for act in (
-            self._watchdogs.keep,
-            self._obey_signal,
-            self._stops.hold,
-            self._look,
-            self._go_on_stopping,
-            self._look_after,
-        ):
+        looks = (self._obey_signal, self._stops.hold, self._look, self._go_on_stopping, self._look_after)
+        for act in (self._watchdogs.keep, *(looks if self._has_seen_all else ())):
             try:
                 act()
             except SafetyError as error:

@@ -43,7 +43,7 @@ TURN = 65536  # increments
 RADIANS = 2.0 * np.pi / TURN
 
 # --- the numbers of the verdict -----------------------------------------------------------------------------------
-SILENCE = 0.1  # after which a drive must have noticed that its master died [s]
+SILENCE = 0.3  # after which a drive must have noticed that its master died [s]; a busy computer holds a heartbeat up
 TRAVEL = (-3 * TURN, 3 * TURN)
 LIMITS = Limits(position=TRAVEL, silence=SILENCE)
 # Half of what the commissioned drives decelerate with (6085h = 1000 turns/s^2): tracking of the ramp is not perfect.
