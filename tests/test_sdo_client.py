@@ -178,6 +178,17 @@ def test_an_answer_that_came_while_the_thread_slept_counts(made):
     assert len(frames(line)) == 1
 
 
+def test_a_node_that_missed_our_heartbeats_is_named_as_the_cause_until_it_answers(made):
+    line, client = made()
+    client.may_be_stopped()
+    with pytest.raises(NoAnswerError, match=r"node 5 did not answer .* missed this program's heartbeats \(8130h\)"):
+        client.write(0x6040, 0, b"\x0f\x00", "Controlword", 0.5)
+    line.answers.append([IS_0237])
+    client.read(0x6041, 0, "Statusword", 0.5)
+    with pytest.raises(NoAnswerError, match="check power"):
+        client.write(0x6040, 0, b"\x0f\x00", "Controlword", 0.5)
+
+
 def test_a_node_that_boots_ends_the_transfer_at_once(made):
     line, client = made()
     line.answers.extend([[client.forget], [client.forget]])

@@ -68,6 +68,7 @@ class CanLink:
             for client in clients:
                 client.is_new = True
             self._network.on_boot = lambda node: clients[self.nodes.index(node)].forget()
+            self._network.on_heartbeats_missed = lambda node: clients[self.nodes.index(node)].may_be_stopped()
             self._clients += clients
         borrowed = BorrowedIdentifiers(port, self.nodes, description.num_axes)
         pdos = [PdoConfiguration(*one, description, borrowed) for one in zip(self.nodes, self._clients, strict=True)]

@@ -14,6 +14,7 @@ from drive_env.master.can.port import Port
 START, PRE_OPERATIONAL, RESET_NODE = 0x01, 0x80, 0x81  # NMT commands (CiA 301, 7.2.8.3.1)
 BOOT_UP = 0x00  # in an error control message
 BOOT_TIMEOUT = 5.0  # from a reset to the boot-up message [s]
+HEARTBEATS_MISSED = 0x8130  # emergency code (CiA 301, table 26)
 MAX_NODE = 127
 _EMCY_LAYOUT = struct.Struct("<HB5s")
 
@@ -34,6 +35,7 @@ class Network:
         self._resets = False
         self.on_boot: Callable[[int], None] = lambda node: None
         self.on_restart: Callable[[int], None] = lambda node: None  # of a node that booted without our reset
+        self.on_heartbeats_missed: Callable[[int], None] = lambda node: None  # which may have stopped it
         self.on_error_control: Callable[[int, bytes], None] | None = None
         for node in self._nodes:
             port.subscribe(EMCY + node, partial(self._on_emergency, node))
@@ -83,6 +85,8 @@ class Network:
         if len(data) == 8:
             code, register, extra = _EMCY_LAYOUT.unpack(data)
             self._emergencies.append(ReceivedEmergency(node, code, register, tuple(extra)))
+            if code == HEARTBEATS_MISSED:
+                self.on_heartbeats_missed(node)
 
     def _on_error_control(self, node: int, data: bytes) -> None:
         if self.on_error_control is not None:

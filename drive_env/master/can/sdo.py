@@ -56,6 +56,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._node = node
         self._alive = alive
         self._answers: list[bytes] = []
+        self._may_be_stopped = False  # by missed heartbeats, and has not answered since
         self._has_booted: bool  # since the transfer under way began
         self._has_blocks = True  # as far as is known
         self._in_block = False  # every frame is of the block transfer under way
@@ -131,6 +132,10 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         """End the transfer that is under way: the node has booted, and knows nothing of it."""
         self._has_booted = True
 
+    def may_be_stopped(self) -> None:
+        """Note that the node missed this master's heartbeats: where that stops it, it answers no SDO."""
+        self._may_be_stopped = True
+
     def check_alone(self) -> None:
         """Raise BusError where two nodes have answered under this node-ID."""
         self._port.drain()
@@ -180,6 +185,11 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                 raise NoAnswerError(
                     f"{where} has restarted during {what}; check its power, and for another master that resets it"
                 ) from None
+            if self._may_be_stopped:
+                raise NoAnswerError(
+                    f"{where} did not answer {what} within {timeout:g} s: it missed this program's heartbeats (8130h) "
+                    "and is stopped; run fewer programs beside this one, or have it wait longer: Limits(silence=...)"
+                ) from None
             raise NoAnswerError(
                 f"{where} did not answer {what} within {timeout:g} s; check power, bit rate and node-ID "
                 "(`drive-env scan`), and that the node is not stopped; a slow object takes a longer --timeout "
@@ -190,7 +200,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         """Note that a transfer had its answer, unless that of the one before may be late."""
         if not self._has_retried:
             self._recent.append(self._object)
-        self._has_retried = False
+        self._has_retried = self._may_be_stopped = False
 
     def _read(self, index: int, sub: int) -> bytes:
         """Read short values in segments, and in blocks those that the server says to be long."""
