@@ -263,7 +263,7 @@ def life(drives):
     assert drives.emergencies() == []
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("quirks", QUIRKS.values(), ids=QUIRKS)
 def test_motion_copes_with_each_quirk(tmp_path, quirks):
     with build(tmp_path, **quirks) as drives:

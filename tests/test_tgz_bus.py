@@ -507,6 +507,7 @@ def sessions(inside):
     return {"pp_move": pp_move, "pv_run": pv_run, "taken_over": taken_over}
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(inside, kind):
     session = sessions(inside)["taken_over"]
