@@ -146,6 +146,7 @@ def csp(drives):
     yield watch(drives, 0.03)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("safety", [True, False])
 @pytest.mark.parametrize("script", [pp, pv, csp])
 def test_the_same_script_gives_the_same_integers_over_the_bus(inside, script, safety):
