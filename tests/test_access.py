@@ -401,6 +401,7 @@ def test_what_is_encoded_is_rounded_and_saturates(unit, value):
         assert raw == -1000
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(data=st.data())

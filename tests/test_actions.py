@@ -38,6 +38,7 @@ class Watched:
         return counted
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("value", NO_NUMBERS)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_drives_of_a_bus_are_told_nothing(name, value):

@@ -92,7 +92,7 @@ def is_disabled(drives):
 
 
 # --- on drives --------------------------------------------------------------------------------------------------------
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @wrong_policies
 def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
     world = World(lockstep=True)

@@ -69,6 +69,7 @@ def dry_run(channel, *more):
     return result
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("by", ["design", "agent", "rule", "tpe"])
 def test_the_drive_is_read_and_nothing_else(by):
     with served() as (world, _, channel, frames):
@@ -132,6 +133,7 @@ def turn(drives):
     drives.write(0x6040, 0)  # and it coasts
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("prepare", "line"),
     [

@@ -263,7 +263,7 @@ def test_worker_processes_change_no_score(benchmark, tmp_path):
 SHIPPED = hyperparameters.FOLDER
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("task", TASKS)
 def test_the_hyperparameters_that_ship_train_on_every_task(task, tmp_path, monkeypatch):
     monkeypatch.setattr(hyperparameters, "FOLDER", SHIPPED)

@@ -21,6 +21,7 @@ FIND = SIX.dictionary.find
 STATUS, POSITION, SPEED, DEMAND, TARGET = (FIND(index) for index in (0x6041, 0x6064, 0x606C, 0x6062, 0x607A))
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("length", range(9))
 def test_a_frame_has_bits_between_those_of_the_formulas(length):
     """With all stuff bits that there may be, and without any; the shortest of 2,000 comes near."""

@@ -200,13 +200,13 @@ def fuzz(seed, count, device="tmcm1636", axes=1):
 
 # A machine whose drive is set up at random may leave physics; the node goes on.
 @pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
-def test_50000_frames():
-    fuzz(1, 50_000)
+def test_10000_frames():
+    fuzz(1, 10_000)
 
 
 @pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
 @pytest.mark.parametrize(
-    ("device", "axes", "count"), [("tmcm6212", 6, 10_000), ("tgz_d", 2, 5_000), ("tmcm3313", 3, 5_000)]
+    ("device", "axes", "count"), [("tmcm6212", 6, 3_000), ("tgz_d", 2, 3_000), ("tmcm3313", 3, 3_000)]
 )
 def test_frames_for_a_node_of_several_axes(device, axes, count):
     fuzz(12, count, device, axes)

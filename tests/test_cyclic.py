@@ -114,6 +114,7 @@ def test_csp_demand_is_the_line_between_set_points_one_period_late_and_the_axis_
     assert (trace[0x6041] & (FOLLOWS | REACHED | FOLLOWING_ERROR) == FOLLOWS).all()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("period", PERIODS)
 def test_csv_demand_is_the_line_between_set_points_one_period_late_and_the_axis_follows(drives, shape, period):

@@ -79,6 +79,7 @@ def test_a_mode_that_needs_a_halt_waits_for_rest_and_bit_8(tmp_path):
         assert one(drives, 0x6061) == PP
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("bit", [4, 9, 10, 14])
 def test_a_bit_that_is_absent_never_comes(tmp_path, bit):
     """Bits of a move of pp that others show: supply, remote, target reached, motor turns."""
@@ -263,7 +264,7 @@ def life(drives):
     assert drives.emergencies() == []
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("quirks", QUIRKS.values(), ids=QUIRKS)
 def test_motion_copes_with_each_quirk(tmp_path, quirks):
     with build(tmp_path, **quirks) as drives:

@@ -128,6 +128,7 @@ def test_a_mode_of_a_position_that_an_axis_cannot_come_to_rest_in_is_not_taken()
         assert int(emulated.read(0x6061)[0]) == 9
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("cycles", [0, 10, 60])
 def test_homing_begins_from_rest(emulated, cycles):
     """On its way back to a far set-point an axis was faster than homing ever is: its stop ended 5.4 turns outside."""

@@ -1,19 +1,16 @@
 """A fault at frame k of a session: the rotor ends at rest, disabled, inside its travel plus the stopping distance.
 
-Every k in the slow run (with FAULT_STRIDE=40 every fortieth), a sample in every run.
+Every k in the slow run (with FAULT_STRIDE=40 every fortieth, from FAULT_FIRST on), a sample in every run.
 The verdict is the emulator's inside alone (tests/rigs/fault_injection.py).
 """
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
 import os
 import random
 import signal
 import struct
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
@@ -44,10 +41,9 @@ from rigs.fault_injection import (
 )
 
 from drive_env import EmulatedDrives
-from drive_env.cores import usable_cores
 
-# Every frame takes a quarter of an hour on two cores, every twentieth a minute.
-STRIDE = int(os.environ.get("FAULT_STRIDE", "1"))
+# Every frame takes a quarter of an hour on two cores, every twentieth a minute. FAULT_FIRST: the first one.
+STRIDE, FIRST = (int(os.environ.get(f"FAULT_{name}", least)) for name, least in (("STRIDE", "1"), ("FIRST", "0")))
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGKILL", "SIGSTOP")
 
 
@@ -73,34 +69,24 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert np.ptp(truth.theta()) > 0.02 * 2 * np.pi
 
 
+def worst_at(emulated, name, kind, chosen):
+    """Return the worst outcome of a session with a fault at one of the frames that `chosen` takes of their number."""
+    _, frames, _ = run_lockstep(emulated, SESSIONS[name])
+    return worst_of([(f"{kind} {k}", run_with(emulated, SESSIONS[name], kind, k)) for k in chosen(frames)])
+
+
 @pytest.mark.every(3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind):
-    _, frames, _ = run_lockstep(emulated, SESSIONS[name])
-    chosen = sample(random.Random(f"{name} {kind}"), frames, 8)
-    assert worst_of([(f"{kind} {k}", run_with(emulated, SESSIONS[name], kind, k)) for k in chosen]) == ""
-
-
-def every_frame(name, kind, first, step):
-    """Run a session with a fault at every `step`-th of its frames; return the outcomes. In a process of its own."""
-    logging.disable()
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with eds_read_once(), EmulatedDrives(load="inertia", num_threads=1) as drives:
-        _, frames, _ = run_lockstep(drives, SESSIONS[name])
-        return [(f"{kind} {k}", run_with(drives, SESSIONS[name], kind, k)) for k in range(first, frames, step)]
+    assert worst_at(emulated, name, kind, lambda frames: sample(random.Random(f"{name} {kind}"), frames, 5)) == ""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
-def test_a_fault_at_any_frame_leaves_no_axis_running(name, kind):
-    cores = usable_cores()
-    with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
-        parts = [
-            pool.submit(every_frame, name, kind, first * STRIDE, cores * STRIDE) for first in range(cores)
-        ]  # fmt: skip
-        assert worst_of([outcome for part in parts for outcome in part.result()]) == ""
+def test_a_fault_at_any_frame_leaves_no_axis_running(emulated, name, kind):
+    assert worst_at(emulated, name, kind, lambda frames: range(FIRST, frames, STRIDE)) == ""
 
 
 # --- real time: the drives' watchdogs are awake, and frame k is another one in every run -----------------------------

@@ -263,7 +263,7 @@ def test_an_axis_of_a_tgz_is_disabled_by_the_factory_s_rpdo_whatever_outputs_tra
     assert bus.plant.is_off(0)
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(12)
 @pytest.mark.parametrize(
     ("name", "entry"),
     [
@@ -288,7 +288,7 @@ def test_no_value_in_an_rpdo_voids_a_stop_before_or_behind_it(name, entry):
     bus.come_to_rest()
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("entry", [pytest.param(one, id=f"{one.index:04X}-{one.sub}") for one in received("tmcm3313")])
 def test_no_value_in_a_mapped_image_voids_a_stop_before_or_behind_it(entry):
     bus, key = Coe(plant_of("tmcm3313")), (entry.index, entry.sub)
@@ -303,6 +303,7 @@ def test_no_value_in_a_mapped_image_voids_a_stop_before_or_behind_it(entry):
         bus.come_to_rest()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("number", [n for n in SIZES if n < 0x1720], ids=lambda n: f"{n:04X}")  # with 6040h
 @pytest.mark.parametrize("name", ["tgz_d", "tgz_s"])
 def test_no_value_in_a_ready_made_image_voids_a_stop_of_either_axis(name, number):

@@ -132,6 +132,7 @@ def test_recipe_of_section_8_3_homes_a_commissioned_drive_by_a_switch_that_is_pr
 
 
 # --- table 209: from everywhere to the edge ---------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize("method", [17, 18, 19, 21])
 def test_every_method_ends_at_its_edge_from_every_region_at_rest(belt, method):
     bring(belt, STARTS)
@@ -141,6 +142,7 @@ def test_every_method_ends_at_its_edge_from_every_region_at_rest(belt, method):
     assert_homed(belt, EDGES[method])
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("direction", [-1, 1])
 @pytest.mark.parametrize("method", [17, 18, 19, 21])
 def test_every_method_ends_at_its_edge_from_every_region_while_moving(belt, method, direction):
@@ -241,7 +243,7 @@ STANDARD = [
 NUMBERS, WAYS, ENDS, LAST_WAYS = (np.array(column) for column in zip(*STANDARD, strict=True))
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("with_index", [False, True])
 @pytest.mark.parametrize("where", [-0.15, -0.0605, -0.04, -0.0195, 0.1])
 def test_each_method_of_the_standard_ends_at_its_edge_or_at_the_index_beyond_it(belt, where, with_index):

@@ -72,6 +72,7 @@ def test_a_device_without_sync_managers_has_no_image():
         Image("tmcm1636")
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("key", "owned"), [
     ((0x1C00, 0), True), ((0x1C12, 1), True), ((0x1C13, 0), True), ((0x1600, 9), True), ((0x1A00, 0), True),
     ((0x1640, 1), False), ((0x1A40, 1), False),  # of CANopen's PDOs, which have communication parameters

@@ -92,7 +92,7 @@ def test_links_have_what_is_asked_of_them(protocol, kinds):
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(8)
 @pytest.mark.parametrize("safety", [True, False], ids=["enveloped", "bare"])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_same_script_gives_the_same_integers(name, safety):

@@ -161,6 +161,7 @@ def test_it_is_judged_safe_by_its_own_columns(device):
 
 
 # --- what finds gains -------------------------------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize("rule", [*RULES])
 def test_a_rule_proposes_the_same_gains_in_its_units(device, rule):
     found, known = propose(rule, device, MOTOR, ELASTIC), propose(rule, KNOWN, MOTOR, ELASTIC)

@@ -59,6 +59,7 @@ def late(monkeypatch):
     world.close()
 
 
+@pytest.mark.slow
 def test_identification_blames_neither_encoder_nor_wiring_for_late_syncs(late):
     """It said that the field made 0.16, 0.58 or 5.23 electrical turns per turn, or that the encoder was reversed."""
     with late.open() as target:

@@ -110,6 +110,7 @@ def test_brakes_of_coupled_axes_hold_without_creep(load, force, friction):
 
 
 # --- backlash ---------------------------------------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("load", "ratio", "gap", "turns", "friction", "stiffness"),
     [  # ratio: output per rotor angle; gap as a multiple of the row's; friction that the output needs

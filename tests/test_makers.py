@@ -69,6 +69,7 @@ def mastered(path, device, **options):
 
 
 # --- limits within which an object cannot say "no limit" --------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("name", "key", "raw", "why"),
     [

@@ -153,6 +153,7 @@ def test_what_a_short_file_asks_for_has_limits(kind, tmp_path, monkeypatch):
 
 
 # --- what is compiled elsewhere is what would be compiled here --------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.parametrize("copies", [None, 8])
 @pytest.mark.parametrize("name", ["two_mass", "robot"])
 def test_a_model_comes_back_as_it_was_compiled(name, copies, tmp_path):

@@ -146,6 +146,7 @@ def facts_of(device):
     return turn, counts, modes
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", some(FIRST))
 def test_each_becomes_a_drive_that_lives(folders, name):
     folder = str(folders[name].folder)
@@ -173,6 +174,7 @@ def on_a_bus(folder):
         world.close()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("name", some(ON_THE_BUS))
 def test_our_master_moves_it_by_the_vendors_eds(folders, name):
     folder = str(folders[name].folder)
@@ -189,6 +191,7 @@ def test_our_master_moves_it_by_the_vendors_eds(folders, name):
             assert np.all(np.abs(drives.read(0x6064) - turn // 2) < turn / 50)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", some(ON_THE_BUS))
 def test_what_is_stored_stays_and_a_dcf_makes_the_same_drive(folders, tmp_path, name):
     folder = folders[name].folder
@@ -231,7 +234,7 @@ def select(node, mode):
     until(lambda: node.sdo[0x6061].raw == mode)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("name", some(ON_THE_BUS))
 def test_python_canopen_moves_it(folders, name):
     folder = folders[name].folder

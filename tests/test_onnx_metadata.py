@@ -30,7 +30,7 @@ def with_metadata(path, text, to):
     return to
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize(
     "text",
     ["no", "[]", "5", "null", "NaN", "[" * 100_000, '{"environment": 5}', '{"configuration": 5}', '{"card": [1]}',

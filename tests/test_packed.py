@@ -100,7 +100,7 @@ def assert_a_copy_is_itself_alone(name, integrator, friction, copies, **options)
     return packed
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", list(LOADS))
 @pytest.mark.parametrize(("copies", "friction"), [(8, "stribeck"), (64, "lugre")])

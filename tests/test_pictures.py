@@ -92,7 +92,7 @@ def test_the_single_environment_renders_and_who_looks_changes_nothing(kind):
     np.testing.assert_array_equal(*found)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("device", [pytest.param(name, marks=needs_gl) for name in device_names()])
 def test_every_device_is_drawn(device):
     """A stepper tells no torque current; its third panel has how far it is behind its steps, which is its torque."""

@@ -52,7 +52,7 @@ SERVO_GAINS = np.array([6925, 3431, 4018, 31_814, 31_467, 0])
 AM3041 = find_motor("am3041_e")
 
 
-@pytest.mark.every(16)
+@pytest.mark.slow
 @pytest.mark.parametrize("anti_resonance", [40.6, 69.1, 77.8, 93.6])
 @pytest.mark.parametrize(("ratio", "damping"), [(1.18, 0.005), (1.35, 0.005), (1.9, 0.02), (2.6, 0.02)])
 def test_one_spring_is_found_wherever_it_lies_between_the_lines(anti_resonance, ratio, damping):

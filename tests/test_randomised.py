@@ -63,6 +63,7 @@ def test_a_thousand_random_machines_are_sound(load):
     check(load, 1000)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("load", sorted(LOADS))
 def test_the_ranges_are_drawn_to_their_ends(load):
     with warnings.catch_warnings():

@@ -116,6 +116,7 @@ def replay(*arguments, timeout=0.05):
     return result.exit_code, result.stdout, result.stderr
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("frames", [enabled_by_sdo(), BY_RPDO, [START, *enabled_by_sdo()]], ids=["SDO", "RPDO", "both"])
 def test_what_is_enabled_at_the_end_is_stopped_and_said(bus, tmp_path, frames):
     drive = Turning()
@@ -330,7 +331,7 @@ def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bu
     assert beats and set(beats) == {b"\5"}
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("values", "frames", "why"),
     [

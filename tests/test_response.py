@@ -366,6 +366,7 @@ def record(duration):
     return np.arange(round(duration / DT) + 1) * DT
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize("duration", DURATIONS)
 def test_a_limit_cycle_of_five_percent_is_found_from_5_hz_to_450_hz(duration, noise):

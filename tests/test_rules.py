@@ -157,6 +157,7 @@ def test_the_symmetrical_optimum_of_the_sampled_drive_has_its_textbook_margin():
 
 
 # --- every rule -------------------------------------------------------------------------------------------------------
+@pytest.mark.every(4)
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("motor", ["qbl4208", "ec_i_40", "class_750w", "qube_servo_3"])
 def test_every_rule_proposes_integers_that_are_stable_in_every_loop(rule, motor):

@@ -101,6 +101,7 @@ def states(drives, cycles):
     return np.array(rows).swapaxes(0, 1)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("distance", [60_000, 4_000, 100])
 def test_a_move_is_its_closed_form_every_millisecond(sign, distance):

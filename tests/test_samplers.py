@@ -79,6 +79,7 @@ def test_a_seed_is_a_search(sampler):
     assert not np.any(np.all(first[:, None] == other[None], axis=2))
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("sampler", "generation"), [("tpe", 1), ("tpe", 4), ("cmaes", 4), ("random", 2)])
 def test_a_search_that_was_broken_off_goes_on_as_if_it_had_not_been(sampler, generation, tmp_path):
     def proposer(path):

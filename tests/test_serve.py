@@ -352,6 +352,7 @@ def test_a_script_finds_the_drives_by_the_ready_file_alone(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_a_script_finds_slaves_on_ethercat_by_the_ready_file(tmp_path):
     path = tmp_path / "ready.json"

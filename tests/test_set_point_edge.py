@@ -87,6 +87,7 @@ ROWS = [(before, device) for before in (left_high, failed_home, unchosen_home) f
 ROWS.remove((unchosen_home, "tgz_d"))  # it has no method 0
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("before", "device"), ROWS)
 def test_a_move_begins_whatever_was_left_of_bit_4(device, before):
     """Before: done at -16 inc after 001Fh; "did not reach set-point acknowledge" after a home that failed."""

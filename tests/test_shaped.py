@@ -88,6 +88,7 @@ def move(shape, distance, speed=SPEED):
     return (lambda s: at(x, s)), (lambda s: at(v, s)), (lambda s: at(a, s)), t[-1]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("shape", TYPES)
 @pytest.mark.parametrize("distance", [60.0, 8.0], ids=["long", "short"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -76,6 +76,7 @@ def test_one_that_is_waited_for_is_watched(emulated):
     assert problems(truth, travel=TRAVEL) == []
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [2, pytest.param(16, marks=pytest.mark.slow)])
 def test_a_fault_at_a_frame_leaves_none_on_its_way(emulated, kind, count):

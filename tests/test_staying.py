@@ -39,6 +39,7 @@ def way(drives, inside, duration=0.5):
     return float(np.abs(inside.machine.rotor_angle - before).max())
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("device", "mode"), ROWS)
 def test_enabling_turns_no_motor(device, mode):
     """Before: 60FFh = 300,000 that was left turned a TMCM-1636 at 4.6 rev/s."""

@@ -42,7 +42,7 @@ def at_rest(tab):
 
 
 # --- every page ---------------------------------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.parametrize("path", PAGES)
 def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)
@@ -91,6 +91,7 @@ def test_enabled_moved_and_disabled(tab):
     tab.await_state("Operation enabled")
     before = tab.value(POSITION)
     tab.type("goal", "90 deg")
+    assert tab.named("goal").get_attribute("value") == "90 deg", "in a text the space bar is a space, and stops nobody"
     tab.press("move-by")
     until(lambda: abs(tab.value(POSITION) - before - 0.25) < 0.01, "the end of the move")
     tab.press("disable")
@@ -127,8 +128,8 @@ def test_transitions_are_pressed_in_the_diagram(tab):
     assert lit == "Ready to switch on"
 
 
-@pytest.mark.every(9)
-@pytest.mark.parametrize("way", ["button", "space", "space, with a button focused", "control and space in a text"])
+@pytest.mark.every(12)
+@pytest.mark.parametrize("way", ["space", "button", "space, with a button focused", "control and space in a text"])
 @pytest.mark.parametrize("path", PAGES)
 def test_quick_stop_from_every_page(tab, path, way):
     at_rest(tab)
@@ -147,16 +148,6 @@ def test_quick_stop_from_every_page(tab, path, way):
         field = {"/axes": "goal", "/scope": "level", "/dictionary": "search"}[path]
         tab.named(field).send_keys(Keys.CONTROL, " ")
     until(lambda: tab.state != "Operation enabled", "the quick stop", 3.0)
-
-
-def test_the_space_bar_in_a_text_is_a_space(tab):
-    at_rest(tab)
-    tab.press("enable")
-    tab.await_state("Operation enabled")
-    tab.type("goal", "1 rev")
-    assert tab.named("goal").get_attribute("value") == "1 rev"
-    time.sleep(0.4)
-    assert tab.state == "Operation enabled"
 
 
 @pytest.mark.slow

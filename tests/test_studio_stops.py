@@ -40,15 +40,23 @@ def driver():
         yield found
 
 
-@pytest.fixture
-def bench(emulated):
-    """A world in real time, and a studio on its bus, one of whose pages computes when it is asked to."""
+@pytest.fixture(scope="module")
+def bus(emulated):
+    """A world in real time, its channel, and the studios that were started on it."""
+    studios = []
     with served(emulated) as (world, channel):
-        made = StudioProcess("--channel", channel, program=PROGRAM)
-        try:
-            yield world, made
-        finally:
-            made.end()
+        yield world, channel, studios
+        for one in studios:
+            one.end()
+
+
+@pytest.fixture
+def bench(bus):
+    """A world in real time, and a studio on its bus, one of whose pages computes when it is asked to."""
+    world, channel, studios = bus
+    if not studios or studios[-1].process.poll() is not None:
+        studios.append(StudioProcess("--channel", channel, program=PROGRAM))
+    return world, studios[-1]
 
 
 def turning(driver, bench):

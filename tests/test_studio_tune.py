@@ -237,7 +237,9 @@ def wait(desk, condition, patience=300.0):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("when", ["identifying", "designing gains on digital twins"])
+@pytest.mark.parametrize(
+    "when", ["identifying", pytest.param("designing gains on digital twins", marks=pytest.mark.slow)]
+)
 def test_auto_is_stopped_and_everything_is_as_before(desk, tmp_path, when):
     before = all_parameters(desk)
     run, future = started(desk, tmp_path / "auto")

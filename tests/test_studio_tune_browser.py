@@ -82,7 +82,7 @@ def parameters(emulated):
 
 
 # --- every page ---------------------------------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(3)
 @pytest.mark.parametrize("path", PAGES)
 def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)
@@ -119,16 +119,35 @@ def bench(emulated, tmp_path, monkeypatch):
             made.end()
 
 
+def slide(tab):
+    thumb = tab.named("slider-velocity_p").find_element(By.CSS_SELECTOR, "[tabindex]")
+    tab.driver.execute_script("arguments[0].focus()", thumb)
+    for _ in range(12):
+        tab.key(Keys.ARROW_RIGHT)
+
+
+def test_a_slider_changes_the_gain_that_the_drive_shows_and_undo_takes_it_back(tab):
+    """What of it is in the drive: tests/test_studio_tune.py, and the next one."""
+    tab.open("/tune")
+    before = gain(tab)
+    slide(tab)
+    until(lambda: "velocity P" in text_of(tab, "gain-history"), "the history")
+    tab.open("/tune")
+    assert gain(tab) > 1.2 * before
+    for _ in range(int(text_of(tab, "gain-history").split()[0])):
+        tab.press("undo")
+        time.sleep(0.5)
+    until(lambda: gain(tab) == before, "the gain before")
+
+
+@pytest.mark.slow
 def test_a_slider_writes_the_gain_of_a_drive_on_the_bus_and_undo_takes_it_back(driver, bench, emulated):
     """Read inside the emulator, not by the page."""
     _, made = bench
     before = read_gains(emulated)[0]
     tab = Tab(driver, made).open("/tune")
     assert gain(tab) == before[COLUMN]
-    thumb = tab.named("slider-velocity_p").find_element(By.CSS_SELECTOR, "[tabindex]")
-    tab.driver.execute_script("arguments[0].focus()", thumb)
-    for _ in range(12):
-        tab.key(Keys.ARROW_RIGHT)
+    slide(tab)
     until(lambda: read_gains(emulated)[0][COLUMN] > 1.2 * before[COLUMN], "the gain in the drive")
     until(lambda: gain(tab) == read_gains(emulated)[0][COLUMN], "the gain on the page")
     until(lambda: "velocity P" in text_of(tab, "gain-history"), "the history")

@@ -146,6 +146,7 @@ def csp(drives):
     yield watch(drives, 0.03)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("safety", [True, False])
 @pytest.mark.parametrize("script", [pp, pv, csp])
 def test_the_same_script_gives_the_same_integers_over_the_bus(inside, script, safety):
@@ -507,6 +508,7 @@ def sessions(inside):
     return {"pp_move": pp_move, "pv_run": pv_run, "taken_over": taken_over}
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(inside, kind):
     session = sessions(inside)["taken_over"]

@@ -256,6 +256,7 @@ METHODS = {1: ("left", 1), 2: ("right", -1), 3: ("home left", -1), 5: ("home rig
            18: ("right", 0), 19: ("home left", 0), 21: ("home right", 0), 33: ("", -1), 34: ("", 1)}  # fmt: skip
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("method", METHODS)
 def test_homing_methods_end_where_table_286_says(method):
     edge, way = METHODS[method]
@@ -301,6 +302,7 @@ def test_field_weakening_begins_where_the_run_current_takes_the_whole_supply(nam
     assert preset["Field weakening minimum velocity"] == pytest.approx(corner, rel=1e-3, abs=50)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("name", DEVICE.motors)
 def test_the_preset_closes_the_loop_of_every_motor(name):
     with warnings.catch_warnings():

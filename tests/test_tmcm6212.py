@@ -72,6 +72,7 @@ def served(load, num_machines=1, nodes=(1,)):
     return world, WorldBus(world)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("load", "machines", "driven"), [("inertia", 1, 1), ("gantry", 1, 2), ("inertia", 4, 4)])
 def test_axes_that_a_machine_leaves_over_have_no_motor(load, machines, driven):
     """They live, and a phase without current is found once it should have some."""

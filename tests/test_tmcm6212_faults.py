@@ -72,6 +72,7 @@ def some_are_off(drives):
 SESSIONS = {session.__name__: session for session in (speeds, paths, some_are_off)}
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     truth, frames, ended = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)
@@ -81,7 +82,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert np.ptp(truth.theta(), axis=0)[: 2 if name == "some_are_off" else AXES].min() > 0.01 * 2 * np.pi
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)

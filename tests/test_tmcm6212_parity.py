@@ -144,7 +144,7 @@ LOADS = {pp: "robot", six_point: "inertia", pv: "robot", csp: "robot", csv: "rob
 SCRIPTS = {script.__name__: script for script in LOADS}
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("name", "safety"),
     [

@@ -407,6 +407,7 @@ def test_a_configuration_takes_the_loads_own_task():
 STILL = {"inertia": 1, "belt": 1, "portal": 3}
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("load", STILL)
 @pytest.mark.parametrize("device", ["tmcm6212", "tmcm3313"])
 @pytest.mark.parametrize(("mode", "action"), [("csp", "offset"), ("csv", "offset"), ("csp", "direct")])

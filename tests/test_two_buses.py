@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 from rigs.namespaces import first_line
+from typer.testing import CliRunner
 
 from drive_env.bus.config import Bus, BusConfigError, Machine, build_world, load_bus
+from drive_env.commands.cli import app
 from drive_env.ethercat.application import AlState
 from drive_env.ethercat.coe_node import CoeNode
 from drive_env.ethercat.slaves import build_beside
@@ -81,7 +83,6 @@ def program(name, *arguments):
     return [sys.executable, "-c", code, *map(str, arguments)]
 
 
-@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("more", "says"),
     [
@@ -92,11 +93,8 @@ def program(name, *arguments):
 def test_what_a_bus_of_both_has_not(tmp_path, more, says):
     path = tmp_path / "bus.toml"
     path.write_text(FILE.format(port=0), encoding="utf-8")
-    done = subprocess.run(
-        program("drive_env", "serve", "--config", path, "--port", 0, *more),
-        capture_output=True, text=True, timeout=PATIENCE,
-    )  # fmt: skip
-    assert done.returncode == 2 and says in " ".join(done.stderr.split())
+    done = CliRunner().invoke(app, ["serve", "--config", str(path), "--port", "0", *more])
+    assert done.exit_code == 2 and says in " ".join(done.stderr.split())
 
 
 def free_port(kind):

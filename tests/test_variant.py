@@ -455,6 +455,7 @@ def test_on_a_bus_it_is_the_same_to_the_integer(safety):
             np.testing.assert_array_equal(told, known)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("device", [BASE.name, NAME])
 def test_the_envelope_holds_speeds_and_ramps_in_whatever_they_count(device):
     with on_a_bus(device) as drives:

@@ -52,6 +52,7 @@ def pressed(*arguments):
     raise KeyboardInterrupt
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("by", "stage", "words"),
     [

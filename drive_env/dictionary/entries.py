@@ -99,10 +99,13 @@ def eds_text(path: Path | EdsText) -> str:
 
 def written_objects(path: Path | EdsText, indices: Iterable[int]) -> dict[int, ODArray | ODRecord]:
     """Return objects that an EDS has read only as those of a fieldbus that can write them, by index."""
-    found = {index: copy.deepcopy(read_eds(path)[index]) for index in indices}
-    for item in found.values():
-        for member in item.values():
+    found = {}
+    for index in indices:
+        item = found[index] = copy.copy(read_eds(path)[index])  # a deep copy has the whole dictionary, its parent
+        members, item.subindices, item.names = list(item.values()), {}, {}
+        for member in map(copy.copy, members):
             member.access_type = "rw"
+            item.add_member(member)
     return found
 
 
@@ -218,6 +221,8 @@ class ObjectDictionary:
 
     def has(self, name: ObjectName) -> bool:
         """Return whether there is such an object, or one that plays such a part."""
+        if isinstance(name, int):
+            name = name, 0
         if type(name) is tuple and len(name) == 2:  # an error's message looks through all of them
             return name in self._entries
         try:
