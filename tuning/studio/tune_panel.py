@@ -19,12 +19,12 @@ COUPLING = {
 assert tuple(COUPLING) == AXES
 
 
-def card(title: str, name: str) -> ui.card:
-    """Return a card with a heading."""
-    made = ui.card().classes(f"studio-card card-{name}")
-    with made:
-        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
-    return made
+def card(title: str, name: str) -> ui.element:
+    """Return a section with a heading that folds it."""
+    with ui.element("details").classes(f"studio-card studio-fold card-{name}").props("open"):
+        with ui.element("summary"):
+            ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
+        return ui.element("div").classes("studio-fold-content")
 
 
 class TunePanel:
