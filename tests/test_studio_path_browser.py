@@ -45,6 +45,7 @@ SOON = 60.0  # s
 TRAVEL = "-20:20"  # turns
 HOME_HERE = 35
 PICTURES = os.environ.get("STUDIO_PICTURES")  # folder for pictures of every page, which people look at
+SUPPLIES = {"tmcm1636": "48", "tgz_s": "560"}  # V, of the own motors
 LENT = ("607D:01", "607D:02")  # limits of travel
 WIDTHS = (360, 800, 1400)
 OVER = "return document.documentElement.scrollWidth"
@@ -214,7 +215,7 @@ def numbers(text):
 
 
 def settings(bench):
-    """Return the parameters inside, less those that the envelope lends a drive on a bus as long as the studio is there."""
+    """Return the parameters inside, less those that the envelope lends a drive while the studio is there."""
     return {name: value for name, value in bench.truth()["parameters"].items() if name not in LENT}
 
 
@@ -244,6 +245,7 @@ def test_an_own_motor_on_an_own_machine_from_the_motor_to_the_certificate_and_af
     if bench.link != "emulated":
         tab.type("motor", str(Path("own_motor.toml").resolve()))
         tab.named("motor").send_keys(Keys.ENTER)
+        until(lambda: tab.named("supply").get_attribute("value") == SUPPLIES[bench.device], "the supply of the motor")
     tab.type("travel", TRAVEL)
     tab.press("begin")
     told(tab, "path-told", "Under way")
