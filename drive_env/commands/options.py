@@ -84,9 +84,6 @@ Timeout = Annotated[
     float | None,
     typer.Option(envvar="DRIVE_ENV_TIMEOUT", help="Longest wait for an answer [s].", show_default="the device's, 0.5"),
 ]
-Lockstep = Annotated[
-    bool, typer.Option("--lockstep", help="Time passes by SYNC only, for an emulator that is served with --lockstep.")
-]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 _INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)

@@ -13,7 +13,6 @@ import typer
 
 from drive_env.commands.options import (
     Eds,
-    Lockstep,
     NodesOptions,
     check_time,
     cycle_for,
@@ -38,7 +37,6 @@ def studio(
     *,
     bus: NodesOptions,
     eds: Eds = None,
-    lockstep: Lockstep = False,
     load: Annotated[str, typer.Option(help="Load of the emulated machine, a name or an MJCF file.")] = "two_mass",
     motor: Annotated[
         str | None, typer.Option(help="Its motor, a name or a TOML file; the device's usual one by default.")
@@ -86,9 +84,7 @@ def studio(
             raise ValueError("--listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in")
         device = bus.device
         described = describe(device, eds, is_bus and is_ethercat(bus.interface))
-        opener = (
-            _bus(described, bus, eds, lockstep=lockstep) if is_bus else _machine(device, load, motor, factory, seed)
-        )
+        opener = _bus(described, bus, eds) if is_bus else _machine(device, load, motor, factory, seed)
         title = _title(described, bus) if is_bus else f"{device}, emulated, load {load}"
         named = {"interface": bus.interface, "channel": bus.channel, "nodes": bus.node, "bitrate": bus.bitrate}
         address = named if is_bus else {}
@@ -144,12 +140,12 @@ def _machine(device: str, load: str, motor: str | None, factory: bool, seed: int
     return open_machine
 
 
-def _bus(described: Description, bus: NodesOptions, eds: Path | None, *, lockstep: bool) -> Callable[[], Drives]:
+def _bus(described: Description, bus: NodesOptions, eds: Path | None) -> Callable[[], Drives]:
     """Return a function that opens drives of a bus with the envelope; it raises where another master commands them."""
 
     def open_bus() -> Drives:
         refuse_other_masters(bus.interface, bus.channel, bus.nodes, bus.bitrate)
-        return bus.connect(eds, cycle=cycle_for(described), pace="lockstep" if lockstep else "real-time")
+        return bus.connect(eds, cycle=cycle_for(described))
 
     return open_bus
 

@@ -22,7 +22,6 @@ from drive_env.commands.options import Channel as Channel
 from drive_env.commands.options import DeviceName as DeviceName
 from drive_env.commands.options import Interface as Interface
 from drive_env.commands.options import Json as Json
-from drive_env.commands.options import Lockstep as Lockstep
 from drive_env.commands.options import Nodes as Nodes
 from drive_env.commands.options import WouldDo as WouldDo
 from drive_env.commands.options import Yes as Yes
@@ -76,6 +75,9 @@ Bus = Annotated[
         help="Use the drives on a bus, inside the safety envelope; --interface, --channel, --node, --bitrate and "
         "--lockstep imply it. Environment variables do not.",
     ),
+]
+Lockstep = Annotated[
+    bool, typer.Option("--lockstep", help="Time passes by SYNC only, for an emulator that is served with --lockstep.")
 ]
 Supply = Annotated[
     float | None,
