@@ -235,10 +235,22 @@ def do(tab, step, title, patience=SOON):
 
 @pytest.mark.parametrize("bench", LINKS, indirect=True)
 def test_an_own_motor_on_an_own_machine_from_the_motor_to_the_certificate_and_after_a_fault(bench):
-    tab = bench.tab
     before = bench.truth()["parameters"]
+    gains = commission(bench)
+    assert not bench.truth()["is_on"]
+    stored = settings(bench)
+    assert stored != {name: value for name, value in before.items() if name not in LENT}
+    home_and_scope_a_move(bench)
+    assert settings(bench) == stored
+    tune_and_go_back(bench, gains)
+    assert settings(bench) == stored
+    fail_and_recover(bench)
+    store_and_switch_off(bench, stored, before)
 
-    # --- the path: motor, wiring, current, limits, homing, identify, tune at two dynamics with a way back, store
+
+def commission(bench):
+    """Go the whole path, tuned at two dynamics with a way back between them; return the gains that it leaves."""
+    tab = bench.tab
     tab.open("/commission")
     if bench.link != "emulated":
         tab.type("motor", str(Path("own_motor.toml").resolve()))
@@ -274,11 +286,13 @@ def test_an_own_motor_on_an_own_machine_from_the_motor_to_the_certificate_and_af
     assert (run / "report.html").is_file()
     page_says = json.loads((run / "certificate.json").read_text())
     assert "accepted" in json.dumps(page_says)
-    assert bench.truth()["parameters"] != before and not bench.truth()["is_on"]
     look(bench, "commissioned")
-    stored = settings(bench)
+    return standard
 
-    # --- enable, home, a move that the scope waits for
+
+def home_and_scope_a_move(bench):
+    """Enable, home, and make a move that the scope waits for."""
+    tab = bench.tab
     tab.open("/axes")
     tab.press("enable")
     tab.await_state("Operation enabled", SOON)
@@ -299,9 +313,11 @@ def test_an_own_motor_on_an_own_machine_from_the_motor_to_the_certificate_and_af
     until(lambda: abs(tab.value("Position actual value") - 3.0) < 0.02, "the end of the move", SOON)
     tab.press("disable")
     tab.await_state("Switch on disabled", SOON)
-    assert settings(bench) == stored
 
-    # --- auto with stiff dynamics, its certificate, and back to the state before
+
+def tune_and_go_back(bench, standard):
+    """Have auto tune with stiff dynamics, and go back from its certificate to the state before."""
+    tab = bench.tab
     tab.open("/tune")
     until(lambda: page_gains(bench) == standard, "the gains on the page", SOON)
     choose(tab, "dynamics", "stiff")
@@ -314,9 +330,11 @@ def test_an_own_motor_on_an_own_machine_from_the_motor_to_the_certificate_and_af
     look(bench, "tune")
     tab.press("restore-before")
     until(lambda: page_gains(bench) == standard, "the gains before", SOON)
-    assert settings(bench) == stored
 
-    # --- a fault, and recovery
+
+def fail_and_recover(bench):
+    """Have the supply dip while the axis is enabled; reset the fault, and move again."""
+    tab = bench.tab
     tab.open("/axes")
     tab.press("enable")
     tab.await_state("Operation enabled", SOON)
@@ -343,7 +361,10 @@ def test_an_own_motor_on_an_own_machine_from_the_motor_to_the_certificate_and_af
     tab.press("disable")
     tab.await_state("Switch on disabled", SOON)
 
-    # --- store; and the truth after a power cycle
+
+def store_and_switch_off(bench, stored, before):
+    """Store, and compare what the drive has after a power cycle with what it had."""
+    tab = bench.tab
     tab.open("/dictionary")
     tab.press("store")
     kept, not_kept = "the drive keeps its parameters from now on", "has no service behind it in this emulator"
