@@ -347,7 +347,7 @@ def fail_and_recover(bench):
         until(lambda: not tab.all(".studio-fault-row.is-active"), "the end of the fault", SOON)
         tab.open("/axes")
     else:
-        bench.fail("supply_dip", duration=0.5)
+        bench.fail("supply_dip", duration=5.0)  # the capacitors of the link are empty by then
         tab.await_state("Fault", SOON)
     assert "Remedy: " in tab.one(".card-faults").text and not bench.truth()["is_on"]
     look(bench, "fault")
