@@ -6,12 +6,14 @@ What a drive has is read by the node's own dictionary, or inside the emulator; n
 from __future__ import annotations
 
 import json
+import re
 from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.truth import settings_of
 from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, cia402, motion
@@ -19,7 +21,10 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import SDO_REQUEST
-from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.drives.raw_gains import write_gains
+from drive_env.loops.linear_model import OPEN_LOOPS
+from drive_env.loops.margins import margins
+from drive_env.loops.true_plant import true_plant
 from tuning.commands.cli import app
 from tuning.commissioning.bench import CommissioningPlan
 from tuning.commissioning.path import CommissioningPath
@@ -29,13 +34,6 @@ from tuning.target import emulated, on_bus
 TURN = 65536
 CHEAP = ("motor", "wiring", "current", "limits", "homing")
 SWITCHES = {"method": 17, "limits": {"current": "6 A", "lowest": "1 rev", "highest": "11 rev"}}  # of the belt
-# What an axis does, not what it is set to: the state, positions and what follows from them, signals. Where home is
-# (2140h) is lost with the power; 6060h cannot be 0 again once a drive had a mode.
-LIVE = {
-    0x1001, 0x1003, 0x2031, 0x2041, 0x2042, 0x2043, 0x2060, 0x2100, 0x2101, 0x2102, 0x2103, 0x2104, 0x2105, 0x2140,
-    0x2702, 0x6040, 0x6041, 0x6060, 0x6061, 0x6062, 0x6063, 0x6064, 0x606B, 0x606C, 0x6077, 0x6078, 0x607A, 0x60F4,
-    0x60FC, 0x60FD,
-}  # fmt: skip
 
 
 def quiet(what, share):
@@ -47,24 +45,6 @@ def fresh():
     """A belt with switches, and its drive as it comes from the factory."""
     with emulated(load="belt", factory_fresh=True, num_threads=1) as target:
         yield target
-
-
-def settings_of(drives):
-    """Every object of a drive that can be read and is no signal, read one by one."""
-    found = {}
-    for entry in drives.device.new_dictionary():
-        try:
-            value = drives.read((entry.index, entry.sub))[0]
-        except ObjectAccessError:
-            continue
-        if entry.index not in LIVE or (entry.index, entry.sub) in gains_of(drives):
-            found[entry.index, entry.sub] = value
-    assert len(found) > 100
-    return found
-
-
-def gains_of(drives):
-    return set(drives.device.gains.keys)
 
 
 def is_off(drives):
@@ -255,6 +235,24 @@ def test_an_open_loop_stepper_has_no_loops_to_identify(tmp_path):
         assert path.run("motor", quiet).state == "done" and path.run("limits", quiet).state == "done"
 
 
+@pytest.mark.parametrize("gains", [(4021, 1573, 445, 329, 118), (4021, 1573, 600, 400, 250)])
+def test_the_margins_that_it_prints_are_those_of_the_true_plant(tmp_path, gains):
+    """Of two masses on a spring, by the linear model of what the machine truly is."""
+    with (
+        emulated(load="two_mass", num_threads=1) as target,
+        CommissioningPath(target, CommissioningPlan(dynamics="stiff"), tmp_path / "x") as path,
+    ):
+        write_gains(target.drives, np.array([gains]))
+        printed = path.run("verify", quiet).lines
+        plant, f = true_plant(target.drives), np.geomspace(2.0, 0.49 * target.device.velocity_rate, 4000)
+        for loop, line in zip(("velocity", "position"), printed, strict=True):
+            true = margins(f, OPEN_LOOPS[loop](target.device, plant, gains, f))
+            phase, gain, ms = re.fullmatch(rf"{loop} loop (\d+)°, (\d+) dB, Ms ([\d.]+)(?:: .*)?", line).groups()
+            assert float(phase) == pytest.approx(true.phase_deg, abs=6.0), line
+            assert float(gain) == pytest.approx(true.gain_db, abs=2.0), line
+            assert float(ms) == pytest.approx(true.ms, rel=0.2), line
+
+
 # --- the command ------------------------------------------------------------------------------------------------------
 def test_a_dry_run_reads_and_lists_the_steps_and_their_objects():
     with served() as (world, _, channel, frames):
@@ -329,12 +327,15 @@ def test_on_a_terminal_a_step_is_done_left_out_or_gone_back_to(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     terminal = SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True))
     monkeypatch.setattr("tuning.commands.commission.sys", terminal)
-    words = [*without("wiring", "current", "identify", "tune", "verify"), "--load", "belt", "--out", "x"]
-    # motor; limits: back to the motor; it again; limits; homing: asked for its method; store: quit
-    found = commission("", *words, input="y\nb\ny\ny\ny\n35\nq\n")
-    assert found.exit_code == 1, found.output
-    assert found.stdout.count("Motor done") == 2 and "home by method 35" in found.stdout
-    assert "the drive has its parameters from before, and is off" in found.stdout
+    words = [*without("wiring", "current", "identify", "tune", "verify"), "--out", "x"]
+    with served() as (_, drives, channel, _):
+        before = settings_of(drives)
+        # motor; limits: back to the motor; it again; limits; homing: asked for its method; store: quit
+        found = commission(channel, *words, input="y\nb\ny\ny\ny\n35\nq\n")
+        assert found.exit_code == 1, found.output
+        assert found.stdout.count("Motor done") == 2 and "home by method 35" in found.stdout
+        assert "from before" in found.stdout, found.output
+        assert settings_of(drives) == before and is_off(drives)
 
 
 def test_what_was_tuned_elsewhere_has_no_certificate(tmp_path, monkeypatch):

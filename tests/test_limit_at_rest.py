@@ -46,6 +46,8 @@ def test_an_encoder_that_is_stuck_is_told_though_the_drive_reports_no_fault(devi
         set_off(drives, round(0.3 * drives.read(Role.POSITION_SCALE)[0]))
         when = told(drives, LimitAtRest(drives), 2.0)
         status, current = map(drives.read, READ[:2])
+        share = LimitAtRest(drives).share(current // 2, drives.read(Role.CURRENT_LIMIT))
+        assert share == pytest.approx(0.5, abs=0.02)
         current, limit = current * ampere_per_count(drives), read_current_limit(drives)
         assert cia402.matches(status, cia402.OPERATION_ENABLED).all()
         assert not cia402.matches(status, cia402.FAULT_BIT).any()
@@ -76,6 +78,7 @@ def test_steppers_have_no_such_limit():
         watch = LimitAtRest(drives)
         assert not watch.is_known
         assert not watch.look(0.0, [0x237], [9], [0], [1]).any()
+        assert np.isnan(watch.share([9], [1])).all()
 
 
 class Served:

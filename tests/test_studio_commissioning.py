@@ -9,12 +9,13 @@ from contextlib import contextmanager
 import pytest
 from rigs.fault_injection import served as on_a_bus
 from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, until
+from rigs.truth import settings_of
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.fieldbus.description import describe
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.session import Session
-from tuning.snapshot import DEVICE_OBJECTS, take_of
+from tuning.snapshot import DEVICE_OBJECTS
 from tuning.studio.commissioning_jobs import room_of
 
 PATIENCE = 120.0  # s, of a computer that is busy: a bus in real time
@@ -22,8 +23,8 @@ SELDOM = 0.5  # s between two looks: the node on the bus lives in this process
 
 
 def parameters(emulated):
-    """The drive's parameters, read inside the emulator; how it talks is its master's."""
-    return {key: value for key, value in take_of(emulated, {}).axes[0].items() if key[0] >= DEVICE_OBJECTS}
+    """The drive's settings, read one by one inside the emulator; how it talks is its master's."""
+    return {key: value for key, value in settings_of(emulated).items() if key[0] >= DEVICE_OBJECTS}
 
 
 def is_off(emulated):

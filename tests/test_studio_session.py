@@ -15,6 +15,7 @@ from drive_env.cia402 import State
 from drive_env.devices.new_device import new_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
+from drive_env.drives.limit_at_rest import SHARE
 from drive_env.fieldbus.description import describe
 from drive_env.motors import find_motor
 from drive_env.studio import dictionary_jobs, motion_jobs, presence
@@ -557,9 +558,10 @@ def test_a_current_at_its_limit_at_rest_is_told(session):
         until(lambda: session.axes[0].is_at_limit, 20.0)
         limit = int(session.do(lambda drives: drives.read(Role.CURRENT_LIMIT)[0], "read").result(10))
         assert abs(float(session.axes[0].motion[-1].value)) > 0.95e-3 * limit
+        assert session.axes[0].current_share >= SHARE
         assert any("its current is at its limit" in event.text for event in session.events)
         session.do(motion_jobs.disable(0), "disable").result(20)
-        until(lambda: not session.axes[0].is_at_limit)
+        until(lambda: not session.axes[0].is_at_limit and session.axes[0].current_share < 0.2)
 
 
 def test_a_backup_is_restored_where_a_machine_has_fewer_axes_than_its_device():

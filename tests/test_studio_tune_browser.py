@@ -100,6 +100,22 @@ def test_nothing_is_wider_than_the_window(tab, path, width):
     assert tab.driver.execute_script("return document.documentElement.scrollWidth") <= width
 
 
+def test_tune_on_a_narrow_page_is_sections_that_fold(tab):
+    """But machine and gains they begin folded; a chart has its size once its section is opened."""
+    size_of(tab.driver, 400, 800)
+    tab.open("/tune")
+    is_open = "return [...document.querySelectorAll('.studio-fold')].map((one) => one.open)"
+    until(lambda: tab.driver.execute_script(is_open) == [True, True, *[False] * 5], "folded sections")
+    summary = tab.one(".card-step summary")
+    tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", summary)
+    summary.click()
+    until(lambda: tab.named("step-chart").size["width"] > 300, "its chart")
+    assert tab.driver.execute_script("return document.documentElement.scrollWidth") <= 400
+    size_of(tab.driver, 1280, 1000)
+    tab.open("/tune")
+    until(lambda: all(tab.driver.execute_script(is_open)), "open sections on a wide page")
+
+
 # --- tune ---------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def emulated():

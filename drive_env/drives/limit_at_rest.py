@@ -57,7 +57,18 @@ class LimitAtRest:
         if not self.is_known:
             return np.zeros(self.axes, bool)
         enabled = cia402.matches(np.asarray(status), cia402.OPERATION_ENABLED)
-        most = np.minimum(np.asarray(limit) * self._counts_per_limit, self._most)
-        pushes = enabled & (most > 0) & (np.abs(current) >= SHARE * most) & (np.abs(speed) <= self._slow)
+        pushes = enabled & (self.share(current, limit) >= SHARE) & (np.abs(speed) <= self._slow)
         self._since = np.where(pushes, np.fmin(self._since, now), np.nan)
         return np.asarray(now - self._since >= HELD)
+
+    def share(self, current: ArrayLike, limit: ArrayLike) -> Floats:
+        """Return the share of its limit that each current is, shape (num_axes,); NaN of a limit of 0, or of none known.
+
+        Args:
+            current: 6077h, (num_axes,).
+            limit: The current limit, as its object has it, alike.
+        """
+        if not self.is_known:
+            return np.full(self.axes, np.nan)
+        most = np.minimum(np.asarray(limit) * self._counts_per_limit, self._most)
+        return np.asarray(np.abs(current) / np.where(most > 0, most, np.nan))

@@ -9,7 +9,7 @@ from nicegui.events import GenericEventArguments
 
 from drive_env import cia402
 from drive_env.cia402 import State
-from drive_env.drives.limit_at_rest import SAYS
+from drive_env.drives.limit_at_rest import SAYS, SHARE
 from drive_env.studio import motion_jobs
 from drive_env.studio.axis_states import AxisState, ShownQuantity
 from drive_env.studio.motion_cards import card, move_rows, power_row
@@ -80,6 +80,7 @@ def _single_transitions(state: State | None) -> None:
 def _motion_card(visitor: Visitor) -> None:
     with card("Motion", "card-motion"):
         values = _Values()
+        share = ui.label("").classes("studio-share").props("data-test=current-share")
         with ui.row().classes("studio-bits"):
             bits = [(ui.label(f"○ {name}").classes("studio-bit"), name, bit) for name, bit in BITS]
         with ui.element("div").classes("studio-fault").props('data-test=at-limit role="status"') as limit:
@@ -92,12 +93,20 @@ def _motion_card(visitor: Visitor) -> None:
             return
         values.show(state.motion)
         limit.set_visibility(state.is_at_limit)
+        _show_share(share, state.current_share)
         for label, name, bit in bits:
             is_set = state.has_bit(bit)
             label.set_text(f"{'●' if is_set else '○'} {name}")
             label.classes(add="is-set" if is_set else "", remove="" if is_set else "is-set")
 
     ui.timer(REFRESH, show)
+
+
+def _show_share(label: ui.label, share: float | None) -> None:
+    """Show the share of its limit that a current is, in colour and with a sign at the limit; nothing for None."""
+    is_at = share is not None and share >= SHARE
+    label.classes(add="is-at" if is_at else "", remove="" if is_at else "is-at")
+    label.set_text("" if share is None else f"{'▲ ' if is_at else ''}Current: {100.0 * share:.0f} % of its limit")
 
 
 class _Values:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from drive_env import cia402
@@ -76,6 +77,7 @@ class AxisState:
         inputs: Switches by name, and whether they are active.
         slow: Temperatures, DC link and the like.
         is_at_limit: Whether its current is at the limit though it does not turn.
+        current_share: Share of the limit that its current is; None where the drive tells no limit.
     """
 
     axis: int
@@ -89,6 +91,7 @@ class AxisState:
     inputs: dict[str, bool] = field(default_factory=dict)
     slow: tuple[ShownQuantity, ...] = ()
     is_at_limit: bool = False
+    current_share: float | None = None
 
     @property
     def is_enabled(self) -> bool:
@@ -199,12 +202,14 @@ class AxisStates:
             return []
         status = newest[cia402.STATUSWORD, 0]
         pushing = self._pushing.look(time.monotonic(), status, current, speed, self._limit)
+        shares = self._pushing.share(current, self._limit)
         told = []
         for axis in self.axes:
+            share = float(shares[axis.axis])
             is_at_limit = bool(pushing[axis.axis])
             if is_at_limit and not axis.is_at_limit:
                 told.append(f"{axis.name}: {SAYS}")
-            self._replace(axis.axis, is_at_limit=is_at_limit)
+            self._replace(axis.axis, is_at_limit=is_at_limit, current_share=share if isfinite(share) else None)
         return told
 
     def _read_slow(self, drives: Drives) -> None:

@@ -330,7 +330,9 @@ class DictionaryPanel:
             ui.label("Backup and restore").classes("studio-heading")
             with ui.row().classes("studio-buttons"):
                 ui.button("Backup", icon="download", on_click=self._backup).props("outline no-caps data-test=backup")
-                ui.button("Store in the drive", icon="save", on_click=self._store).props("outline no-caps")
+                ui.button("Store in the drive", icon="save", on_click=self._store).props(
+                    "outline no-caps data-test=store"
+                )
             ui.label(
                 "Restore writes all of a file or none: what was written is read back, and taken back if one fails. "
                 "The axis must be disabled."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import select
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -32,6 +34,7 @@ def why_no_namespace():
 
 NO_NAMESPACE = why_no_namespace()
 needs_namespaces = pytest.mark.skipif(NO_NAMESPACE is not None, reason=str(NO_NAMESPACE))
+NEW_NETWORK = 0x40000000  # CLONE_NEWNET of Linux
 PATIENCE = 240.0  # s; kernels may have to be compiled
 
 
@@ -46,6 +49,22 @@ def spaces():
 
 def inside(space, *arguments):
     return ["ip", "netns", "exec", space, sys.executable, *map(str, arguments)]
+
+
+@contextmanager
+def within(space):
+    """Have this thread, and the programs that it starts, in a namespace: sockets that are open stay where they are."""
+    with Path("/proc/thread-self/ns/net").open() as before, Path("/run/netns", space).open() as there:
+        _enter(there)
+        try:
+            yield
+        finally:
+            _enter(before)
+
+
+def _enter(space):
+    if ctypes.CDLL(None, use_errno=True).setns(space.fileno(), NEW_NETWORK):
+        raise OSError(ctypes.get_errno(), "setns")
 
 
 def first_line(process):

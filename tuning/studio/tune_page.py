@@ -19,6 +19,11 @@ from tuning.studio.tune_panel import TunePanel, card, machine_card
 from tuning.studio.tuner_card import TunerCard
 
 REFRESH = 0.2  # s
+# On a narrow page but machine and gains begin folded: what is far below is found by its heading.
+FOLD = """
+if (innerWidth <= 600)
+  for (const one of [...document.querySelectorAll(".studio-fold")].slice(2)) one.open = false;
+"""
 REREAD = 2.0  # s between two readings of the gains, which another page or another master may write
 
 
@@ -62,6 +67,7 @@ class TunePage:
             with ui.element("div").classes("studio-stack"):
                 self.tuner.build_run()
                 self.rules.build()
+        ui.run_javascript(FOLD)
         self.panel.visitor.hand_in(tune_jobs.look(self.panel.desk), "Read the gains")
         ui.timer(REFRESH, self._show)
         ui.timer(REREAD, self._reread)

@@ -19,12 +19,12 @@ COUPLING = {
 assert tuple(COUPLING) == AXES
 
 
-def card(title: str, name: str) -> ui.card:
-    """Return a card with a heading."""
-    made = ui.card().classes(f"studio-card card-{name}")
-    with made:
-        ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
-    return made
+def card(title: str, name: str) -> ui.element:
+    """Return a section with a heading that folds it."""
+    with ui.element("details").classes(f"studio-card studio-fold card-{name}").props("open"):
+        with ui.element("summary"):
+            ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
+        return ui.element("div").classes("studio-fold-content")
 
 
 class TunePanel:
@@ -81,7 +81,7 @@ def machine_card(panel: TunePanel) -> None:
                 motor = ui.select([*names, *({now} - {*names})], value=now, label="Motor, or the path of its file",
                                   with_input=True, new_value_mode="add-unique")  # fmt: skip
                 motor.props("dense outlined data-test=motor").classes("grow")
-                motor.on_value_change(lambda event: _choose_motor(panel, str(event.value or usual)))
+                motor.on_value_change(lambda event: choose(str(event.value or usual)))
             travel = ui.input(
                 "Travel [turns]", value=desk.entries.travel, placeholder="the load's" if emulated else "-0.5:0.5"
             ).props("dense outlined data-test=travel").classes("grow")  # fmt: skip
@@ -90,12 +90,19 @@ def machine_card(panel: TunePanel) -> None:
                 axes = ui.select(COUPLING, value=desk.entries.axes, label="Axes").props("dense outlined")
                 axes.on_value_change(lambda event: setattr(desk.entries, "axes", str(event.value)))
             if not emulated:
-                supply = ui.number("Supply [V]", value=panel.supply, min=1).props("dense outlined")
+                supply = ui.number("Supply [V]", value=panel.supply, min=1).props("dense outlined data-test=supply")
                 supply.on_value_change(lambda event: setattr(desk.entries, "supply", event.value))
         own = "; empty: as far as the load lets it" if emulated else ""
         ui.label(f"How far the rotor may turn from where it stands: LOW:HIGH, as -0.5:0.5, or free{own}.").classes(
             "studio-hint"
         )
+
+    def choose(name: str) -> None:
+        """Take a motor, and show its supply where none was given."""
+        _choose_motor(panel, name)
+        if desk.entries.supply is None:
+            supply.set_value(panel.supply)
+            desk.entries.supply = None  # it is shown, and was not given
 
 
 def _choose_motor(panel: TunePanel, name: str) -> None:
