@@ -11,11 +11,13 @@ from rigs.makers import files
 from rigs.pump import NODE
 from rigs.small_eds import entry
 from rigs.world_bus import WorldBus
+from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.devices.new_device import new_device
 from drive_env.dictionary.aborts import ObjectAccessError
@@ -295,6 +297,14 @@ def test_a_drive_without_a_watchdog_is_refused_with_the_remedy_and_moves_with_it
                 motion.enable(drives, mode="pp")
                 motion.move_to(drives, 2048, timeout=60.0)
                 assert abs(drives.read(0x6064)[0] - 2048) < 82
+            assert "no drive stops by itself when this process dies" in caplog.text
+            named = ("--interface", "slcan", "--channel", hub.channel, "--node", str(NODE), "--timeout", "20")
+            asked = ["jog", "2048", "--for", "0.1", *named]
+            found = CliRunner().invoke(app, [*asked, "--eds", str(path)])
+            assert found.exit_code == 1 and "give --no-watchdog to jog, move or home" in found.stderr
+            found = CliRunner().invoke(app, [*asked, "--eds", str(path), "--no-watchdog"])
+            assert found.exit_code == 0, found.output
+            found = CliRunner().invoke(app, [*asked, "--no-watchdog"])
+            assert found.exit_code == 2 and "a tmcm1636 has a watchdog over its master (1016h)" in found.stderr
     finally:
         world.close()
-    assert "no drive stops by itself when this process dies" in caplog.text

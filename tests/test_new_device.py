@@ -198,7 +198,8 @@ def test_what_is_stored_stays_and_a_dcf_makes_the_same_drive(folders, tmp_path, 
     known = find_device(str(folder))
     with on_a_bus(str(folder)) as options, CanDrives(str(folder), safety=False, **options) as drives:
         has_store = known.new_dictionary().has((0x1010, 1))
-        two = (0x6081, 0x6084) if known.new_dictionary().has(0x6081) else ((0x6048, 1), (0x6049, 1))
+        ways = ((0x6081, 0x6084), ((0x6048, 1), (0x6049, 1)), (0x604F, 0x6050))
+        two = next(both for both in ways if known.new_dictionary().has(both[0]))
         was = {key: int(drives.read(key)[0]) for key in two}
         factory = [known.new_dictionary().find(key).default for key in was]
         for key, raw in was.items():

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from drive_env import EmulatedDrives, motion
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
+from drive_env.devices.gains import small_time_constants
 from drive_env.emulator.sizing import LEADS, MARGIN, RATIOS, axis_proposal, demand, propose_drives
 from drive_env.motors import find_motor
 from mechanics import Load
@@ -27,10 +28,13 @@ from mechanics.loads import find_load
 from mechanics.model import compile_packed, read_model, with_motors
 from mechanics.packed import PackedLoad
 from mechanics.shaft import shaft_load
+from tuning.auto.one_button import auto
+from tuning.target import emulated
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 
 LAYOUTS = Path(__file__).parent / "data" / "public_layouts"
+SCARA = Path(__file__).parents[1] / "examples" / "models" / "scara.xml"
 NO_ACTUATOR = "no actuator of the file turns it: name it"
 # File -> its joints: "" where a drive can be, else what is said.
 JOINTS = {
@@ -257,6 +261,14 @@ def test_margins_are_what_the_move_leaves():
     assert axis.torque_margin == pytest.approx(TMCM1636.torque_of(motor) / torque)
     assert axis.speed_margin == pytest.approx(100.0 * math.pi / (20.0 * speed))
     assert (axis.inertia, axis.inertia_ratio) == pytest.approx((0.02 / 400.0, 0.02 / 400.0 / 2.8e-5))
+    # A count of 10,000 through a low-pass of 400 Hz, damping 0.7, whose impulse response has its peak at acos(0.7) of
+    # its damped oscillation, answered by J w_v: a quarter of the reciprocal sum of the lags.
+    w = 2.0 * math.pi * 400.0
+    t = math.acos(0.7) / (w * math.sqrt(0.51))
+    peak = w / math.sqrt(0.51) * math.exp(-0.7 * w * t) * math.sin(w * math.sqrt(0.51) * t)
+    bandwidth = 0.25 / float(small_time_constants(TMCM1636, 400.0))
+    count = 2.0 * math.pi / 10000.0 * peak * bandwidth * (0.02 / 400.0 + 2.8e-5)
+    assert axis.encoder_margin == pytest.approx(TMCM1636.torque_of(motor) / count)
 
 
 def test_the_smallest_motor_that_suffices_is_proposed():
@@ -276,6 +288,20 @@ def test_the_smallest_motor_that_suffices_is_proposed():
     assert not lacking.fits and lacking.axes[0].torque_margin < 1.0
     hinge = [joints[0]._replace(kind="hinge", travel=Range(-1.0, 1.0), inertia=Range(0.01, 0.01), holding=Range(0, 1))]
     assert propose_drives(hinge, TMCM1636, motors, 2.0).axes[0].gear in RATIOS
+
+
+@pytest.mark.slow
+def test_auto_tunes_what_is_proposed_for_the_scara(tmp_path):
+    """A motor of 2,048 counts has the torque and the speed, and no gains on which it moves and rests."""
+    out = tmp_path / "scara"
+    code, _, says = run(SCARA, "--motor", "qube_servo_3", "--out", out)
+    assert code == 2 and "of the encoder's resolution" in says and not out.exists()
+    code, text, _ = run(SCARA, "--out", out, "--json")
+    told = json.loads(text)
+    assert code == 0 and all(joint["encoder_margin"] >= MARGIN for joint in told["joints"])
+    with emulated(load=out / "scara.xml", motor=told["motor"], num_threads=1) as target:
+        result = auto(target, tmp_path / "before.toml")
+    assert [axis.accepted for axis in result.axes] == [True, True], [axis.reason for axis in result.axes]
 
 
 # --- other joints that no drive can turn ------------------------------------------------------------------------------

@@ -10,9 +10,10 @@ import json
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
+from rigs.makers import files
 from rigs.pump import NODE
 from rigs.served_drives import node
-from rigs.small_eds import FOLDER, entry, put
+from rigs.small_eds import FOLDER, put
 from rigs.world_bus import WorldBus
 from typer.testing import CliRunner
 
@@ -291,12 +292,95 @@ def test_a_drive_without_6048h_gets_a_ramp_of_the_emulators_own(tmp_path):
     text = EDS["vl"].read_text(encoding="utf-8")
     path = tmp_path / "bare.eds"
     head, rest = text.split("[6048]", 1)
-    path.write_text(head + "[6049]" + rest.split("[6049]", 1)[1] + entry("604F", "Ramp time"), encoding="utf-8")
+    path.write_text(head + "[6049]" + rest.split("[6049]", 1)[1], encoding="utf-8")
     made = new_device(path, tmp_path / "bare", find_motor(MOTOR))
     assert any("no 6048h" in note.why for note in made.fill_in)
-    assert {note.what: note.why for note in made.without_effect}["604Fh"].startswith("ramps of vl are those of 6048h")
     with emulated(made) as drives:
         turning(drives, 300)
+
+
+# --- 6047h, and ramps by times ----------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def of_times(tmp_path_factory):
+    home = tmp_path_factory.mktemp("of_times")
+    path = home / "granit_fu1.eds"
+    path.write_bytes(files()["granit_fu1"])
+    return path, new_device(path, home / "made", find_motor(MOTOR))
+
+
+@pytest.fixture
+def timed(of_times):
+    """A drive without 6048h to 604Ah: 1,000 rpm are gained in 2 s, lost in 1 s, and in 0.25 s at a quick stop."""
+    with emulated(of_times[1]) as drives:
+        set_times(drives)
+        yield drives
+
+
+def set_times(drives):
+    for index, value in {0x604E: 1000, 0x604F: 2000, 0x6050: 1000, 0x6051: 250}.items():
+        drives.write(index, value)
+
+
+def test_604eh_is_gained_in_604fh_and_lost_in_6050h_and_at_a_quick_stop_in_6051h(timed):
+    t = np.arange(400)
+    motion.enable(timed, mode="vl")
+    motion.turn(timed, 200)
+    np.testing.assert_allclose(demand(timed, 0.4), np.minimum(0.5 * t, 200), atol=1)
+    assert one(timed, 0x6045) == one(timed, 0x6043) == 200
+    timed.write(0x6042, 0)
+    np.testing.assert_allclose(demand(timed, 0.4), np.maximum(200 - t, 0), atol=1)
+    motion.turn(timed, 200)
+    timed.advance(0.5)
+    timed.write(0x6040, cia402.QUICK_STOP)
+    np.testing.assert_allclose(demand(timed, 0.4), np.maximum(200 - 4.0 * t, 0), atol=1)
+
+
+def test_a_drive_as_commissioned_turns_by_its_times_and_needs_no_ramp_of_the_emulators_own(of_times):
+    made = of_times[1]
+    assert not any("6048h" in note.why for note in made.fill_in)
+    ours = {f"{index:X}h" for index in (0x6045, 0x6047, 0x604E, 0x604F, 0x6050, 0x6051)}
+    assert not ours & {note.what for note in made.without_effect}
+    with emulated(made) as drives:
+        turning(drives, 300)
+
+
+@pytest.mark.parametrize(
+    ("target", "turns", "limited"),
+    [(250, 250, False), (300, 280, True), (50, 100, True), (-250, -150, True), (-30, -40, True), (-120, -120, False)],
+)
+def test_6047h_limits_each_direction_within_6046h(timed, target, turns, limited):
+    for sub, value in enumerate((100, 400, 0, 150), 1):
+        timed.write((0x6047, sub), value)
+    timed.write((0x6046, 1), 40)
+    timed.write((0x6046, 2), 280)
+    timed.write(0x604F, 0)
+    motion.enable(timed, mode="vl")
+    motion.turn(timed, target)
+    assert demand(timed, 0.05)[-1] == turns
+    assert bool(one(timed, 0x6041) & LIMITED) is limited
+
+
+def test_our_master_reads_the_ramp_of_a_quick_stop_from_604eh_and_6051h(of_times, timed):
+    """250 ms for 1,000 rpm allow 4,000 rpm, a second; 2,000 ms allow 500."""
+    world = World(lockstep=True)
+    world.add(timed, [NODE])
+    bus = WorldBus(world)
+    with CanDrives(eds=of_times[0], bus=bus, nodes=(NODE,), pace="lockstep") as drives:
+        set_times(timed)  # a drive that is found anew has its stored ones
+        motion.enable(drives, mode="vl")
+        motion.turn(drives, 600)
+        drives.advance(1.4)
+        assert rpm(timed) == pytest.approx(600, rel=0.02)
+        for name, value in ((0x6051, 2000), (0x604E, 100)):
+            with pytest.raises(SafetyError, match="would not stop it within 1 s"):
+                drives.write(name, value)
+        motion.turn(drives, 0)
+        drives.advance(1.0)
+        drives.write(0x6051, 2000)
+        with pytest.raises(SafetyError, match=r"is beyond the limit 500.* it \(in vl 604Eh\) stops"):
+            motion.turn(drives, 600)
+    bus.shutdown()
+    world.close()
 
 
 # --- over a bus, by our master, with its limits -----------------------------------------------------------------------

@@ -12,6 +12,7 @@ from drive_env.commands.one_axis import (
     STANDSTILL,
     MaxCurrent,
     MoveOutcome,
+    NoWatchdog,
     OneAxis,
     check_axis,
     limits_of,
@@ -81,6 +82,7 @@ def home(
     eds: Eds = None,
     within: Annotated[float, typer.Option(help="Longest time that homing an axis may take [s].")] = 60.0,
     max_current: MaxCurrent = None,
+    no_watchdog: NoWatchdog = False,
     yes: Yes = False,
     json: Json = False,
     dry_run: WouldDo = False,
@@ -101,7 +103,7 @@ def home(
         check_time("--within", within)
         if not description.has(cia402.HOMING_METHOD):
             raise ValueError(f"{description.name} has no homing: its EDS lacks 6098h")
-        limits = limits_of(description, max_current)
+        limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
         if dry_run:
             bus.look_first(eds)
         with bus.connect(eds, safety=limits, cycle=cycle_for(description)) as drives:

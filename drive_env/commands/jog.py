@@ -15,6 +15,7 @@ from drive_env.commands.one_axis import (
     STANDSTILL,
     MaxCurrent,
     MoveOutcome,
+    NoWatchdog,
     OneAxis,
     Recording,
     check_axis,
@@ -52,6 +53,7 @@ def jog(
     bus: AxisOptions,
     eds: Eds = None,
     max_current: MaxCurrent = None,
+    no_watchdog: NoWatchdog = False,
     out: Recording = None,
     json: Json = False,
     dry_run: WouldDo = False,
@@ -67,7 +69,7 @@ def jog(
 
         description = describe(bus.device, eds)
         check_axis(description, bus.axis)
-        limits = limits_of(description, max_current)
+        limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
         files = None if out is None else new_files(out)

@@ -31,6 +31,7 @@ COLUMNS = (
     Column("times the\nrotor's"),
     Column("torque\nmargin"),
     Column("speed\nmargin"),
+    Column("encoder\nmargin"),
 )
 
 
@@ -119,6 +120,7 @@ def print_proposal(
             f"{axis.inertia_ratio:.2g}",
             f"{axis.torque_margin:.3g}",
             f"{axis.speed_margin:.3g}",
+            f"{axis.encoder_margin:.3g}",
         ))  # fmt: skip
     print_table(COLUMNS, rows)
     print_lines(f"{row.name or '(no name)'}: no drive: {row.refusal}" for row in found if row.refusal)
@@ -164,6 +166,6 @@ def _span(low: float, high: float) -> str:
 
 def _margins(axis: Any) -> str:
     return (
-        f"{axis.torque_margin:.2g} of torque, {axis.speed_margin:.2g} of speed and {axis.inertia_ratio:.2g} times its "
-        "rotor's inertia"
+        f"{axis.torque_margin:.2g} of torque, {axis.speed_margin:.2g} of speed, {axis.encoder_margin:.2g} of the "
+        f"encoder's resolution and {axis.inertia_ratio:.2g} times its rotor's inertia"
     )

@@ -10,6 +10,7 @@ from drive_env import cia402
 from drive_env.commands.one_axis import (
     LEAST,
     MaxCurrent,
+    NoWatchdog,
     OneAxis,
     Recording,
     check_axis,
@@ -46,6 +47,7 @@ def move(
     bus: AxisOptions,
     eds: Eds = None,
     max_current: MaxCurrent = None,
+    no_watchdog: NoWatchdog = False,
     out: Recording = None,
     yes: Yes = False,
     json: Json = False,
@@ -61,7 +63,7 @@ def move(
 
         description = describe(bus.device, eds)
         check_axis(description, bus.axis)
-        limits = limits_of(description, max_current)
+        limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
         files = None if out is None else new_files(out)
         if dry_run:
             bus.look_first(eds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -24,9 +25,18 @@ if TYPE_CHECKING:
 MaxCurrent = Annotated[
     str | None, typer.Option(help="Current limit, set in the drive for the movement; by default the drive's own.")
 ]
+NoWatchdog = Annotated[
+    bool,
+    typer.Option(
+        "--no-watchdog",
+        help="Move a drive that has no watchdog over its master (neither 1016h nor 100Ch): it runs on if this process "
+        "or the cable dies. Keep the emergency stop at hand.",
+    ),
+]
 Recording = Annotated[
     Path | None, typer.Option(help="Record the movement, as scope does: new files OUT.csv and OUT.png.")
 ]
+WATCHDOGS = (0x1016, 0x100C)  # heartbeat consumer, life guarding
 POSITION = (cia402.POSITION_ACTUAL, 0)
 # Of each mode: the object that keeps an axis from moving if it is 0, its words, and a value for it.
 PROFILE = ((cia402.PROFILE_ACCELERATION, 0), "profile acceleration 6083h", "6083 '500 rev/s^2'")
@@ -220,14 +230,25 @@ def check_axis(description: Description, axis: int) -> None:
         raise ValueError(f"--axis {axis}: a {description.name} has {description.num_axes} axes, from 0")
 
 
-def limits_of(description: Description, max_current: str | None) -> Limits:
-    """Return the envelope's limits for --max-current; ValueError for one that the drive cannot have."""
+def limits_of(description: Description, max_current: str | None, interface: str | None, *, no_watchdog: bool) -> Limits:
+    """Return the envelope's limits for --max-current and --no-watchdog; ValueError for what the drive cannot have."""
     from drive_env.dictionary import quantities
     from drive_env.dictionary.roles import Role
     from drive_env.drives.limits import Limits
+    from drive_env.master.open_drives import is_ethercat
 
+    limits = Limits()
+    if no_watchdog:
+        has = [index for index in WATCHDOGS if description.has((index, 0)) or description.has((index, 1))]
+        if has or is_ethercat(interface):
+            what = f"{has[0]:04X}h" if has else "that of its process data"
+            raise ValueError(
+                f"--no-watchdog: a {description.name} has a watchdog over its master ({what}), and is not moved "
+                "without it; leave the option out"
+            )
+        limits = Limits(silence=None)
     if max_current is None:
-        return Limits()
+        return limits
     device = description.device
     if device is not None and Role.CURRENT_LIMIT not in device.roles:
         name = next((row for row in device.gains.rows if row.name == "run_current"), None)
@@ -239,7 +260,7 @@ def limits_of(description: Description, max_current: str | None) -> Limits:
     current = quantities.parse(max_current, description.dictionary.find(cia402.TORQUE_ACTUAL), None)
     if current <= 0:
         raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
-    return Limits(current=current)
+    return replace(limits, current=current)
 
 
 @contextlib.contextmanager

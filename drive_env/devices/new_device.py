@@ -461,7 +461,8 @@ class _Draft:
         others = [
             row
             for row in NEEDED
-            if row.field not in fields and (not row.modes or any(mode in self._modes for mode in row.modes))
+            if not {row.field, row.unless} & fields
+            and (not row.modes or any(mode in self._modes for mode in row.modes))
         ]
         for offset, (title, rows) in enumerate(zip(OWN_TITLES, (GAINS, MOTOR, others), strict=True)):
             for sub, row in enumerate(rows, 1):
@@ -595,7 +596,8 @@ class _Draft:
                 Note(
                     f"{CONSUMER_HEARTBEAT:04X}h and {GUARD_TIME:04X}h",
                     "the EDS has neither: the drive does not notice when its master dies, and goes on with what it was "
-                    "last told. A master moves it with Limits(silence=None) alone; keep the emergency stop at hand",
+                    "last told. Only jog, move and home with --no-watchdog move it, or Limits(silence=None) in Python; "
+                    "keep the emergency stop at hand",
                 )
             )
         fixed = [f"{index:04X}h" for index in sorted(indices) if self._is_fixed_pdo(index)]

@@ -35,6 +35,7 @@ class OwnObject(NamedTuple):
         why: What the EDS lacks.
         role: The part that it plays; "" for none.
         modes: Modes of operation that need it; empty: every drive does.
+        unless: A field that does the same where an object has it; "" for none.
     """
 
     name: str
@@ -44,6 +45,7 @@ class OwnObject(NamedTuple):
     why: str = ""
     role: str = ""
     modes: Sequence[int] = ()
+    unless: str = ""
 
 
 _DATA = read_toml(Path(__file__).parent / "standard.toml")

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from drive_env.devices import Device
+from drive_env.devices.gains import BASELINE_RULE, VELOCITY_FILTER_DAMPING, small_time_constants
 from drive_env.emulator.inertia_check import MAX_INERTIA_RATIO
 from drive_env.motors import Motor
 from mechanics.joint_loads import JointLoad
@@ -35,6 +36,7 @@ class AxisProposal(NamedTuple):
         inertia_ratio: The same over the rotor's.
         torque_margin: The motor's rated torque, or what the drive has current for, over the most that the move takes.
         speed_margin: The motor's rated speed on the drive's supply over that of the move.
+        encoder_margin: As `encoder_margin`.
     """
 
     gear: float
@@ -42,11 +44,13 @@ class AxisProposal(NamedTuple):
     inertia_ratio: float
     torque_margin: float
     speed_margin: float
+    encoder_margin: float
 
     @property
     def least_margin(self) -> float:
-        """The least of both margins and of the largest inertia ratio over this one."""
-        return min(self.torque_margin, self.speed_margin, MARGIN * MAX_INERTIA_RATIO / self.inertia_ratio)
+        """The least of the three margins and of the largest inertia ratio over this one."""
+        inertia = MARGIN * MAX_INERTIA_RATIO / self.inertia_ratio
+        return min(self.torque_margin, self.speed_margin, self.encoder_margin, inertia)
 
 
 class DriveProposal(NamedTuple):
@@ -67,6 +71,26 @@ def demand(joint: JointLoad, move_time: float) -> Demand:
     return Demand(1.5 * way / move_time, 4.5 * way / move_time**2)
 
 
+def encoder_margin(device: Device, motor: Motor, inertia: float) -> float:
+    """Return the rated torque over what the velocity loop answers one count of the encoder with.
+
+    A count of angle q comes out of the velocity filter, a second-order low-pass of corner w, as a speed of up to
+    q w exp(-d acos(d) / sqrt(1 - d^2)), and the loop answers it with J w_v times that, w_v as the baseline rule has it.
+    Below 1 gains are noisy, or too slow to overcome friction: `drive-tune auto` tuned a disc on three motors with 2,048
+    and 4,096 counts wherever this was 1.05 or more, and on one of them below, at 0.68.
+
+    Args:
+        device: The drive.
+        motor: The motor.
+        inertia: What its rotor turns, with its own [kg*m^2].
+    """
+    corner, d = device.stage["velocity_filter"].default, VELOCITY_FILTER_DAMPING
+    peak = 2.0 * math.pi * corner * math.exp(-d * math.acos(d) / math.sqrt(1.0 - d * d))
+    count = 2.0 * math.pi / motor.encoder_counts * peak
+    bandwidth = BASELINE_RULE.speed / float(small_time_constants(device, corner, BASELINE_RULE.current_hz))
+    return device.torque_of(motor) / (inertia * bandwidth * count)
+
+
 def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, move_time: float) -> AxisProposal:
     """Return the margins of a gear between a motor and a joint in a move over the joint's range.
 
@@ -79,8 +103,9 @@ def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, m
     rated_speed = motor.rated_speed * device.supply_of(motor) / motor.voltage
     inertia = joint.inertia.high / gear**2
     return AxisProposal(
-        gear, inertia, inertia / motor.inertia, device.torque_of(motor) / torque, rated_speed / (gear * speed)
-    )
+        gear, inertia, inertia / motor.inertia, device.torque_of(motor) / torque, rated_speed / (gear * speed),
+        encoder_margin(device, motor, inertia + motor.inertia),
+    )  # fmt: skip
 
 
 def propose_drives(

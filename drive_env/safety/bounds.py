@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import Context, find_unit, split_unit
 from drive_env.drives.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
 from drive_env.fieldbus.errors import RefusedError
-from drive_env.safety.objects import CURRENT, POSITION, VELOCITY, VL_QUICK_STOP, VL_TARGET, VL_VELOCITY
+from drive_env.safety.objects import CURRENT, POSITION, VELOCITY, VL_BY_TIME, VL_QUICK_STOP, VL_TARGET, VL_VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 from mechanics.arrays import Floats, Integers, Mask
 
@@ -39,7 +40,7 @@ ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (
 COUNTED = "pps"  # speeds in increments per second
 BY_RATIO = ("velocity unit", "velocity unit/s")  # of which two objects say how many rpm they are
 TARGET_UNIT = "set-point unit"  # of which two more say how many of those it is
-VL_SPEEDS = range(cia402.VL_TARGET_VELOCITY, cia402.VL_QUICK_STOP + 1)  # whose unit the standard knows
+VL_SPEEDS = (*range(cia402.VL_TARGET_VELOCITY, cia402.VL_QUICK_STOP + 1), cia402.VL_REFERENCE)  # of the standard
 BY_MINUTE = ("rpm", "rpm/s")  # which the scale of positions turns into increments; other units are not set off
 # A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
 SETTLED, SETTLED_TURNS = 200.0, 0.02
@@ -371,20 +372,30 @@ def _rate(drives: WatchedDrives, key: Key, rotor: RotorAngle) -> Floats:
     return np.asarray(read_own(drives, key, 0) * np.nan_to_num(count), float)
 
 
-def vl_rate(speed: Integers, time: Integers, rotor: RotorAngle) -> Floats:
-    """Return a deceleration of vl [inc/s^2]; 0 where the scale or the speed is not known, infinite without a time."""
+def read_vl_rate(
+    drives: WatchedDrives, keys: tuple[Key, Key], rotor: RotorAngle, written: Mapping[Key, Integers] | None = None
+) -> Floats:
+    """Return the deceleration of a ramp of vl [inc/s^2]; 0 where drive or scale have none, infinite without a time.
+
+    Args:
+        drives: The drives.
+        keys: The ramp, a speed and a time in s; where it has no speed, that of 604Eh counts.
+        rotor: Their scale.
+        written: Values that some of these objects will have, (num_axes,) each.
+    """
     count = np.nan_to_num(increments_per_count(BY_RATIO[0], rotor))
-    return np.asarray(np.where(time > 0, speed * count / np.maximum(time, 1), np.where(speed > 0, np.inf, 0.0)), float)
-
-
-def read_vl_rate(drives: WatchedDrives, keys: tuple[Key, Key], rotor: RotorAngle) -> Floats:
-    """Return the deceleration of a ramp of vl [inc/s^2], as `vl_rate` has it; 0 where the drive has none."""
-    speed, time = (read_own(drives, key, absent) for key, absent in zip(keys, (0, 1), strict=True))
-    return vl_rate(speed, time, rotor)
+    found, written = np.zeros(drives.num_axes), written or {}
+    for pair, per_second in ((keys, 1.0), (VL_BY_TIME[keys], 1e3)):
+        if not all(drives.description.has(key) for key in pair):
+            continue
+        speed, time = (written[key] if key in written else read_own(drives, key, 0) for key in pair)
+        rate = np.where(time > 0, speed * count * per_second / np.maximum(time, 1), np.where(speed > 0, np.inf, 0.0))
+        found = np.where(found > 0.0, found, rate)
+    return found
 
 
 def _braking(drives: WatchedDrives, rotor: RotorAngle, in_vl: Mask | None) -> Floats:
-    """Return the deceleration of a quick stop [inc/s^2]: 6085h, and in vl 604Ah where it is set; 0: not known."""
+    """Return the deceleration of a quick stop [inc/s^2]: 6085h, in vl 604Ah or 6051h where set; 0: not known."""
     ramp = _rate(drives, QUICK_STOP_DECELERATION, rotor)
     if in_vl is None:
         return ramp

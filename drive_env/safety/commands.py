@@ -27,7 +27,6 @@ from drive_env.safety.bounds import (
     read_vl_rate,
     speed_in,
     unit_of,
-    vl_rate,
 )
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
@@ -55,7 +54,9 @@ from drive_env.safety.objects import (
     UNRAMPED_MODES,
     VELOCITY_OFFSET,
     VL,
+    VL_BRAKING,
     VL_QUICK_STOP,
+    VL_REFERENCE,
     VL_TARGET,
 )
 from drive_env.safety.rotor import scale_objects
@@ -286,7 +287,7 @@ class Commands:
                 self._check_jumps(entry, raw + other, where)
         elif key == QUICK_STOP_DECELERATION:
             self._check_braking(entry, raw, where)
-        elif key in VL_QUICK_STOP:
+        elif key in VL_BRAKING:
             self._check_vl_braking(entry, raw, where)
         elif key == MODE:
             self.check_modes(where & self._axes.may_turn, raw)
@@ -474,11 +475,10 @@ class Commands:
 
     def _check_vl_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Raise SafetyError for a ramp of a quick stop in vl that would let an axis that is turning run on."""
-        other = [read_own(self._drives, key, 0) for key in VL_QUICK_STOP]
-        is_speed = (entry.index, entry.sub) == VL_QUICK_STOP[0]
+        key = entry.index, entry.sub
         raw = np.atleast_2d(raw)
-        raw = raw.min(axis=0) if is_speed else raw.max(axis=0)
-        ramp = vl_rate(*((raw, other[1]) if is_speed else (other[0], raw)), self._axes.rotor)
+        raw = raw.min(axis=0) if key in (VL_QUICK_STOP[0], VL_REFERENCE) else raw.max(axis=0)
+        ramp = read_vl_rate(self._drives, VL_QUICK_STOP, self._axes.rotor, {key: raw})
         where = where & (self._modes() == VL) & np.isfinite(ramp)
         self._check_stops_turning(entry, raw, ramp, where)
         count = np.nan_to_num(self._limits.bounds().count, nan=1.0)
@@ -603,7 +603,8 @@ class Commands:
         bounds = self._limits.bounds()
         by_ramp = bounds.braking[axis] * STOP_WITHIN / np.nan_to_num(bounds.count[axis], nan=1.0)
         if 0.0 < by_ramp <= bounds.velocity[axis] + 1e-6:
-            in_vl = " (in vl 604Ah)" if self._drives.description.has(VL_QUICK_STOP[0]) else ""
+            own = next((key[0] for key in VL_BRAKING[::2] if self._drives.description.has(key)), None)
+            in_vl = "" if own is None else f" (in vl {own:04X}h)"
             return f"the quick stop's ramp, 6085h: no axis may be faster than it{in_vl} stops within {STOP_WITHIN:g} s"
         if bounds.default_speed[axis]:
             return "Limits(velocity=...): this drive has no limit of its own; 6,000 rpm is used"

@@ -54,7 +54,7 @@ from drive_env.safety.objects import (
     SET_POINTS,
     STATUSWORD,
     STORE,
-    VL_QUICK_STOP,
+    VL_BRAKING,
 )
 from drive_env.safety.rotor import HOME_OFFSET, scale_objects
 from drive_env.safety.stop_runner import RAMPS, SLOW_DOWN_RAMPS, StopRunner
@@ -73,7 +73,7 @@ DEVICE_OBJECTS = 0x2000  # below are those of communication
 # Limits of the drives themselves, and what tells their stopping distance.
 _BOUNDS = (
     POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, QUICK_STOP_DECELERATION, ACCELERATION,
-    DECELERATION, HOME_OFFSET, *VL_QUICK_STOP,
+    DECELERATION, HOME_OFFSET, *VL_BRAKING,
 )  # fmt: skip
 
 

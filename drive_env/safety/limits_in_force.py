@@ -27,7 +27,7 @@ from drive_env.safety.bounds import (
     speed_in,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.objects import POSITION, VL, VL_MAX, VL_QUICK_STOP
+from drive_env.safety.objects import POSITION, VL, VL_BRAKING, VL_MAX
 from drive_env.safety.rotor import HOME_OFFSET, read_ratios, read_scale
 from mechanics.arrays import Floats, Integers
 
@@ -65,7 +65,7 @@ class LimitsInForce:
         self._drives = drives
         self._axes = axes
         self._lending = lending
-        self._has_vl_ramp = drives.description.has(VL_QUICK_STOP[0])
+        self._has_vl_ramp = any(drives.description.has(key) for key in VL_BRAKING)
         self._in_vl = np.zeros(drives.num_axes, bool)  # as the limits were read last
         self._of_rotors = self._capture()
 

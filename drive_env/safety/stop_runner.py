@@ -32,6 +32,7 @@ from drive_env.safety.objects import (
     QUICK_STOP_OPTION,
     VL,
     VL_DECELERATION,
+    VL_REFERENCE,
 )
 from drive_env.safety.stop_ends import LATENCY, ends_by_itself, outside, stop_way
 from drive_env.safety.stopping import GRACE, REPEAT, SHARE, AxisStop, Phase, Sample, Stop
@@ -60,7 +61,7 @@ SLOW_DOWN_RAMPS = {
     (cia402.PROFILE_DECELERATION, 0): (),
     (cia402.PROFILE_ACCELERATION, 0): (PV,),
     HOMING_RAMP: (HM,),
-    **dict.fromkeys(VL_DECELERATION, (VL,)),
+    **dict.fromkeys((*VL_DECELERATION, VL_REFERENCE), (VL,)),
 }
 # Option codes of 605Ah that end in switch on disabled, and those with the same ramp that end in quick stop active.
 _ENDS_HELD = {1: 5, 2: 6}
@@ -180,7 +181,7 @@ class StopRunner:
                 continue
             count = increments_per_count(unit_of(self._drives.description, key), self._axes.rotor)
             own: Floats = np.asarray(read_own(self._drives, key, 0) * np.nan_to_num(count), float)
-            if key in VL_DECELERATION:
+            if key in (*VL_DECELERATION, VL_REFERENCE):
                 own = read_vl_rate(self._drives, VL_DECELERATION, self._axes.rotor)
             counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode without a ramp of its own has 6084h
             ramp = np.where(counts & np.isin(self._axes.mode, modes or self._axes.mode), np.minimum(ramp, own), ramp)

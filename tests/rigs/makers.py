@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rigs.small_eds import FOLDER
+from rigs.small_eds import FOLDER, entry
 
 TYPES = {"i8": 2, "i16": 3, "i32": 4, "u8": 5, "u16": 6, "u32": 7, "text": 9}
 # Index and sub-index, type, access, default, whether a PDO carries it, name.
@@ -187,7 +187,19 @@ def files() -> dict[str, bytes]:
             changed = manner.changed | {key: value for key, value in part.items() if key not in own}
             made = Manner(**{**vars(manner), **own, "changed": changed, "parts": ()})
             found[f"{name}_{k + 1}"] = made_file(made, name.capitalize(), k + 1)
-    return found
+    return found | {"granit_fu1": _with_ramp_times(found["granit_fu3"])}
+
+
+def _with_ramp_times(inverter: bytes) -> bytes:
+    """Return an inverter's file with 6047h, and three times in ms, 604Fh to 6051h, in place of 6048h to 604Ah."""
+    head, rest = inverter.decode().split("[6048]", 1)
+    names = ("reference", "ramp function time", "slow down time", "quick stop time")
+    more = entry("6045", "vl manipulated velocity", data_type="0x0003", access="ro", DefaultValue="0")
+    more += entry("6047", "vl velocity min max", kind="0x9", data_type=None, access=None, SubNumber="5")
+    more += entry("6047sub0", "Entries", data_type="0x0005", access="const", DefaultValue="4")
+    more += "".join(entry(f"6047sub{sub}", f"Limit {sub}", DefaultValue="0") for sub in range(1, 5))
+    more += "".join(entry(f"{0x604E + k:X}", f"vl {name}", DefaultValue="0") for k, name in enumerate(names))
+    return f"{head}{more}[604B]{rest.split('[604B]', 1)[1]}".encode()
 
 
 def made_file(manner: Manner, vendor: str, number: int) -> bytes:

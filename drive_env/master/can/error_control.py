@@ -133,7 +133,8 @@ class ErrorControl:
         if self.kind == "none":
             raise NoWatchdogError(
                 f"node {self._node} would not stop by itself when this process dies: it has neither a heartbeat "
-                f"consumer (1016h) nor life guarding (100Ch); {REMEDY}"
+                "consumer (1016h) nor life guarding (100Ch); to move it all the same, keep the emergency stop at hand "
+                "and give --no-watchdog to jog, move or home, or open it in Python with Limits(silence=None)"
             )
 
     def _have_it_stop(self) -> None:
