@@ -194,7 +194,7 @@ def test_a_signal_at_many_frames_leaves_no_axis_running(emulated, programs, name
 # --- the harness finds what it is for -------------------------------------------------------------------------------
 @posix_only
 def test_the_verdict_sees_a_program_without_an_envelope_that_is_killed(emulated, programs):
-    found = run_and_signal(emulated, programs, "cst_play", "SIGKILL", 150, 1, safety=False, within=0.5)
+    found = run_and_signal(emulated, programs, "cst_play", "SIGKILL", 150, 1, safety=False, within=1.0)
     assert [os.waitstatus_to_exitcode(status) for status in programs.ended.values()][-1] == -signal.SIGKILL
     assert any("left in OPERATION_ENABLED" in one for one in found)
     assert any("turns at" in one for one in found)
