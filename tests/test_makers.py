@@ -286,7 +286,8 @@ def test_a_drive_without_a_watchdog_is_refused_with_the_remedy_and_moves_with_it
     why = told(device)["1016h and 100Ch"]
     assert "the drive does not notice when its master dies" in why and "Limits(silence=None)" in why
     world = World(lockstep=False)
-    world.add(emulated(device), [NODE])
+    inside = emulated(device)
+    world.add(inside, [NODE])
     hub = Hub()
     where = {"interface": "slcan", "channel": hub.channel, "nodes": (NODE,), "eds": path}
     try:
@@ -302,8 +303,11 @@ def test_a_drive_without_a_watchdog_is_refused_with_the_remedy_and_moves_with_it
             asked = ["jog", "2048", "--for", "0.1", *named]
             found = CliRunner().invoke(app, [*asked, "--eds", str(path)])
             assert found.exit_code == 1 and "give --no-watchdog to jog, move or home" in found.stderr
-            found = CliRunner().invoke(app, [*asked, "--eds", str(path), "--no-watchdog"])
-            assert found.exit_code == 0, found.output
+            unwatched = (*named, "--eds", str(path), "--no-watchdog")
+            for words in (asked[:4], ["home", "--method", "35", "--yes"], ["move", "2048", "--yes"]):
+                found = CliRunner().invoke(app, [*words, *unwatched])
+                assert found.exit_code == 0, found.output
+            assert abs(inside.read(0x6064)[0] - 2048) < 82 and inside.read(0x6041)[0] & 0x6F != 0x27
             found = CliRunner().invoke(app, [*asked, "--no-watchdog"])
             assert found.exit_code == 2 and "a tmcm1636 has a watchdog over its master (1016h)" in found.stderr
     finally:

@@ -100,8 +100,8 @@ class Watch:
     def begin(self) -> None:
         """Start the thread, unless it runs, or time waits for the program.
 
-        Until `first_look` has seen every axis it only keeps the watchdogs quiet: what is read and configured before
-        takes longer on a slow bus than a drive waits for its master.
+        Until `first_look` has seen every axis it only keeps the watchdogs quiet, while the program does not stall: what
+        is read and configured before takes longer on a slow bus than a drive waits for its master.
         """
         if not self._drives.time_waits and self._supervisor is None:
             self._missed = 0
@@ -309,9 +309,19 @@ class Watch:
         Raises:
             BusError: If the bus failed in one of them; the others are done all the same.
         """
+        if not self._has_seen_all:
+            if not self._stalls(time.monotonic() - self._alive):
+                self._watchdogs.keep()
+            return
         failure: BusError | None = None
-        looks = (self._obey_signal, self._stops.hold, self._look, self._go_on_stopping, self._look_after)
-        for act in (self._watchdogs.keep, *(looks if self._has_seen_all else ())):
+        for act in (
+            self._watchdogs.keep,
+            self._obey_signal,
+            self._stops.hold,
+            self._look,
+            self._go_on_stopping,
+            self._look_after,
+        ):
             try:
                 act()
             except SafetyError as error:
@@ -334,6 +344,10 @@ class Watch:
         with self._axes.lock:
             if self._stops.current is not None:
                 self._stops.step()
+
+    def _stalls(self, pause: float) -> bool:
+        """Return whether the program has made no call for longer than its limit; never without one."""
+        return self._limits.user.stall is not None and pause > self._limits.user.stall
 
     def _fail(self) -> None:
         """Send a last quick stop, and leave the drives to their watchdogs."""
@@ -389,12 +403,12 @@ class Watch:
             self._axes.is_armed = False  # the watchdogs are set anew once the program enables
             self._stops.stop_for(rival, "end one of them")
         pause = now - self._alive
-        stall = self._limits.user.stall
-        if stall is not None and pause > stall:
+        if self._stalls(pause):
             logger.error("the program did nothing for %.2f s: quick stop", pause)
             with self._axes.lock:
                 self._stops.begin(self._axes.may_turn, holds=True)
             self._pending = SafetyError(
                 f"the drives were quick-stopped: the program made no call for {pause:.2f} s with an axis enabled; "
-                f"the limit is {stall:g} s; disable the drives before long work, or set Limits(stall=...)"
+                f"the limit is {self._limits.user.stall:g} s; disable the drives before long work, or set "
+                "Limits(stall=...)"
             )
