@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -18,6 +19,7 @@ from numba import config, njit, types
 from numba.core import event
 
 from mechanics.kernel_files import KernelCache
+from mechanics.stage_compiler import StageCompiler, remembered_answers
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -36,31 +38,33 @@ UNCOUNTED: dict[str, Any] = {"_nrt": False}
 UNWRAPPED: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
-class _CollectorWaits(event.Listener):  # type: ignore[misc]  # Numba has no types
-    """Has Python's cyclic garbage collector wait while Numba compiles.
+class _QuickCompilation(event.Listener):  # type: ignore[misc]  # Numba has no types
+    """Has Numba remember its answers while it compiles, and Python's cyclic garbage collector wait.
 
     A compilation makes millions of objects that live until its end: to look through them again and again took a sixth
     of the whole. Numba compiles in one thread at a time.
     """
 
     def __init__(self) -> None:
-        self._nested, self._was_on = 0, False
+        self._nested, self._changed = 0, ExitStack()
 
     def on_start(self, event: event.Event) -> None:
-        """Switch it off at the outermost function."""
+        """Begin at the outermost function."""
         if self._nested == 0:
-            self._was_on = gc.isenabled()
-            gc.disable()
+            if gc.isenabled():
+                gc.disable()
+                self._changed.callback(gc.enable)
+            self._changed.enter_context(remembered_answers())
         self._nested += 1
 
     def on_end(self, event: event.Event) -> None:
-        """Switch it on again, whatever ended the compilation."""
+        """Put everything back, whatever ended the compilation."""
         self._nested -= 1
-        if self._nested == 0 and self._was_on:
-            gc.enable()
+        if self._nested == 0:
+            self._changed.close()
 
 
-event.register("numba:compile", _CollectorWaits())
+event.register("numba:compile", _QuickCompilation())
 
 
 def user_cache_folder() -> Path:
@@ -148,8 +152,8 @@ def cached(*, allocates: bool = True, source: str | None = None) -> Callable[[Fu
 
 
 def stage(function: Function) -> Function:
-    """Compile a function that kernels call, and they alone: Python would crash. It cannot make arrays."""
-    kernel: Any = njit(**OPTIONS, **UNCOUNTED, **UNWRAPPED)(function)
+    """Compile a function that kernels call, and they alone. It cannot make arrays."""
+    kernel: Any = njit(**OPTIONS, **UNCOUNTED, **UNWRAPPED, pipeline_class=StageCompiler)(function)
     specialised = kernel.get_call_template
 
     # Numba would compile it once more for each number that a caller has written out: the automaton's transitions seven
