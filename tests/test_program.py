@@ -25,6 +25,7 @@ import tuning.commands.cli
 from drive_env.commands import compile_bar, compiling, progress
 from drive_env.commands.program import AGAIN, Quiet, RepeatedLines, Verbose, say_as_much
 from drive_env.commands.progress import progress_on
+from drive_env.devices import device_names
 from mechanics import kernel_files
 
 APPS = {
@@ -162,12 +163,20 @@ def test_quiet_hides_bars_and_warnings(capfd):
     assert shown["--quiet",].output == ""
 
 
-def test_kernels_are_compiled_ahead_and_once():
-    first, second = (CliRunner().invoke(drive_env.commands.cli.app, ["compile", "--json"]) for _ in range(2))
+@pytest.mark.parametrize("devices", [[], device_names()])
+def test_kernels_are_compiled_ahead_and_once(devices):
+    first, second = (CliRunner().invoke(drive_env.commands.cli.app, ["compile", *devices, "--json"]) for _ in range(2))
     assert (first.exit_code, second.exit_code) == (0, 0), first.output
     assert json.loads(second.stdout)["compiled"] == 0
-    again = CliRunner().invoke(drive_env.commands.cli.app, ["compile"])
+    again = CliRunner().invoke(drive_env.commands.cli.app, ["compile", *devices])
     assert again.stdout.strip().startswith("nothing to compile: the kernels of these sources are in ")
+
+
+def test_a_device_that_is_not_there_is_named_before_anything_compiles(monkeypatch):
+    monkeypatch.setattr(compiling, "_use_drives", None)
+    result = CliRunner().invoke(drive_env.commands.cli.app, ["compile", "tmcm1636", "tmcm9999"])
+    assert result.exit_code == 2
+    assert "tmcm9999" in result.stderr
 
 
 @pytest.mark.slow
@@ -191,7 +200,7 @@ def test_after_that_drives_and_environments_compile_nothing(tmp_path):
 
 
 def test_kernels_that_cannot_be_kept_are_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiling, "STEPS", {})
+    monkeypatch.setattr(compiling, "_steps", lambda devices: {})
     monkeypatch.setenv("DRIVE_ENV_CACHE", str(tmp_path / "none"))
     result = CliRunner().invoke(drive_env.commands.cli.app, ["compile"])
     assert result.exit_code == 2

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
+from typing import Annotated
+
+import typer
 
 from drive_env.commands.options import Json, errors_as_exit_codes, print_json
 from drive_env.commands.progress import progress_on
+from drive_env.default_device import DEFAULT_DEVICE
 
 
-def compile_kernels(json: Json = False) -> None:
-    """Compile the kernels and store them, so that no program waits half a minute for its first result.
+def compile_kernels(
+    devices: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[DEVICE]...", help="Devices by name, or your own by path.", show_default=DEFAULT_DEVICE
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compile the kernels of devices and store them, so that no program waits half a minute for its first result.
 
     Once is enough for an installation: kernels are kept in the user's cache, or in DRIVE_ENV_CACHE, under a hash of
     the sources that they are made from. Do it in advance for workers of a cluster, and in a container's image.
@@ -20,11 +33,12 @@ def compile_kernels(json: Json = False) -> None:
     from mechanics.compiled import user_cache_folder
 
     with errors_as_exit_codes():
+        steps = _steps(devices or [DEFAULT_DEVICE])
         folder = user_cache_folder()
         before, began = set(folder.rglob("*.kernel")), time.monotonic()
         with progress_on(Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("", total=float(len(STEPS)))
-            for name, use in STEPS.items():
+            task = progress.add_task("", total=float(len(steps)))
+            for name, use in steps.items():
                 progress.update(task, description=f"kernels of {name}")
                 use()
                 progress.advance(task)
@@ -41,14 +55,26 @@ def compile_kernels(json: Json = False) -> None:
         print(f"nothing to compile: the kernels of these sources are in {folder}")
 
 
-def _use_drives() -> None:
+def _steps(devices: list[str]) -> dict[str, Callable[[], None]]:
+    """Return what compiles the kernels of devices, by its name on the progress bar.
+
+    Raises:
+        ValueError: There is no such device.
+    """
+    from drive_env.devices import find_device
+
+    found = [(find_device(name).name, name) for name in devices]
+    return {title: partial(_use_drives, name) for title, name in found} | {"environments": _use_environments}
+
+
+def _use_drives(device: str) -> None:
     """Run emulated drives as every program does; the third call of `record` is a prepared one."""
     from drive_env import EmulatedDrives, motion
 
-    with EmulatedDrives() as drives:
+    with EmulatedDrives(device=device) as drives:
         motion.enable(drives, "csv")
         for _ in range(3):
-            drives.record(["Statusword"], 0.002, play={"Target velocity": [0, 0]})
+            drives.record(["Statusword"], 0.002, play={"Target velocity": [[0] * drives.num_axes] * 2})
 
 
 def _use_environments() -> None:
@@ -64,6 +90,3 @@ def _use_environments() -> None:
         with_delays.step(np.zeros(with_delays.action_space.shape, np.float32))
     finally:
         with_delays.close()
-
-
-STEPS: dict[str, Callable[[], None]] = {"emulated drives": _use_drives, "environments": _use_environments}
