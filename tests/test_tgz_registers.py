@@ -50,6 +50,7 @@ DPosRevol 3905 3A05 rw|ASpeed 3906 3A06 ro|PosSpeed 3907 3A07 rw|Speed 3908 3A08
 Rdy 390A 3A0A rw|Type 390B 3A0B rw|BitsPerRevol 390C 3A0C rw
 """
 OVER_VOLTAGE, UNDER_VOLTAGE, BRAKE, MOTOR_HOT, FEEDBACK, COMMUTATION, OVER_SPEED, I2T = 3, 4, 6, 9, 12, 13, 14, 25
+BRAKE_SWITCH, BRAKE_SUPPLY = 7, 23
 
 
 def new_drives(load="inertia", **given):
@@ -286,6 +287,39 @@ def test_m_staticbrake_is_that_there_is_a_brake_to_release():
         assert errors(drives) == set()
         assert drives.machine.rotor_speed[0] == pytest.approx(200.0 * RPM, rel=0.05)
         assert int(drives.read("aDriveStatus")[0]) & 0x7F == 0x7F
+
+
+def test_a_brake_is_held_open_by_less_than_its_supply_and_closes_without_it():
+    """0.2 of the 24 V hold it (it drops out below), 0.6 pull it in; error 23 is there below 21.6 V."""
+    with braked() as drives:
+        drives.write("M-StaticBrake", 1)
+        turn(drives, 200, 0.3)
+        for volts, is_closed in ((22.0, False), (6.0, False), (4.0, True), (12.0, True), (15.0, False)):
+            drives.machine.set("stage.brake_supply", volts)
+            set_lanes(drives.inside.records, "drive_function", np.ones(1))  # held up, whatever the error commands
+            for _ in range(40):
+                drives.advance(0.001)
+                set_lanes(drives.inside.records, "drive_function", np.ones(1))
+            assert drives.machine.brake_is_closed[0] == is_closed, volts
+            assert (BRAKE_SUPPLY in errors(drives)) == (volts < 21.6)
+        drives.write("M-StaticBrake", 0)
+        drives.advance(0.002)
+        assert BRAKE_SUPPLY not in errors(drives), "without a brake nothing needs it"
+
+
+@pytest.mark.parametrize(("has_switch", "expected"), [(0.0, set()), (1.0, {BRAKE_SWITCH})])
+def test_a_worn_brake_that_no_longer_closes_is_seen_by_its_switch_alone(has_switch, expected):
+    with braked() as drives:
+        drives.write("M-StaticBrake", 1)
+        drives.machine.set("motor.brake_switch", has_switch)
+        turn(drives, 200, 0.3)
+        assert errors(drives) == set()
+        drives.machine.brake = "open"
+        motion.disable(drives)
+        drives.advance(0.15)
+        assert errors(drives) == set(), "it has time to follow its output"
+        drives.advance(0.15)
+        assert errors(drives) == expected
 
 
 def test_current_flows_before_the_brake_is_released_and_until_it_has_closed():
