@@ -92,6 +92,48 @@ def test_c_ti_is_the_time_in_which_the_integrator_adds_what_the_gain_gives():
         assert field(drives, "i_q") - first == pytest.approx(asked * (missing[0] - missing[1]), rel=0.01)
 
 
+def test_c_cogcompfac_is_the_share_of_the_cogging_that_a_current_takes_away():
+    """Of a held rotor the current is the cogging torque there over 3/2 n_p psi; of one that turns the ripple goes."""
+    torque, phase, ripples = 0.2, 0.7, []
+    for share in (0, 50, 100):
+        with new_drives() as drives:
+            write(drives, C_CogCompFac=share)
+            for name, value in (("torque", torque), ("phase", phase)):
+                drives.machine.set(f"motor.cogging_{name}", value)
+            drives.machine.brake = "closed"
+            motion.enable(drives, mode="cst")
+            drives.advance(0.05)
+            order, angle = drives.motor.cogging_order, float(drives.machine.rotor_angle[0])
+            constant = 1.5 * drives.motor.n_p * drives.motor.psi_m
+            expected = -share / 100.0 * torque * math.sin(order * angle + phase) / constant
+            assert field(drives, "i_q") == pytest.approx(expected, abs=2e-3)
+            motion.disable(drives)
+            drives.machine.brake = "open"
+            motion.enable(drives, mode="pv")
+            drives.write(cia402.TARGET_VELOCITY, "60 rpm")
+            drives.advance(0.8)
+            speeds = []
+            for _ in range(500):
+                drives.advance(0.001)
+                speeds.append(drives.machine.rotor_speed[0])
+            ripples.append(np.std(speeds))
+    assert ripples[1] == pytest.approx(0.5 * ripples[0], rel=0.2)
+    assert ripples[2] < 0.1 * ripples[0]
+
+
+def test_a_current_against_cogging_stays_within_the_limits_and_flows_in_an_axis_that_is_on_alone():
+    with new_drives() as drives:
+        write(drives, C_CogCompFac=100)
+        drives.machine.set("motor.cogging_torque", 50.0)
+        drives.machine.set("motor.cogging_phase", 0.5 * math.pi)
+        drives.machine.brake = "closed"
+        drives.advance(0.02)
+        assert field(drives, "i_q_ref") == 0.0
+        motion.enable(drives, mode="cst")
+        drives.advance(0.05)
+        assert field(drives, "i_q_ref") == field(drives, "i_low") < 0.0
+
+
 def test_v_k_and_v_ti_are_milliamperes_for_1000_rpm_and_the_time_that_doubles_them():
     with new_drives() as drives:
         write(drives, V_K=2000, V_Ti=0)

@@ -10,10 +10,13 @@ import math
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
+from rigs.coe_rig import CoeRig
 
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
+from drive_env.canopen.frames import Frame
 from drive_env.devices import find_device
 from drive_env.drives.currents import read_current_limit, write_current_limit
+from drive_env.ethercat.application import AlState
 from drive_env.firmware.record import get_lanes, set_lanes
 
 DEVICE = find_device("tgz_d")
@@ -49,7 +52,9 @@ Acc 3900 3A00 rw|Dec 3901 3A01 rw|APosAngle 3902 3A02 ro|APosRevol 3903 3A03 ro|
 DPosRevol 3905 3A05 rw|ASpeed 3906 3A06 ro|PosSpeed 3907 3A07 rw|Speed 3908 3A08 rw|Mode 3909 3A09 rw
 Rdy 390A 3A0A rw|Type 390B 3A0B rw|BitsPerRevol 390C 3A0C rw
 """
+REGISTERS = [found.split() for line in TABLE.split("\n") for found in filter(None, line.split("|"))]
 OVER_VOLTAGE, UNDER_VOLTAGE, BRAKE, MOTOR_HOT, FEEDBACK, COMMUTATION, OVER_SPEED, I2T = 3, 4, 6, 9, 12, 13, 14, 25
+BRAKE_SWITCH, BRAKE_SUPPLY = 7, 23
 
 
 def new_drives(load="inertia", **given):
@@ -80,18 +85,37 @@ def turn(drives, speed, seconds=0.4):
 # --- the table ----------------------------------------------------------------------------------------------------
 def test_the_dictionary_has_the_makers_table():
     """Number of both axes and access of each register; a name has its group where it would be unclear without."""
-    known, seen = DEVICE.new_dictionary(), 0
-    for line in TABLE.split("\n"):
-        for found in filter(None, line.split("|")):
-            name, first, second, access = found.split()
-            assert known.find((int(first, 16), 0)).access == access, name
-            if second != "-":
-                assert int(second, 16) == int(first, 16) + 0x100
-                entry = known.find((int(second, 16), 0))
-                assert DEVICE.locate(entry.index) == (1, int(first, 16)) and entry.access == access, name
-            assert known.find((int(first, 16), 0)).name.rpartition(" ")[2] == name
-            seen += 1
-    assert seen == 124
+    known = DEVICE.new_dictionary()
+    for name, first, second, access in REGISTERS:
+        assert known.find((int(first, 16), 0)).access == access, name
+        if second != "-":
+            assert int(second, 16) == int(first, 16) + 0x100
+            entry = known.find((int(second, 16), 0))
+            assert DEVICE.locate(entry.index) == (1, int(first, 16)) and entry.access == access, name
+        assert known.find((int(first, 16), 0)).name.rpartition(" ")[2] == name
+    assert len(REGISTERS) == 124
+
+
+@pytest.mark.parametrize("bus", ["can", "coe"])
+def test_each_register_is_read_with_32_bits_and_written_as_its_access_says(bus):
+    """By a master's SDO: what is read is written back, which what is read only refuses."""
+    with new_drives("gantry") as drives:
+        rig = Wire(drives) if bus == "can" else CoeRig(drives)
+        if bus == "coe":
+            rig.bring_to(AlState.PRE_OP)
+        for name, *numbers, access in REGISTERS:
+            for index in (int(number, 16) for number in numbers if number != "-"):
+                if bus == "can":
+                    request = b"\x40" + index.to_bytes(2, "little") + bytes(5)
+                    rig.node.receive(Frame(0x600 + rig.node.node_id, request), rig.now)
+                    (answer,) = rig.take()
+                    assert answer.data[0] == 0x43, name  # expedited, of four bytes
+                    refused = rig.download(index, 0, int.from_bytes(answer.data[4:8], "little"), 4)
+                else:
+                    data = rig.upload(index)
+                    assert len(data) == 4, name
+                    refused = rig.download(index, 0, data)
+                assert refused == (0 if access == "rw" else 0x06010002), (name, index)
 
 
 @pytest.mark.parametrize(
@@ -286,6 +310,39 @@ def test_m_staticbrake_is_that_there_is_a_brake_to_release():
         assert errors(drives) == set()
         assert drives.machine.rotor_speed[0] == pytest.approx(200.0 * RPM, rel=0.05)
         assert int(drives.read("aDriveStatus")[0]) & 0x7F == 0x7F
+
+
+def test_a_brake_is_held_open_by_less_than_its_supply_and_closes_without_it():
+    """0.2 of the 24 V hold it (it drops out below), 0.6 pull it in; error 23 is there below 21.6 V."""
+    with braked() as drives:
+        drives.write("M-StaticBrake", 1)
+        turn(drives, 200, 0.3)
+        for volts, is_closed in ((22.0, False), (6.0, False), (4.0, True), (12.0, True), (15.0, False)):
+            drives.machine.set("stage.brake_supply", volts)
+            set_lanes(drives.inside.records, "drive_function", np.ones(1))  # held up, whatever the error commands
+            for _ in range(40):
+                drives.advance(0.001)
+                set_lanes(drives.inside.records, "drive_function", np.ones(1))
+            assert drives.machine.brake_is_closed[0] == is_closed, volts
+            assert (BRAKE_SUPPLY in errors(drives)) == (volts < 21.6)
+        drives.write("M-StaticBrake", 0)
+        drives.advance(0.002)
+        assert BRAKE_SUPPLY not in errors(drives), "without a brake nothing needs it"
+
+
+@pytest.mark.parametrize(("has_switch", "expected"), [(0.0, set()), (1.0, {BRAKE_SWITCH})])
+def test_a_worn_brake_that_no_longer_closes_is_seen_by_its_switch_alone(has_switch, expected):
+    with braked() as drives:
+        drives.write("M-StaticBrake", 1)
+        drives.machine.set("motor.brake_switch", has_switch)
+        turn(drives, 200, 0.3)
+        assert errors(drives) == set()
+        drives.machine.brake = "open"
+        motion.disable(drives)
+        drives.advance(0.15)
+        assert errors(drives) == set(), "it has time to follow its output"
+        drives.advance(0.15)
+        assert errors(drives) == expected
 
 
 def test_current_flows_before_the_brake_is_released_and_until_it_has_closed():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from rigs.fault_injection import ObservedWorld, eds_read_once
@@ -80,3 +81,20 @@ def test_a_sweep_moves_both_axes_of_each_machine_with_a_points_gains():
     same = np.isclose(found.response.speed_rpm[: len(speed)], speed, rtol=0, atol=1e-6).all(axis=0)
     assert same.any(), "a point is as good as its worst axis, whose recording it has"
     assert (np.ptp(speed, axis=0) > excitation.velocity_rpm).all(), "both axes turn"
+
+
+def test_an_agent_tunes_the_speed_feed_forward_beside_the_loops():
+    """P-SFF is one of the gains that GainTuning's action may have; more of it from the rule's 0 is rewarded."""
+    chosen = ("velocity_p", "velocity_i", "position_p", "feed_forward")
+    own = {"device": "tgz_d", "gains": chosen, "distributions": {"parameters": {}}, "num_threads": 1}
+    with gymnasium.make("ServoDrive/GainTuning-v0", **own) as env:
+        assert env.action_space.shape == (len(chosen),)
+        _, info = env.reset(seed=1)
+        begun = info["gains"]
+        ahead = DEVICE.gains.column("feed-forward", "speed")
+        assert begun[0, ahead] == 0
+        total = sum(env.step(np.array([0.0, 0.0, 0.0, 1.0], np.float32))[1] for _ in range(2))
+        *_, info = env.step(np.zeros(len(chosen), np.float32))
+    assert total > 0.0
+    assert info["gains"][0, ahead] > 300
+    np.testing.assert_array_equal(np.delete(info["gains"], ahead, 1), np.delete(begun, ahead, 1))

@@ -188,6 +188,8 @@ def notes(device: Device, entry: Entry, by_place: dict[tuple[int, int], object])
         found.append("takes " + ranges(device.allowed_values[place]))
     if place in device.write_states:
         found.append(f"written in {device.write_states[place].replace('_', ' ').lower()} only")
+    if why := device.without_effect.get((device.locate(entry.index)[1], entry.sub)):
+        found.append(f"kept and shown, without effect: {why}")
     if place in device.unsupported:
         reason = device.unsupported[place]
         found.append(f"always refused: {reason}" if reason else "refused where the service behind it is not there")

@@ -197,6 +197,7 @@ class Device(NamedTuple):
     shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
     kept_bits: Mapping[tuple[int, int], int] = MappingProxyType({})  # of a value that is written; others are ignored
     num_outputs: int = 4
+    without_effect: Mapping[tuple[int, int], str] = MappingProxyType({})  # of the first axis -> why
     moved: Mapping[str, str] = MappingProxyType({})  # name or index of an earlier version -> what it is now
     mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
     # What process data above an object's range are taken as, `HIGHEST` or `MASK`; of others the object stays as it was.
@@ -436,6 +437,7 @@ def _device(
         ethercat=ethercat_of(data.get("ethercat")),
         about=data.get("about", "").strip(),
         parts=parts_of({parse_key(text): row for text, row in data.get("parts", {}).items()}, parse_key),
+        without_effect={parse_key(text): why for text, why in data.get("without_effect", {}).items()},
         moved=data.get("moved", {}),
         kept_bits={parse_key(text): int(mask) for text, mask in data.get("kept_bits", {}).items()},
         shared_values=frozenset(parse_key(text) for text in data.get("shared_values", [])),

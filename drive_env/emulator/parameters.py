@@ -134,6 +134,7 @@ _MAY_VANISH = (
     "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
     "short_conductance", "short_a", "short_b", "index_inverted", "brake_opens_in", "brake_closes_in", "noise",
     "dead_time", "resistance", "supply_sinks", "idle_power", "emergency_stop",
+    "mains_phase_lost", "brake_switch", "brake_supply",
 )  # fmt: skip
 
 

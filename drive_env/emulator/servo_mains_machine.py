@@ -37,6 +37,13 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
     return rows
 
 
+def wiring_parameters(motor: Motor) -> list[MachineParameter]:
+    """Return how the motor's cables may be wired, and what its brake is connected to, which is never drawn."""
+    brake = (("motor.brake_switch", "1", 0.0), ("stage.brake_supply", "V", 24.0))
+    rows = [MachineParameter(name, unit, value, value, value, value) for name, unit, value in brake]
+    return [*SERVO.wiring_parameters(motor), *rows]
+
+
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
     """Write the constants of stage and motor that are not parameters, and the drive's own data of its motor."""
     servo_machine.set_constants(records, device, motor)
@@ -74,7 +81,7 @@ def connect(records: Records, device: Device, axes: Mask) -> None:
 
 SERVO_MAINS = MachineKind(
     motor_parameters,
-    SERVO.wiring_parameters,
+    wiring_parameters,
     set_constants,
     {name: write for name, write in SERVO.writes.items() if name not in _NOT_HERE}
     | {
@@ -85,6 +92,8 @@ SERVO_MAINS = MachineKind(
         "stage.brake_thermal_time": field("brake_thermal_time"),
         "stage.mains_phase_lost": field("mains_phase_lost"),
         "stage.emergency_stop": field("emergency_stop"),
+        "stage.brake_supply": field("brake_supply"),
+        "motor.brake_switch": field("brake_switch"),
         "motor.brake_opens_in": field("brake_opens_in"),
         "motor.brake_closes_in": field("brake_closes_in"),
     },

@@ -49,7 +49,7 @@ class GainTuningConfig:
 
     load, device, motor, friction: As `EmulatedDrives` takes them; without a motor the device's usual one.
     gains: Which gains the action changes, of the device's: those of the TMCM-1636 are torque_p, torque_i, velocity_p,
-        velocity_i, position_p. None is those of the velocity and the position loop.
+        velocity_i, position_p; the TGZ-D has feed_forward, too. None is those of the velocity and the position loop.
     trials: Of an episode.
     step: Change of a gain's logarithm that an action of 1 makes; the reach of gains, 10.4, is the most that makes
         sense.

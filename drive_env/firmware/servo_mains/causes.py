@@ -1,8 +1,8 @@
 """What two-axis servo amplifiers on mains watch: the errors of the TGZ manual's table, by their physical cause.
 
-A cause's status flag is its bit of the error register. Errors without a cause in this model (an internal error, the
-brake's switch, the ramp of another axis, the supply of the brake) are those that a machine sets: error_bits does it for
-every error of the table.
+A cause's status flag is its bit of the error register. Of two errors the maker tells nothing that a machine could have:
+2 is an "internal hardware error" of no told kind, and of 18 there is a name alone. A machine sets them: error_bits does
+it for every error of the table.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drive_env.firmware.common import causes, fsa, start_up
-from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT
+from drive_env.firmware.common.brake import CLOSED, PULL_IN, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.common.modes import CSP, acts_as
 from drive_env.firmware.common.protection import (
     BLOCKS_NEGATIVE,
@@ -34,13 +34,15 @@ REVERSE_TIME = 0.01  # s of speeding up against the current, after which the com
 REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for
 OFF_TIME = 0.02  # s after which a stage that is off has no current: several times a winding's L/R
 STUCK_TIME = 0.1  # s of standing still under a brake that should be open
+SWITCH_TIME = 0.2  # s in which a brake must have followed its output, by its switch: several times what it needs
+BRAKE_SUPPLY = 21.6  # V: 24 V less 10 %, what holding brakes are specified for
 # Bits of 1001h (TGZ manual): current, voltage, temperature, communication.
 CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
 
 
 @stage
 def watch_motion(drive, lane, dt):
-    """Measure for how long an axis is off, outside its window, runs away, or stands under its brake."""
+    """Measure for how long an axis is off, outside its window, runs away, stands under its brake, or this is wrong."""
     drive.off_time[lane] = 0.0 if drive.stage_on[lane] > 0.0 else drive.off_time[lane] + dt
     window = drive.following_error_window[lane]
     error = abs(drive.position_demand[lane] - drive.theta_meas[lane])
@@ -74,6 +76,11 @@ def watch_motion(drive, lane, dt):
         and abs(slow) <= drive.standstill[lane]
     )
     drive.stuck_time[lane] = drive.stuck_time[lane] + dt if held else 0.0
+    by_stage = mode == WITH_STAGE and drive.stage_on[lane] == 0.0
+    is_closed = mode == CLOSED or by_stage or (mode == WITH_OUTPUT and drive.brake_opened[lane] == 0)
+    is_wrong = is_closed == (drive.brake_output[lane] >= PULL_IN)
+    watched = drive.brake_switch[lane] > 0.5 and drive.static_brake[lane] == 1
+    drive.switch_time[lane] = drive.switch_time[lane] + dt if watched and is_wrong else 0.0
 
 
 @stage
@@ -92,6 +99,12 @@ def mains_supply(drive, lane, told):
 def holding_brake(drive, lane, told):
     """Return whether the brake holds a motor that it should have let go."""
     return drive.stuck_time[lane] > STUCK_TIME
+
+
+@stage
+def holding_brake_switch(drive, lane, told):
+    """Return whether the brake's switch has shown another state than the commanded one for too long."""
+    return drive.switch_time[lane] > SWITCH_TIME
 
 
 @stage
@@ -177,6 +190,12 @@ def brake_resistance(drive, lane, told):
 
 
 @stage
+def brake_supply(drive, lane, told):
+    """Return whether there is a brake to be released, and too little voltage for it."""
+    return drive.static_brake[lane] == 1 and drive.brake_supply[lane] < BRAKE_SUPPLY
+
+
+@stage
 def i2t(drive, lane, told):
     """Return whether the stage's I2t budget is used up, or the motor has more than M-Inull in the mean."""
     return drive.overload[lane] > 1.0 or drive.mean_motor_current[lane] > drive.nominal_motor_current[lane]
@@ -228,7 +247,7 @@ CAUSES = (
     _error(4, "under_voltage", CUT, causes.undervoltage, register=VOLTAGE),
     _error(5, "sto", CUT, causes.shutdown_switch),
     _error(6, "holding_brake", CUT, holding_brake, held=True),
-    _error(7, "holding_brake_switch", STOP),
+    _error(7, "holding_brake_switch", STOP, holding_brake_switch, held=True),
     _error(8, "current_measurement", CUT, current_measurement, register=CURRENT),
     _error(9, "motor_thermostat", STOP, motor_thermostat, register=TEMPERATURE),
     _error(10, "ambient_temperature", STOP, ambient_temperature),
@@ -245,7 +264,7 @@ CAUSES = (
     _error(20, "emergency_stop", STOP, emergency_stop),
     _error(21, "igbt_driver_voltage", CUT, igbt_driver_voltage, register=CURRENT, held=True),
     _error(22, "brake_resistance", STOP, brake_resistance),
-    _error(23, "brake_supply", STOP),
+    _error(23, "brake_supply", STOP, brake_supply),
     _error(25, "i2t", STOP, i2t, held=True),
     _error(26, "motor_temperature", STOP, motor_temperature),
     _error(27, "motor_parameter", CUT, motor_parameter),

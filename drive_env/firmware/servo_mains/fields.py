@@ -45,6 +45,7 @@ PARAMETERS = (
     Field("feedback_pulses", "f8", "1/rev", "F-IncrEnc"),
     Field("external_pulses", "f8", "1/rev", "F-ExtIncrEnc; 0: there is no external encoder"),
     Field("current_integration", "f8", "s", "C-Ti: integration time of the current regulators; 0: no integrator"),
+    Field("cogging_compensation", "f8", "1", "C-CogCompFac: share of the motor's cogging that is compensated"),
     Field("velocity_integration", "f8", "s", "V-Ti: integration time of the velocity regulator; 0: no integrator"),
     Field("limit_negative", "f8", "1", "C-LimN: limit of negative currents, as amplitudes in units of M-Inull"),
     Field("limit_positive", "f8", "1", "C-LimP: the same of positive ones"),
@@ -81,11 +82,15 @@ PARAMETERS = (
     Field("switch_input", "f8", "", "input that the left, right and home switch are wired to", depth=3),
     Field("error_bits", "i4", "", "errors that are there, whatever the machine does: bit k is error k"),
     Field("emergency_stop", "f8", "", "1: the emergency stop button is pressed"),
+    Field("brake_supply", "f8", "V", "that the output of the holding brake is supplied with", 24.0),
+    Field("brake_switch", "f8", "", "1: the holding brake has a switch that shows whether it is closed"),
 )
 
 STATE = (
     *servo.STATE,
     *mains_link.STATE,
+    Field("block_compensates_cogging", "i4", "", "lane 0: 1 if a lane of this block compensates cogging"),
+    Field("cogging_current", "f8", "A", "amplitude of the current that compensates the cogging"),
     Field("i_low", "f8", "A", "least current that may be asked for"),
     Field("i_high", "f8", "A", "greatest current that may be asked for"),
     Field("cycle_seen", "f8", "s", "C-SetCycleTime that 60C2h has been set by", 1e-3),
@@ -113,6 +118,7 @@ STATE = (
     Field("omega_before", "f8", "rad/s", "omega_meas a period ago"),
     Field("off_time", "f8", "s", "for which the stage has been off"),
     Field("stuck_time", "f8", "s", "for which the brake has held the motor although it was to move"),
+    Field("switch_time", "f8", "s", "for which the brake's switch has not shown what the output commands"),
     Field("digital_inputs", "i4", "", "4000h: levels of the module's inputs, bits 0 to 7"),
     Field("input_word", "i4", "", "60FDh: the same in bits 16 to 23"),
     Field("axis_inputs", "i4", "", "Digital_Inputs: every second of them, from the axis' own on"),

@@ -12,13 +12,17 @@ current = M-Ipeak", 32767 is full limitation. Taken is the straight line between
 and what lies above 32767 is full limitation, too. C-LimN and C-LimP limit each sign besides, in thousandths of M-Inull
 (in mA of amplitude: C-Lim M-Inull / 1000, as the maker's page has it), V-LimN and V-LimP what the position loop asks
 for.
+
+C-CogCompFac is the share of the motor's cogging that a current takes away in every mode. "Before using function must be
+measured compensation data of motor" (the maker's page), and no register holds them: here they are those of the motor as
+it is, at the angle that its feedback tells.
 """
 
 from __future__ import annotations
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa
-from drive_env.firmware.common.arithmetic import between
+from drive_env.firmware.common.arithmetic import TWO_PI, between, sine_cosine
 from drive_env.firmware.common.modes import CSP, acts_as, is_blocked
 from drive_env.firmware.common.modes.cyclic import NO_SET_POINT
 from drive_env.firmware.record import LANES
@@ -91,3 +95,14 @@ def motion_loops(drive):
         drive.velocity_error[lane] = error
         drive.velocity_sum[lane] = total * on
         drive.i_q_ref[lane] = i_ref * on
+
+
+@inlined
+def compensate_cogging(drive):
+    """Add to i_q_ref [A] the current whose torque is opposite to the cogging at the angle of the feedback."""
+    for lane in range(LANES):
+        angle = TWO_PI * drive.turns_per_count[lane] * drive.count[lane]
+        s, _ = sine_cosine(drive.cogging_order[lane] * angle + drive.cogging_phase[lane])
+        wanted = drive.i_q_ref[lane] - drive.cogging_current[lane] * s
+        on = drive.drive_function[lane] > 0.0 or drive.holding[lane] == 1
+        drive.i_q_ref[lane] = between(wanted, drive.i_low[lane], drive.i_high[lane]) if on else drive.i_q_ref[lane]

@@ -3,8 +3,9 @@
 A feedback's resolution is told by its type (F-Type): by itself (Hiperface DSL, EnDat), by F-Resolution, or as four
 counts a pulse of F-IncrEnc. An external encoder of F-ExtIncrEnc pulses sits on the shaft of the module's first
 motor, and counts from power-on. With M-StaticBrake the drive moves a brake at its output: current flows for
-D-DelayUnbrake_Enable before the brake is released, and for D-DelayDisable_Brake after it was applied. The enable input
-must have been closed for D-DelayEnable_Hwen before an axis is enabled.
+D-DelayUnbrake_Enable before the brake is released, and for D-DelayDisable_Brake after it was applied. The output's
+current is as much of the largest as the brake's supply is of 24 V. The enable input must have been closed for
+D-DelayEnable_Hwen before an axis is enabled.
 """
 
 from __future__ import annotations
@@ -23,13 +24,20 @@ RMS_TIME = 0.1  # s, of the RMS currents
 PT1000, PT1000_SLOPE = 1000.0, 3.851e-3  # ohm at 0 degC, 1/K (IEC 60751, mean of 0 to 100 degC)
 COUNTER_PERIOD = 2.0**32
 ON, HARDWARE, SOFTWARE, RELEASED, NO_ERROR, INITIALISED, FIELDBUS = 1, 2, 4, 8, 16, 32, 64  # bits of aDriveStatus
+BRAKE_VOLTAGE = 24.0  # V, of the brake's supply
 INPUTS_AT = 2.0**28  # the lowest of the four inputs among them
 
 
 @inlined
 def read_settings(drive, dt):
-    """Write what settings are to the stages: counts, angle of commutation, delays and output of the brake."""
+    """Write what settings are to the stages: counts, angle of commutation, delays, output of the brake, cogging."""
+    drive.block_compensates_cogging[0] = 0
     for lane in range(LANES):
+        torque = drive.phase_factor[lane] * drive.n_p[lane] * drive.psi_nominal[lane]  # N m of an ampere
+        share = drive.cogging_compensation[lane]
+        drive.cogging_current[lane] = share * drive.cogging_torque[lane] / torque if torque > 0.0 else 0.0
+        if drive.cogging_current[lane] != 0.0:
+            drive.block_compensates_cogging[0] = 1
         kind = drive.feedback_type[lane]
         own = kind in (DSL, ENDAT)
         told = drive.encoder_counts[lane] / drive.encoder_interpolation[lane]
@@ -93,6 +101,7 @@ def energise(drive, lane, dt):
     if drive.holding[lane] == 1 and ready and drive.angle_source[lane] != alignment.DISABLED:
         drive.stage_on[lane] = 1.0
     brake.drive_output(drive, lane, dt)
+    drive.brake_output[lane] *= drive.brake_supply[lane] / BRAKE_VOLTAGE
     brake.follow_output(drive, lane, dt)
 
 

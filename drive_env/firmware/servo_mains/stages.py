@@ -23,6 +23,7 @@ from drive_env.firmware.servo.stages import (
 from drive_env.firmware.servo_mains import causes, d_mode, fields, own_commands
 from drive_env.firmware.servo_mains.inputs import find_switches, read_module_inputs
 from drive_env.firmware.servo_mains.loops import (
+    compensate_cogging,
     feed_forward_current,
     find_integral_shares,
     motion_loops,
@@ -68,8 +69,10 @@ def run_tick(drive, rates, k):
 
 @stage
 def regulate_motion(drive, rates):
-    """Run position and velocity loop, and add what they ask for to its mean over the period."""
+    """Run position and velocity loop, compensate cogging, and add the current asked for to its mean over the period."""
     motion_loops(drive)
+    if drive.block_compensates_cogging[0]:
+        compensate_cogging(drive)
     share = rates.window / rates.period
     for lane in range(LANES):
         drive.asked_mean[lane] += share * drive.i_q_ref[lane]
@@ -102,6 +105,7 @@ def connect(drive, lane):
     drive.reverse_time[lane] = 0.0
     drive.asked_mean[lane] = 0.0
     drive.stuck_time[lane] = 0.0
+    drive.switch_time[lane] = 0.0
     drive.off_time[lane] = 0.0
     drive.omega_before[lane] = 0.0
     drive.torque_feed_forward[lane] = 0.0
