@@ -218,6 +218,26 @@ def test_a_step_is_scoped_from_its_trigger_and_measured(tab, moved_on):
 
 
 @pytest.mark.slow
+def test_a_test_signal_is_played_beside_its_traces_or_refused_with_its_remedy(tab):
+    at_rest(tab)
+    tab.open("/scope")
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    choose(tab, "signal", "Velocity square wave (csv)")
+    tab.type("signal-speed", "50 rpm")
+    tab.press("play-signal")
+    until(lambda: any("100 rpm are more than the 50 rpm" in line for line in tab.told()), "the refusal")
+    tab.type("signal-speed", "300 rpm")
+    tab.press("play-signal")
+    seen = "return studioScope.header.traces.filter((one) => one.channel === 1).map((one) => [one.low, one.high])[0]"
+    low, high = until(lambda: (lambda v: v if v and v[1] > 90 and v[0] < -90 else None)(
+        tab.driver.execute_script(seen)), "the square wave on the scope")  # fmt: skip
+    assert high < 150 and low > -150
+    until(lambda: tab.all(".studio-mode")[0].text == "pp", "its mode of before")
+    assert tab.state == "Operation enabled"
+
+
+@pytest.mark.slow
 def test_twenty_frames_a_second(tab):
     tab.open("/scope")
     until(lambda: tab.driver.execute_script("return studioScope.frames") > 5, "frames")

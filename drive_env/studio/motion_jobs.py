@@ -83,7 +83,7 @@ def command(axis: int, word: int) -> MotionJob:
         else:
             motion.take_command(drives, where=only(drives, axis))
             if word == cia402.ENABLE_OPERATION:
-                motion.stay(drives, _mode_of(drives, axis), only(drives, axis))
+                motion.stay(drives, mode_of(drives, axis), only(drives, axis))
             drives.write(cia402.CONTROLWORD, word, where=only(drives, axis))
 
     return job
@@ -142,7 +142,7 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
         where = only(drives, axis)
         target = parsed(session, axis, goal, cia402.TARGET_POSITION)
         rate = parsed(session, axis, speed, cia402.PROFILE_VELOCITY) if speed.strip() else None
-        _check_enabled(drives, axis)
+        check_enabled(drives, axis)
         motion.select_mode(drives, "pp", where=where)
         if rate is not None and rate <= 0:
             raise ValueError(f"a speed of {speed} moves nothing; give one above 0")
@@ -166,7 +166,7 @@ def turn(session: Session, axis: int, speed: str, number: int) -> MotionJob:
         where = only(drives, axis)
         mode = motion.turning_mode(drives)
         rate = parsed(session, axis, speed, motion.FOLLOWED[mode][0])
-        _check_enabled(drives, axis)
+        check_enabled(drives, axis)
         if not session.presence.is_on(number):
             return  # released before it began
         motion.stay(drives, mode, where)
@@ -196,13 +196,14 @@ def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
     return raw
 
 
-def _check_enabled(drives: Drives, axis: int) -> None:
+def check_enabled(drives: Drives, axis: int) -> None:
+    """Raise RuntimeError for an axis that is not in operation enabled."""
     status = int(drives.read(cia402.STATUSWORD)[axis])
     if not cia402.matches(status, cia402.OPERATION_ENABLED):
         raise RuntimeError(f"axis {axis} is not enabled and cannot move: statusword {status:04X}h; enable it first")
 
 
-def _mode_of(drives: Drives, axis: int) -> str:
+def mode_of(drives: Drives, axis: int) -> str:
     """Return the mode of operation of an axis by its abbreviation, "" for none."""
     try:
         number = int(drives.read(cia402.MODE_DISPLAY)[axis])

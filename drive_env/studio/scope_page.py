@@ -18,7 +18,7 @@ from drive_env import cia402
 from drive_env.dictionary import quantities
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
-from drive_env.studio.motion_cards import card, move_rows, power_row
+from drive_env.studio.motion_cards import card, move_rows, power_row, signal_rows
 from drive_env.studio.page import StudioPage
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
 from drive_env.studio.scope_trigger import EDGES
@@ -209,6 +209,8 @@ class ScopePanel:
         with card("Move", "card-move"):
             power_row(self._visitor)
             move_rows(self._session, self._visitor)
+        with card("Test signal", "card-signal"):
+            signal_rows(self._session, self._visitor)
 
     # --- channels -------------------------------------------------------------------------------------------------
     def _channel_card(self) -> None:
