@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import pytest
@@ -300,15 +299,22 @@ def shown(tab, name):
 
 
 @pytest.mark.slow
-def test_favourites_stay_in_the_browser(tab):
+def test_favourites_and_units_are_those_of_every_page(tab, served):
     tab.open("/dictionary")
-    tab.driver.execute_script("localStorage.setItem('studio-favourites', '[]')")
-    tab.driver.execute_script("studioDictionary.toggle('6064:00')")
-    tab.open("/dictionary")
-    stored = json.loads(tab.driver.execute_script("return localStorage.getItem('studio-favourites')"))
-    assert stored == ["6064:00"]
     tab.type("search", "6064")
-    until(lambda: tab.one("[data-key='6064:00'] .q-icon").text == "star", "its star")
+    until(lambda: tab.all("[data-key='6064:00'] button"), "its star")[0].click()
+    with chromium() as another:
+        second = Tab(another, served).open("/dictionary")
+        second.type("search", "6064")
+        until(lambda: second.one("[data-key='6064:00'] .q-icon").text == "star", "its star")
+    tab.open("/scope")
+    choose(tab, "unit-angle", "deg")
+    units = "return (studioScope.header || {channels: []}).channels.map((one) => one.unit)"
+    until(lambda: "deg" in tab.driver.execute_script(units), "the unit on the scope")
+    tab.open("/axes")
+    until(lambda: "deg" in tab.one(".card-motion").text, "the unit on the page Axes")
+    tab.open("/scope")
+    choose(tab, "unit-angle", "rev")
 
 
 def test_compared_with_stored_nothing_differs(tab):

@@ -474,6 +474,15 @@ def test_presence_counts_pages_and_their_motions():
     assert not known.moves()
 
 
+def test_values_are_shown_in_the_units_that_were_chosen(session):
+    with Beats(session):
+        session.do(lambda drives: drives.machine.place(0, np.pi), "turn").result(10)
+        until(lambda: session.axes[0].motion and abs(session.axes[0].motion[0].value - 0.5) < 0.01)
+        session.workspace.show_in("angle", "deg")
+        until(lambda: session.axes[0].motion[0].unit == "deg")
+        assert session.axes[0].motion[0].value == pytest.approx(180.0, abs=3.0)
+
+
 # --- texts --------------------------------------------------------------------------------------------------------
 def test_errors_are_sentences_for_people():
     error = RuntimeError("axis 0 is in fault while waiting for target reached; see emergencies(), then reset_fault()")

@@ -31,11 +31,12 @@ from drive_env.studio.scope_view import (
     ScopeView,
     channel_of,
     with_channels,
+    with_units,
 )
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
-from drive_env.studio.workspace import OF_VL, AxisSettings, object_key, object_name, trigger_of
+from drive_env.studio.workspace import CHOICES, OF_VL, AxisSettings, object_key, object_name, trigger_of
 from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
@@ -157,8 +158,8 @@ class ScopePanel:
 
     def _channel(self, key: tuple[int, int], axis: int) -> ScopeChannel:
         entry = self._session.description.dictionary.find(key)
-        several = self._session.num_axes > 1
-        return channel_of(entry, axis, self._session.scales[axis], several=several)
+        scale, units = self._session.scales[axis], self._session.workspace.units
+        return channel_of(entry, axis, scale, several=self._session.num_axes > 1, units=units)
 
     # --- run and halt ---------------------------------------------------------------------------------------------
     def _bar(self) -> None:
@@ -220,6 +221,13 @@ class ScopePanel:
             options = {object_name(key): entry.label for key, entry in self._entries.items()}
             add = ui.select(options, label="Add an object, by index or name", with_input=True, clearable=True)
             add.props("dense outlined options-dense data-test=add-channel").classes("w-full")
+            ui.label("Units of all axes, here and on the page Axes").classes("studio-label")
+            with ui.row().classes("studio-buttons"):
+                for dimension, units in CHOICES.items():
+                    now = self._session.workspace.units[dimension]
+                    unit = ui.select(list(units), value=now, label=dimension.capitalize()).classes("studio-unit")
+                    unit.props(f"dense outlined options-dense data-test=unit-{dimension}")
+                    unit.on_value_change(lambda event, dimension=dimension: show_in(dimension, str(event.value)))
 
         def draw() -> None:
             chips.clear()
@@ -249,6 +257,13 @@ class ScopePanel:
             add.set_value(None)
             if channel not in self._view.channels:
                 change((*self._view.channels, channel))
+
+        def show_in(dimension: str, unit: str) -> None:
+            session = self._session
+            self._visitor.keep(lambda: session.workspace.show_in(dimension, unit))
+            for axis, view in session.scopes.items():
+                with_units(view, tuple(self._channel(one.key, axis) for one in view.channels))
+            draw()
 
         add.on_value_change(added)
         draw()

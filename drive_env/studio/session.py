@@ -343,7 +343,7 @@ class Session:
             self._drives = SharedDrives(
                 self._real, self.recorder, self._look, self._hear, self.presence.moves, self._why_stopped
             )
-            self._states = AxisStates(self._real, self.description)
+            self._states = AxisStates(self._real, self.description, self.workspace.units)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
             self._read_stored()

@@ -48,8 +48,12 @@ class Visitor:
 
     def set(self, **changes: Any) -> None:
         """Keep settings of its axis, named as in `AxisSettings`, for the pages after this one."""
+        self.keep(lambda: self.session.workspace.change(self.axis, **changes))
+
+    def keep(self, change: Callable[[], None]) -> None:
+        """Change the workspace; the page says where its file cannot be written."""
         try:
-            self.session.workspace.change(self.axis, **changes)
+            change()
         except OSError as error:
             self.say(sentence(error), "error")
 
