@@ -138,7 +138,7 @@ class DictionaryPanel:
         with self._list:
             for entry in shown:
                 self._row(entry)
-        ui.run_javascript("studioDictionary.observe()")
+        self._visitor.client.run_javascript("studioDictionary.observe()")  # what was pressed may be gone by now
 
     def _turn(self, by: int) -> None:
         self._first = max(0, self._first + by)

@@ -1,4 +1,4 @@
-"""What people have set on the pages and find again, also in a file: scope and jog speed of each axis, units, favourites."""
+"""What people have set on the pages and find again, in a file, too: scope and jog speed of axes, units, favourites."""
 
 from __future__ import annotations
 
