@@ -6,6 +6,7 @@ import time
 
 import pytest
 from rigs.studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
+from selenium.webdriver import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 pytestmark = needs_chromium
@@ -181,6 +182,34 @@ def test_two_pages_at_once(tab, served):
         tab.release()
         until(lambda: second.state != "Operation enabled", "its state on the other page")
         assert any("quick stop" in line for line in tab.told())
+
+
+@pytest.mark.slow
+def test_a_gantry_is_enabled_jogged_and_stopped_by_its_table(driver):
+    with studio("--load", "gantry") as served:
+        size_of(driver, 1280, 1000)
+        tab = Tab(driver, served).open("/axes")
+        until(lambda: tab.all("[data-test=in-1]"), "the table")
+        assert tab.nameless() == []
+
+        def column(number):
+            rows = tab.all("[data-test=axes] tr")[1:]
+            return [row.find_elements("css selector", "td")[number].text for row in rows]
+
+        tab.press("enable-group")
+        until(lambda: all("Operation enabled" in text for text in column(0)), "both axes enabled")
+        tab.type("group-speed", "30 rpm")
+        button = tab.one("[data-jog='1'][data-group=all]")
+        tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+        ActionChains(tab.driver).click_and_hold(button).perform()
+        until(lambda: all(float(text.split()[0]) > 20.0 for text in column(3)), "both axes turning")
+        seen = "return studioScope.header.traces.filter((one) => one.channel === 1).map((one) => one.high)[0]"
+        until(lambda: tab.driver.execute_script(seen) > 20.0, "the speed in the live plot")
+        tab.release()
+        until(lambda: all(abs(float(text.split()[0])) < 5.0 for text in column(3)), "their rest")
+        tab.press("stop-group")
+        until(lambda: not any("Operation enabled" in text for text in column(0)), "both axes stopped")
+        assert "Traceback" not in served.output, served.output
 
 
 # --- scope --------------------------------------------------------------------------------------------------------

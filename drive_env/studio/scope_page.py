@@ -40,6 +40,7 @@ from drive_env.studio.workspace import CHOICES, OF_VL, AxisSettings, object_key,
 from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
+LIVE = 5.0  # s across the plot of the page Axes
 FIRST = (  # of the objects that can be chosen, those that people look for
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
@@ -79,6 +80,25 @@ async def _listen(line: WebSocket, view: ScopeView) -> None:
             view.columns = min(4000, max(50, int(message["columns"])))
 
 
+def traces(visitor: Visitor, view: ScopeView, size: str = "") -> None:
+    """Show the traces of a scope on a page; `size` is a class of it."""
+    _views[visitor.id] = view
+    with ui.element("div").classes(f"studio-scope {size}"):
+        ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
+    ui.run_javascript(f"studioScope.start({visitor.id!r}, {json.dumps(view.cursors)})")
+
+
+def live_plot(session: Session, visitor: Visitor) -> None:
+    """Show the latest position, velocity and current of the axis of a page, as far as they are sampled anyway."""
+    known, view = session.description.dictionary, ScopeView(session.recorder)
+    scale, units = session.scales[visitor.axis], session.workspace.units
+    keys = [key for key in session.workspace.usual_channels if key in session.recorder.objects]
+    view.channels = tuple(channel_of(known.find(key), visitor.axis, scale, several=False, units=units) for key in keys)
+    view.window = LIVE
+    traces(visitor, view, "studio-scope-small")
+    visitor.client.on_delete(lambda: _views.pop(visitor.id, None))
+
+
 def build(session: Session, visitor: Visitor) -> None:
     """Make the page."""
     ScopePanel(session, visitor).build()
@@ -101,14 +121,12 @@ class ScopePanel:
 
     def build(self) -> None:
         """Make it."""
-        _views[self._visitor.id] = self._view
         self._visitor.client.on_delete(self._leave)
         self._want()
         with ui.element("div").classes("studio-scope-page"):
             with ui.card().classes("studio-card studio-scope-card"):
                 self._bar()
-                with ui.element("div").classes("studio-scope"):
-                    ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
+                traces(self._visitor, self._view)
                 self._readout()
             with ui.element("div").classes("studio-scope-side"):
                 self._move_card()
@@ -116,7 +134,6 @@ class ScopePanel:
                 self._trigger_card()
                 self._figure_card()
         ui.on("scope_cursors", self._take_cursors)
-        ui.run_javascript(f"studioScope.start({self._visitor.id!r}, {json.dumps(self._view.cursors)})")
 
     def _view_of(self, session: Session, axis: int) -> ScopeView:
         """Return the scope of an axis as its settings have it; a trigger that is set is armed.

@@ -82,11 +82,15 @@ class Workspace:
                 self.favourites = tuple(object_key(name) for name in data.get("favourites", []))
                 _check_objects(self.favourites, description)
 
+    @property
+    def usual_channels(self) -> tuple[Key, ...]:
+        """The objects on a scope where nothing else is set: position, velocity and current, or what a drive has."""
+        there = [(index, 0) for index in (*CHANNELS, *OF_VL) if self._description.has((index, 0))]
+        return tuple(key for key in there if key[0] in CHANNELS) or tuple(there)
+
     def of(self, axis: int) -> AxisSettings:
         """Return the settings of an axis."""
-        known = self._description
-        there = [(index, 0) for index in (*CHANNELS, *OF_VL) if known.has((index, 0))]
-        usual = tuple(key for key in there if key[0] in CHANNELS) or tuple(there)
+        known, usual = self._description, self.usual_channels
         source = (cia402.VELOCITY_ACTUAL, 0)
         return self._axes.get(axis) or AxisSettings(
             channels=usual, source=source if known.has(source) or not usual else usual[-1]

@@ -12,8 +12,9 @@ from drive_env.studio.session import Session
 
 
 @contextmanager
-def opened(load, device="tmcm1636", motor="qbl4208"):
-    made = Session(lambda: EmulatedDrives(device, load, motor, num_threads=1), "a machine", describe(device, None))
+def opened(load, device="tmcm1636", motor="qbl4208", **options):
+    drives = lambda: EmulatedDrives(device, load, motor, num_threads=1, **options)  # noqa: E731
+    made = Session(drives, "a machine", describe(device, None))
     made.presence.beat("page")
     made.start()
     until(lambda: made.state != "opening", 120.0)
