@@ -251,6 +251,7 @@ def test_a_test_signal_is_played_beside_its_traces_or_refused_with_its_remedy(ta
     tab.open("/scope")
     tab.press("enable")
     tab.await_state("Operation enabled")
+    choose(tab, "trigger-mode", "rolling")  # whatever a test before has left
     choose(tab, "signal", "Velocity square wave (csv)")
     tab.type("signal-speed", "50 rpm")
     tab.press("play-signal")
