@@ -265,4 +265,5 @@ def test_report_row_and_episodes(tmp_path):
 def test_workspace_of_the_studio(tmp_path):
     Workspace(describe("tmcm1636", None), tmp_path / "machine.toml").change(0, jog_speed="90 rpm")
     data = tomllib.loads((tmp_path / "machine.toml").read_text(encoding="utf-8"))
-    assert list(data) == ["format", "device", "axis"] and set(data["axis"]["0"]) == set(fields("workspace"))
+    assert list(data) == ["format", "device", "favourites", "units", "axis"]
+    assert set(data["axis"]["0"]) == set(fields("workspace"))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import time
 
 import pytest
 from rigs.studio_rig import Tab, chromium, needs_chromium, size_of, studio, until
+from selenium.webdriver import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 pytestmark = needs_chromium
@@ -184,6 +184,34 @@ def test_two_pages_at_once(tab, served):
         assert any("quick stop" in line for line in tab.told())
 
 
+@pytest.mark.slow
+def test_a_gantry_is_enabled_jogged_and_stopped_by_its_table(driver):
+    with studio("--load", "gantry") as served:
+        size_of(driver, 1280, 1000)
+        tab = Tab(driver, served).open("/axes")
+        until(lambda: tab.all("[data-test=in-1]"), "the table")
+        assert tab.nameless() == []
+
+        def column(number):
+            rows = tab.all("[data-test=axes] tr")[1:]
+            return [row.find_elements("css selector", "td")[number].text for row in rows]
+
+        tab.press("enable-group")
+        until(lambda: all("Operation enabled" in text for text in column(0)), "both axes enabled")
+        tab.type("group-speed", "30 rpm")
+        button = tab.one("[data-jog='1'][data-group=all]")
+        tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+        ActionChains(tab.driver).click_and_hold(button).perform()
+        until(lambda: all(float(text.split()[0]) > 20.0 for text in column(3)), "both axes turning")
+        seen = "return studioScope.header.traces.filter((one) => one.channel === 1).map((one) => one.high)[0]"
+        until(lambda: tab.driver.execute_script(seen) > 20.0, "the speed in the live plot")
+        tab.release()
+        until(lambda: all(abs(float(text.split()[0])) < 5.0 for text in column(3)), "their rest")
+        tab.press("stop-group")
+        until(lambda: not any("Operation enabled" in text for text in column(0)), "both axes stopped")
+        assert "Traceback" not in served.output, served.output
+
+
 # --- scope --------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize("moved_on", ["/scope", "/axes"])
@@ -215,6 +243,27 @@ def test_a_step_is_scoped_from_its_trigger_and_measured(tab, moved_on):
     tab.press("measure")
     told = until(lambda: " ".join(one.text for one in tab.all(".studio-figures")).strip(), "figures")
     assert "rise" in told, told
+
+
+@pytest.mark.slow
+def test_a_test_signal_is_played_beside_its_traces_or_refused_with_its_remedy(tab):
+    at_rest(tab)
+    tab.open("/scope")
+    tab.press("enable")
+    tab.await_state("Operation enabled")
+    choose(tab, "trigger-mode", "rolling")  # whatever a test before has left
+    choose(tab, "signal", "Velocity square wave (csv)")
+    tab.type("signal-speed", "50 rpm")
+    tab.press("play-signal")
+    until(lambda: any("100 rpm are more than the 50 rpm" in line for line in tab.told()), "the refusal")
+    tab.type("signal-speed", "300 rpm")
+    tab.press("play-signal")
+    seen = "return studioScope.header.traces.filter((one) => one.channel === 1).map((one) => [one.low, one.high])[0]"
+    low, high = until(lambda: (lambda v: v if v and v[1] > 90 and v[0] < -90 else None)(
+        tab.driver.execute_script(seen)), "the square wave on the scope")  # fmt: skip
+    assert high < 150 and low > -150
+    until(lambda: tab.all(".studio-mode")[0].text == "pp", "its mode of before")
+    assert tab.state == "Operation enabled"
 
 
 @pytest.mark.slow
@@ -280,15 +329,22 @@ def shown(tab, name):
 
 
 @pytest.mark.slow
-def test_favourites_stay_in_the_browser(tab):
+def test_favourites_and_units_are_those_of_every_page(tab, served):
     tab.open("/dictionary")
-    tab.driver.execute_script("localStorage.setItem('studio-favourites', '[]')")
-    tab.driver.execute_script("studioDictionary.toggle('6064:00')")
-    tab.open("/dictionary")
-    stored = json.loads(tab.driver.execute_script("return localStorage.getItem('studio-favourites')"))
-    assert stored == ["6064:00"]
     tab.type("search", "6064")
-    until(lambda: tab.one("[data-key='6064:00'] .q-icon").text == "star", "its star")
+    until(lambda: tab.all("[data-key='6064:00'] button"), "its star")[0].click()
+    with chromium() as another:
+        second = Tab(another, served).open("/dictionary")
+        second.type("search", "6064")
+        until(lambda: second.one("[data-key='6064:00'] .q-icon").text == "star", "its star")
+    tab.open("/scope")
+    choose(tab, "unit-angle", "deg")
+    units = "return (studioScope.header || {channels: []}).channels.map((one) => one.unit)"
+    until(lambda: "deg" in tab.driver.execute_script(units), "the unit on the scope")
+    tab.open("/axes")
+    until(lambda: "deg" in tab.one(".card-motion").text, "the unit on the page Axes")
+    tab.open("/scope")
+    choose(tab, "unit-angle", "rev")
 
 
 def test_compared_with_stored_nothing_differs(tab):

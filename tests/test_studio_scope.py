@@ -13,6 +13,7 @@ import pytest
 
 from drive_env import cia402
 from drive_env.devices import find_device
+from drive_env.dictionary.quantities import SHOWN
 from drive_env.drives.trace import Trace
 from drive_env.fieldbus.description import describe
 from drive_env.studio.decimation import min_max, stride_of
@@ -20,7 +21,7 @@ from drive_env.studio.recorder import SampleRing, ScopeRecorder
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
 from drive_env.studio.scope_page import ScopePanel
 from drive_env.studio.scope_trigger import EDGES, ScopeTrigger, first_fired
-from drive_env.studio.scope_view import ScopeChannel, ScopeRecording, ScopeView, channel_of, with_channels
+from drive_env.studio.scope_view import ScopeChannel, ScopeRecording, ScopeView, channel_of, with_channels, with_units
 from drive_env.studio.workspace import Workspace, trigger_of
 
 VELOCITY, STATUS = (cia402.VELOCITY_ACTUAL, 0), (cia402.STATUSWORD, 0)
@@ -242,6 +243,21 @@ def test_a_channel_has_the_unit_that_people_read():
     assert 65536 * found.factor == pytest.approx(60.0)
 
 
+def test_other_units_show_the_same_as_before():
+    view = ScopeView(made := recorder_of(trace([0, 65536, 65536])))
+    rpm = channel_of(KNOWN.find(VELOCITY), 0, 65536.0, several=False)
+    view.channels, view.window = (rpm,), 0.003
+    view.halt()
+    view.keep_as_reference()
+    before = view.shown().of(rpm)
+    per_second = channel_of(KNOWN.find(VELOCITY), 0, 65536.0, several=False, units=SHOWN | {"speed": "deg/s"})
+    with_units(view, (per_second,))
+    assert per_second.label == "Velocity actual value [deg/s]" and made.now == 0.003
+    for recording in (view.kept, view.reference):
+        assert recording.of(per_second) == pytest.approx(6.0 * before)  # a rpm is 6 deg/s
+    assert picture(view)[1][0][1].max() == pytest.approx(360.0, rel=1e-3)
+
+
 # --- figures and files --------------------------------------------------------------------------------------------
 def step_recording(overshoot=0.0):
     t = np.arange(-100, 900) * 0.001
@@ -303,6 +319,15 @@ def test_a_workspace_is_found_again_from_its_file(tmp_path):
     first.change(0, window=0.5)
     again = Workspace(DEVICE, file)
     assert [again.of(axis) for axis in range(3)] == [first.of(axis) for axis in range(3)]
+    assert (again.units["angle"], again.units["speed"], again.favourites) == ("rev", "rpm", ())
+    again.show_in("angle", "deg")
+    again.toggle_favourite(VELOCITY)
+    again.toggle_favourite(STATUS)
+    again.toggle_favourite(VELOCITY)
+    third = Workspace(DEVICE, file)
+    assert (third.units["angle"], third.units["speed"], third.favourites) == ("deg", "rpm", (STATUS,))
+    with pytest.raises(ValueError, match="'inch' is not one of angle: rev, deg, rad;"):
+        third.show_in("angle", "inch")
     assert again.of(0).channels == ((0x6041, 0), (0x2101, 0)) and again.of(0).window == 0.5
     assert again.of(0).jog_speed == again.of(2).jog_speed == "60 rpm"
 
@@ -312,7 +337,11 @@ def test_a_workspace_is_found_again_from_its_file(tmp_path):
     [
         ("format = 1", "format = 2", "is not a workspace"),
         ("tmcm1636", "tgz_d", "is of tgz_d, and this is tmcm1636; give another file"),
-        ("6041:00", "606C:07", "has no object 606C:07"),
+        ('channels = ["6041:00"]', 'channels = ["606C:07"]', "has no object 606C:07"),
+        ("favourites = []", 'favourites = ["606C:09"]', "has no object 606C:09"),
+        ("favourites = []", "favourites = [7]", "mend the line"),
+        ('speed = "rpm"', 'speed = "knots"', "units: speed = 'knots' is not one of"),
+        ('speed = "rpm"', 'mass = "kg"', "units: mass = 'kg' is not one of"),
         ("6041:00", "velocity", "mend the line"),
         ('"single"', '"once"', "'once' is not one of roll, auto"),
         ("window = 2.0", "window = 3.0", "3.0 is not one of 0.1, 0.2"),

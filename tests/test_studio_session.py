@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from rigs.session_rig import Beats, opened, until
 from rigs.small_eds import FOLDER
 
 from drive_env import EmulatedDrives, cia402, motion
@@ -31,47 +31,6 @@ FIRST = np.array([True])
 def session():
     with opened("inertia") as made:
         yield made
-
-
-@contextmanager
-def opened(load, device="tmcm1636", motor="qbl4208"):
-    made = Session(lambda: EmulatedDrives(device, load, motor, num_threads=1), "a machine", describe(device, None))
-    made.presence.beat("page")
-    made.start()
-    until(lambda: made.state != "opening", 120.0)
-    assert made.state == "open", made.failure
-    try:
-        yield made
-    finally:
-        made.close()
-
-
-def until(condition, patience=10.0):
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-class Beats:
-    """A page that is there as long as a block runs."""
-
-    def __init__(self, session, page="page", held=0):
-        self.session, self.page, self.held = session, page, held
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def _run(self):
-        while not self._end.wait(0.1):
-            self.session.presence.beat(self.page, self.held)
-
-    def __enter__(self):
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._end.set()
-        self._thread.join()
 
 
 def state_of(session):
@@ -513,6 +472,15 @@ def test_presence_counts_pages_and_their_motions():
     assert known.pages() == 1
     assert [motion.why for motion in known.take_overdue()] == ["its page was closed"]
     assert not known.moves()
+
+
+def test_values_are_shown_in_the_units_that_were_chosen(session):
+    with Beats(session):
+        session.do(lambda drives: drives.machine.place(0, np.pi), "turn").result(10)
+        until(lambda: session.axes[0].motion and abs(session.axes[0].motion[0].value - 0.5) < 0.01)
+        session.workspace.show_in("angle", "deg")
+        until(lambda: session.axes[0].motion[0].unit == "deg")
+        assert session.axes[0].motion[0].value == pytest.approx(180.0, abs=3.0)
 
 
 # --- texts --------------------------------------------------------------------------------------------------------

@@ -12,8 +12,10 @@ from drive_env.cia402 import State
 from drive_env.drives.limit_at_rest import SAYS, SHARE
 from drive_env.studio import motion_jobs
 from drive_env.studio.axis_states import AxisState, ShownQuantity
+from drive_env.studio.group_card import group_card
 from drive_env.studio.motion_cards import card, move_rows, power_row
 from drive_env.studio.page import StudioPage
+from drive_env.studio.scope_page import live_plot
 from drive_env.studio.session import Session
 from drive_env.studio.state_diagram import ARROWS, diagram
 from drive_env.studio.visitor import Visitor
@@ -29,11 +31,13 @@ BITS = (  # of the statusword, that people ask for
 
 def build(session: Session, visitor: Visitor) -> None:
     """Make the page."""
+    if session.num_axes > 1:
+        group_card(session, visitor)
     with ui.element("div").classes("studio-grid"):
         with ui.element("div").classes("studio-stack"):
             _state_card(session, visitor)
         with ui.element("div").classes("studio-stack"):
-            _motion_card(visitor)
+            _motion_card(session, visitor)
             with card("Move", "card-move"):
                 move_rows(session, visitor)
         with ui.element("div").classes("studio-stack"):
@@ -77,10 +81,11 @@ def _single_transitions(state: State | None) -> None:
         ui.label("None from this state: the drive goes on by itself.").classes("studio-hint")
 
 
-def _motion_card(visitor: Visitor) -> None:
+def _motion_card(session: Session, visitor: Visitor) -> None:
     with card("Motion", "card-motion"):
         values = _Values()
         share = ui.label("").classes("studio-share").props("data-test=current-share")
+        live_plot(session, visitor)
         with ui.row().classes("studio-bits"):
             bits = [(ui.label(f"○ {name}").classes("studio-bit"), name, bit) for name, bit in BITS]
         with ui.element("div").classes("studio-fault").props('data-test=at-limit role="status"') as limit:

@@ -119,6 +119,7 @@ class AxisStates:
     Args:
         drives: The drives.
         description: Of their device.
+        units: In which values of each dimension are shown; they may change.
 
     Attributes:
         axes: What is known, replaced as a whole.
@@ -126,8 +127,9 @@ class AxisStates:
         sampled: Objects that are wanted of each cycle, the most important first.
     """
 
-    def __init__(self, drives: Drives, description: Description) -> None:
+    def __init__(self, drives: Drives, description: Description, units: Mapping[str, str] = SHOWN) -> None:
         self._known = description
+        self._units = units
         self.scales: list[Scale] = scales_of(drives, description.dictionary)
         doubled = cia402.VL_VELOCITY_ACTUAL if description.has(cia402.VELOCITY_ACTUAL) else None
         self.sampled: tuple[Key, ...] = tuple(
@@ -238,15 +240,15 @@ class AxisStates:
             return None
 
     def _quantity(self, key: Key, raw: int, axis: int) -> ShownQuantity:
-        return quantity_of(self._known.dictionary.find(key), raw, self.scales[axis])
+        return quantity_of(self._known.dictionary.find(key), raw, self.scales[axis], self._units)
 
 
-def quantity_of(entry: Entry, raw: int, scale: Scale) -> ShownQuantity:
-    """Return an integer of an object in the unit that people read."""
+def quantity_of(entry: Entry, raw: int, scale: Scale, units: Mapping[str, str]) -> ShownQuantity:
+    """Return an integer of an object in the unit of its dimension."""
     unit = find_unit(entry.unit, scale)
     if unit is None:
         return ShownQuantity(entry.name, float(raw), entry.unit)
-    shown = SHOWN[unit.dimension]
+    shown = units[unit.dimension]
     return ShownQuantity(entry.name, raw * unit.factor / UNITS[shown].factor, shown)
 
 

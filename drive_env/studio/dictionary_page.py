@@ -49,7 +49,6 @@ class DictionaryPanel:
         self._entries: list[Entry] = list(self._known.dictionary)
         self._chosen: list[Entry] = self._entries
         self._first = 0
-        self._favourites: set[Key] = set()
         self._visible: list[Key] = []
         self._next = 0  # which of the visible ones is read next
         self._rows: dict[Key, ui.label] = {}
@@ -70,8 +69,6 @@ class DictionaryPanel:
                 self._compare_card()
                 self._backup_card()
         ui.on("dictionary_visible", self._take_visible)
-        ui.on("dictionary_favourites", self._take_favourites)
-        ui.run_javascript("studioDictionary.start()")
         self._draw()
         ui.timer(READ, self._read_visible)
 
@@ -114,7 +111,7 @@ class DictionaryPanel:
         entries: Sequence[Entry] = self._entries
         area = self._area.value
         if area == FAVOURITES:
-            entries = [e for e in entries if (e.index, e.sub) in self._favourites]
+            entries = [e for e in entries if (e.index, e.sub) in self._session.workspace.favourites]
         elif area != ALL:
             entries = [e for e in entries if search.area_of(e.index) == area]
         self._chosen = search.searched(entries, self._search.value or "")
@@ -141,7 +138,7 @@ class DictionaryPanel:
         with self._list:
             for entry in shown:
                 self._row(entry)
-        ui.run_javascript("studioDictionary.observe()")
+        self._visitor.client.run_javascript("studioDictionary.observe()")  # what was pressed may be gone by now
 
     def _turn(self, by: int) -> None:
         self._first = max(0, self._first + by)
@@ -151,10 +148,9 @@ class DictionaryPanel:
         key = (entry.index, entry.sub)
         name = f"{entry.index:04X}:{entry.sub:02X}"
         with ui.element("div").classes("studio-row").props(f'role="row" data-key={name}'):
-            star = ui.button(icon="star" if key in self._favourites else "star_outline").props(
-                f'flat dense round size=sm aria-label="Favourite {entry.label}"'
-            )
-            star.on("click", js_handler=f"() => studioDictionary.toggle({name!r})")
+            is_favourite = key in self._session.workspace.favourites
+            star = ui.button(icon="star" if is_favourite else "star_outline", on_click=lambda: self._toggle(key))
+            star.props(f'flat dense round size=sm aria-label="Favourite {entry.label}"')
             with ui.element("div").classes("what"):
                 ui.label(f"{entry.index:04X}h:{entry.sub:02X}").classes("index")
                 ui.label(entry.name).classes("name")
@@ -171,8 +167,9 @@ class DictionaryPanel:
         self._visible = [_key(text) for text in event.args]
         self._next = 0
 
-    def _take_favourites(self, event: GenericEventArguments) -> None:
-        self._favourites = {_key(text) for text in event.args}
+    def _toggle(self, key: Key) -> None:
+        """Add an object to the favourites, or take it away."""
+        self._visitor.keep(lambda: self._session.workspace.toggle_favourite(key))
         if self._area.value == FAVOURITES:
             self._choose()
         else:

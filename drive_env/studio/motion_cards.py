@@ -1,12 +1,15 @@
-"""What moves the axis of a page, on the pages Axes and Scope: enable, jog, move, home."""
+"""What moves the axis of a page, on the pages Axes and Scope: enable, jog, move, home, test signals."""
 
 from __future__ import annotations
+
+from typing import Any
 
 from nicegui import ui
 
 from drive_env.studio import motion_jobs
 from drive_env.studio.axis_states import MODE_NAMES, AxisState
 from drive_env.studio.homing_sketch import homing_sketch
+from drive_env.studio.motion_signals import SHAPES, SIGNALS, SignalSettings, play_signal, signals_of
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
@@ -133,3 +136,46 @@ def home_rows(session: Session, visitor: Visitor) -> None:
 
     method.on_value_change(lambda _: show())
     ui.timer(0.0, load, once=True)
+
+
+def signal_rows(session: Session, visitor: Visitor) -> None:
+    """Make the rows that play a test signal on the axis of a page."""
+    titles = signals_of(_modes(visitor.state), session.description.has)
+    if not titles:
+        ui.label("This drive has no mode in which set-points are played (csp, csv, cst).").classes("studio-hint")
+        return
+    defaults = SignalSettings(next(iter(titles)), "")
+    kind = ui.select(titles, value=defaults.name, label="Signal").props("dense outlined").classes("w-full")
+    kind.props("data-test=signal")
+    texts, numbers = {}, {}
+    with ui.row().classes("studio-buttons"):
+        for name, label in (("height", "Height"), ("travel", "May go, each way"), ("speed", "May turn at")):
+            texts[name] = ui.input(label, value=getattr(defaults, name), placeholder="the drive's limit")
+            texts[name].props(f"dense outlined data-test=signal-{name}").classes("grow")
+        for name, label in {name: label for shape in SHAPES.values() for name, label in shape.items()}.items():
+            numbers[name] = ui.number(label, value=getattr(defaults, name), min=0).classes("grow")
+            numbers[name].props(f"dense outlined data-test=signal-{name}")
+
+    def choose() -> None:
+        row = SIGNALS[str(kind.value)]
+        texts["height"].set_value(row.height)
+        for name, field in numbers.items():
+            field.set_visibility(name in SHAPES[row.shape])
+            if name in SHAPES[row.shape]:
+                field.props(f'label="{SHAPES[row.shape][name]}"')
+
+    async def play() -> None:
+        asked: dict[str, Any] = {name: field.value or "" for name, field in texts.items()}
+        asked |= {name: float(field.value or 0.0) for name, field in numbers.items()}
+        settings = SignalSettings(str(kind.value), **asked)
+        title = f"{SIGNALS[settings.name].title} of axis {visitor.axis}"
+        if told := await visitor.do(play_signal(session, visitor.axis, settings), title):
+            visitor.say(told, "warning")
+
+    kind.on_value_change(choose)
+    choose()
+    ui.button("Play", icon="play_arrow", on_click=play).props("unelevated no-caps data-test=play-signal")
+    ui.label(
+        "Enable the axis first; it is at rest and in its mode of before afterwards. It is stopped where it leaves what "
+        "it may, and with this page."
+    ).classes("studio-hint")

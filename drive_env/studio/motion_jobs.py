@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
@@ -25,13 +25,14 @@ if TYPE_CHECKING:
     from drive_env.studio.session import Session
 
 MotionJob = Callable[[Drives], None]
+AxisNumbers = int | Sequence[int]
 
 LONGEST_MOVE = 600.0  # s
 
 
-def masks_of(num_axes: int, axis: int) -> Mask:
-    """Return the mask of one axis of so many."""
-    return np.asarray(np.arange(num_axes) == axis)
+def masks_of(num_axes: int, axes: AxisNumbers) -> Mask:
+    """Return the mask of an axis, or of some, of so many."""
+    return np.isin(np.arange(num_axes), axes)
 
 
 def turned_round(speed: str, direction: int) -> str:
@@ -42,28 +43,28 @@ def turned_round(speed: str, direction: int) -> str:
     return text[1:] if text.startswith("-") else f"-{text.removeprefix('+')}"
 
 
-def only(drives: Drives, axis: int) -> Mask:
-    """Return the mask of one axis."""
-    return masks_of(drives.num_axes, axis)
+def only(drives: Drives, axes: AxisNumbers) -> Mask:
+    """Return the mask of an axis, or of some."""
+    return masks_of(drives.num_axes, axes)
 
 
-def enable(axis: int, mode: str) -> MotionJob:
-    """Return the job that enables an axis in a mode."""
+def enable(axes: AxisNumbers, mode: str) -> MotionJob:
+    """Return the job that enables axes in a mode."""
 
     def job(drives: Drives) -> None:
-        motion.enable(drives, mode=mode, where=only(drives, axis), timeout=3.0)
+        motion.enable(drives, mode=mode, where=only(drives, axes), timeout=3.0)
 
     return job
 
 
-def disable(axis: int) -> MotionJob:
-    """Return the job that brings an axis to rest and switches it off."""
+def disable(axes: AxisNumbers) -> MotionJob:
+    """Return the job that brings axes to rest and switches them off."""
 
     def job(drives: Drives) -> None:
-        where = only(drives, axis)
-        if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
-            motion.quick_stop(drives, where=where)
-            _await_rest(drives, axis)
+        where = only(drives, axes)
+        if (on := _enabled(drives, where)).any():
+            motion.quick_stop(drives, where=on)
+            _await_rest(drives, on)
         motion.disable(drives, where=where, timeout=3.0)
 
     return job
@@ -83,7 +84,7 @@ def command(axis: int, word: int) -> MotionJob:
         else:
             motion.take_command(drives, where=only(drives, axis))
             if word == cia402.ENABLE_OPERATION:
-                motion.stay(drives, _mode_of(drives, axis), only(drives, axis))
+                motion.stay(drives, mode_of(drives, axis), only(drives, axis))
             drives.write(cia402.CONTROLWORD, word, where=only(drives, axis))
 
     return job
@@ -142,7 +143,7 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
         where = only(drives, axis)
         target = parsed(session, axis, goal, cia402.TARGET_POSITION)
         rate = parsed(session, axis, speed, cia402.PROFILE_VELOCITY) if speed.strip() else None
-        _check_enabled(drives, axis)
+        check_enabled(drives, axis)
         motion.select_mode(drives, "pp", where=where)
         if rate is not None and rate <= 0:
             raise ValueError(f"a speed of {speed} moves nothing; give one above 0")
@@ -152,37 +153,44 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
     return job
 
 
-def turn(session: Session, axis: int, speed: str, number: int) -> MotionJob:
-    """Return the job that turns an axis in pv, or in vl of drives without it, as long as a motion of a page lasts.
+def turn(session: Session, axes: AxisNumbers, speed: str, number: int) -> MotionJob:
+    """Return the job that turns axes in pv, or in vl of drives without it, as long as a motion of a page lasts.
+
+    Several begin together, and none does where one is not enabled; from then on all are stopped where one is lost.
 
     Args:
         session: Knows the units, and the motion.
-        axis: The axis.
+        axes: The axis, or some.
         speed: Signed.
         number: Of the motion.
     """
 
     def job(drives: Drives) -> None:
-        where = only(drives, axis)
+        where = only(drives, axes)
         mode = motion.turning_mode(drives)
-        rate = parsed(session, axis, speed, motion.FOLLOWED[mode][0])
-        _check_enabled(drives, axis)
+        if not where.any():
+            raise ValueError("no axis is in the group; choose some in the table")
+        rate = np.zeros(drives.num_axes, np.int64)
+        for axis in np.flatnonzero(where).tolist():
+            rate[axis] = parsed(session, axis, speed, motion.FOLLOWED[mode][0])
+            check_enabled(drives, axis)
         if not session.presence.is_on(number):
             return  # released before it began
         motion.stay(drives, mode, where)
         motion.select_mode(drives, mode, where=where)
         if session.presence.is_on(number):
             motion.turn(drives, rate, where)
+            session.presence.couple(number)
 
     return job
 
 
-def end_turn(axis: int) -> MotionJob:
-    """Return the job that lets an axis come to rest by its own ramp: a button was released."""
+def end_turn(axes: AxisNumbers) -> MotionJob:
+    """Return the job that lets axes come to rest by their own ramps: a button was released."""
 
     def job(drives: Drives) -> None:
-        if cia402.matches(int(drives.read(cia402.STATUSWORD)[axis]), cia402.OPERATION_ENABLED):
-            motion.stay(drives, motion.turning_mode(drives), only(drives, axis))
+        if (on := _enabled(drives, only(drives, axes))).any():
+            motion.stay(drives, motion.turning_mode(drives), on)
 
     return job
 
@@ -196,13 +204,14 @@ def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
     return raw
 
 
-def _check_enabled(drives: Drives, axis: int) -> None:
+def check_enabled(drives: Drives, axis: int) -> None:
+    """Raise RuntimeError for an axis that is not in operation enabled."""
     status = int(drives.read(cia402.STATUSWORD)[axis])
     if not cia402.matches(status, cia402.OPERATION_ENABLED):
         raise RuntimeError(f"axis {axis} is not enabled and cannot move: statusword {status:04X}h; enable it first")
 
 
-def _mode_of(drives: Drives, axis: int) -> str:
+def mode_of(drives: Drives, axis: int) -> str:
     """Return the mode of operation of an axis by its abbreviation, "" for none."""
     try:
         number = int(drives.read(cia402.MODE_DISPLAY)[axis])
@@ -211,10 +220,15 @@ def _mode_of(drives: Drives, axis: int) -> str:
     return next((name for name, one in cia402.MODES.items() if one == number), "")
 
 
-def _await_rest(drives: Drives, axis: int, timeout: float = 5.0) -> None:
-    """Let time pass until the quick stop of an axis is over, or it has left its state."""
-    waited, where = 0.0, only(drives, axis)
+def _enabled(drives: Drives, where: Mask) -> Mask:
+    """Return those of some axes that are in operation enabled."""
+    return np.asarray(where & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
+
+
+def _await_rest(drives: Drives, where: Mask, timeout: float = 5.0) -> None:
+    """Let time pass until the quick stop of axes is over, or they have left its state."""
+    waited = 0.0
     while waited < timeout and motion.is_turning(drives, where, 0.02):
         waited += 0.02
-        if not cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis])):
+        if not np.any(where & cia402.is_live(drives.read(cia402.STATUSWORD))):
             return

@@ -32,6 +32,7 @@ class PageMotion:
         held: Whether it lasts only as long as a button is held; otherwise as long as the page is there.
         beat: When the page said last that it goes on [s].
         why: Why it ended; empty while it lasts.
+        coupled: Whether several axes turn by it: none goes on without the others.
     """
 
     number: int
@@ -40,6 +41,7 @@ class PageMotion:
     held: bool
     beat: float
     why: str = ""
+    coupled: bool = False
 
 
 class Presence:
@@ -75,6 +77,32 @@ class Presence:
             motion = PageMotion(next(self._numbers), page, axes.copy(), held, time.monotonic())
             self._motions[motion.number] = motion
             return motion
+
+    def couple(self, number: int) -> None:
+        """Note that the axes of a motion turn now: where they are several, none goes on without the others."""
+        with self._lock:
+            motion = self._motions.get(number)
+            if motion is not None:
+                motion.coupled = int(motion.axes.sum()) > 1
+
+    def is_coupled(self) -> bool:
+        """Return whether any motion has axes none of which goes on without the others."""
+        with self._lock:
+            return any(motion.coupled for motion in self._motions.values())
+
+    def lose(self, axes: Mask) -> None:
+        """Expire the coupled motions of axes that are not enabled any more."""
+        with self._lock:
+            for motion in self._motions.values():
+                if motion.coupled and not motion.why and np.any(motion.axes & axes):
+                    lost = int(np.flatnonzero(motion.axes & axes)[0])
+                    motion.why = f"axis {lost} is not enabled any more, and none goes on without it"
+
+    def stop(self, axes: Mask, why: str) -> None:
+        """Have axes stopped as those of a motion that expired, whatever moves them."""
+        with self._lock:
+            number = next(self._numbers)
+            self._motions[number] = PageMotion(number, "", axes.copy(), False, time.monotonic(), why)
 
     def end(self, number: int) -> PageMotion | None:
         """Return a motion that its page has ended; None if it was over."""

@@ -18,7 +18,7 @@ from drive_env import cia402
 from drive_env.dictionary import quantities
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
-from drive_env.studio.motion_cards import card, move_rows, power_row
+from drive_env.studio.motion_cards import card, move_rows, power_row, signal_rows
 from drive_env.studio.page import StudioPage
 from drive_env.studio.scope_export import as_csv, as_npz, as_png, in_words, measure_step
 from drive_env.studio.scope_trigger import EDGES
@@ -31,14 +31,16 @@ from drive_env.studio.scope_view import (
     ScopeView,
     channel_of,
     with_channels,
+    with_units,
 )
 from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
-from drive_env.studio.workspace import OF_VL, AxisSettings, object_key, object_name, trigger_of
+from drive_env.studio.workspace import CHOICES, OF_VL, AxisSettings, object_key, object_name, trigger_of
 from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
+LIVE = 5.0  # s across the plot of the page Axes
 FIRST = (  # of the objects that can be chosen, those that people look for
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
@@ -78,6 +80,25 @@ async def _listen(line: WebSocket, view: ScopeView) -> None:
             view.columns = min(4000, max(50, int(message["columns"])))
 
 
+def traces(visitor: Visitor, view: ScopeView, size: str = "") -> None:
+    """Show the traces of a scope on a page; `size` is a class of it."""
+    _views[visitor.id] = view
+    with ui.element("div").classes(f"studio-scope {size}"):
+        ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
+    ui.run_javascript(f"studioScope.start({visitor.id!r}, {json.dumps(view.cursors)})")
+
+
+def live_plot(session: Session, visitor: Visitor) -> None:
+    """Show the latest position, velocity and current of the axis of a page, as far as they are sampled anyway."""
+    known, view = session.description.dictionary, ScopeView(session.recorder)
+    scale, units = session.scales[visitor.axis], session.workspace.units
+    keys = [key for key in session.workspace.usual_channels if key in session.recorder.objects]
+    view.channels = tuple(channel_of(known.find(key), visitor.axis, scale, several=False, units=units) for key in keys)
+    view.window = LIVE
+    traces(visitor, view, "studio-scope-small")
+    visitor.client.on_delete(lambda: _views.pop(visitor.id, None))
+
+
 def build(session: Session, visitor: Visitor) -> None:
     """Make the page."""
     ScopePanel(session, visitor).build()
@@ -100,14 +121,12 @@ class ScopePanel:
 
     def build(self) -> None:
         """Make it."""
-        _views[self._visitor.id] = self._view
         self._visitor.client.on_delete(self._leave)
         self._want()
         with ui.element("div").classes("studio-scope-page"):
             with ui.card().classes("studio-card studio-scope-card"):
                 self._bar()
-                with ui.element("div").classes("studio-scope"):
-                    ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
+                traces(self._visitor, self._view)
                 self._readout()
             with ui.element("div").classes("studio-scope-side"):
                 self._move_card()
@@ -115,7 +134,6 @@ class ScopePanel:
                 self._trigger_card()
                 self._figure_card()
         ui.on("scope_cursors", self._take_cursors)
-        ui.run_javascript(f"studioScope.start({self._visitor.id!r}, {json.dumps(self._view.cursors)})")
 
     def _view_of(self, session: Session, axis: int) -> ScopeView:
         """Return the scope of an axis as its settings have it; a trigger that is set is armed.
@@ -157,8 +175,8 @@ class ScopePanel:
 
     def _channel(self, key: tuple[int, int], axis: int) -> ScopeChannel:
         entry = self._session.description.dictionary.find(key)
-        several = self._session.num_axes > 1
-        return channel_of(entry, axis, self._session.scales[axis], several=several)
+        scale, units = self._session.scales[axis], self._session.workspace.units
+        return channel_of(entry, axis, scale, several=self._session.num_axes > 1, units=units)
 
     # --- run and halt ---------------------------------------------------------------------------------------------
     def _bar(self) -> None:
@@ -209,6 +227,8 @@ class ScopePanel:
         with card("Move", "card-move"):
             power_row(self._visitor)
             move_rows(self._session, self._visitor)
+        with card("Test signal", "card-signal"):
+            signal_rows(self._session, self._visitor)
 
     # --- channels -------------------------------------------------------------------------------------------------
     def _channel_card(self) -> None:
@@ -218,6 +238,13 @@ class ScopePanel:
             options = {object_name(key): entry.label for key, entry in self._entries.items()}
             add = ui.select(options, label="Add an object, by index or name", with_input=True, clearable=True)
             add.props("dense outlined options-dense data-test=add-channel").classes("w-full")
+            ui.label("Units of all axes, here and on the page Axes").classes("studio-label")
+            with ui.row().classes("studio-buttons"):
+                for dimension, units in CHOICES.items():
+                    now = self._session.workspace.units[dimension]
+                    unit = ui.select(list(units), value=now, label=dimension.capitalize()).classes("studio-unit")
+                    unit.props(f"dense outlined options-dense data-test=unit-{dimension}")
+                    unit.on_value_change(lambda event, dimension=dimension: show_in(dimension, str(event.value)))
 
         def draw() -> None:
             chips.clear()
@@ -247,6 +274,13 @@ class ScopePanel:
             add.set_value(None)
             if channel not in self._view.channels:
                 change((*self._view.channels, channel))
+
+        def show_in(dimension: str, unit: str) -> None:
+            session = self._session
+            self._visitor.keep(lambda: session.workspace.show_in(dimension, unit))
+            for axis, view in session.scopes.items():
+                with_units(view, tuple(self._channel(one.key, axis) for one in view.channels))
+            draw()
 
         add.on_value_change(added)
         draw()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,10 +56,12 @@ class ScopeRecording:
         return next((values for one, values in self.values if one == channel), None)
 
 
-def channel_of(entry: Entry, axis: int, scale: Scale, *, several: bool) -> ScopeChannel:
-    """Return an object of an axis as a channel in the unit that people read."""
+def channel_of(
+    entry: Entry, axis: int, scale: Scale, *, several: bool, units: Mapping[str, str] = SHOWN
+) -> ScopeChannel:
+    """Return an object of an axis as a channel in the unit of its dimension."""
     unit = find_unit(entry.unit, scale)
-    shown = entry.unit if unit is None else SHOWN[unit.dimension]
+    shown = entry.unit if unit is None else units[unit.dimension]
     factor = 1.0 if unit is None else unit.factor / UNITS[shown].factor
     name = f"{entry.name} (axis {axis})" if several else entry.name
     return ScopeChannel((entry.index, entry.sub), axis, name, shown, factor)
@@ -268,6 +271,19 @@ def with_channels(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
     view.channels = channels
     if view.kept is not None and view.is_running:
         view.kept = None
+
+
+def with_units(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
+    """Show the same channels in other units, what is kept of them, too."""
+    new = {one.key: one for one in channels}
+
+    def of(recording: ScopeRecording | None) -> ScopeRecording | None:
+        if recording is None:
+            return None
+        pairs = ((new.get(one.key, one), one, values) for one, values in recording.values)
+        return replace(recording, values=tuple((to, values * (to.factor / one.factor)) for to, one, values in pairs))
+
+    view.channels, view.kept, view.reference = channels, of(view.kept), of(view.reference)
 
 
 def moved(recording: ScopeRecording, by: float) -> ScopeRecording:

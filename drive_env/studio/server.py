@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
+import numpy as np
 import uvicorn
 from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
 from nicegui import Client, app, ui
@@ -99,26 +100,27 @@ class Studio:
         elif kind == "stop":
             self.session.stop_now("the button or the space bar of a page")
         elif kind == "turn":
-            self._turn(page, int(message["hold"]), int(message["direction"]), held)
+            self._turn(page, message, held)
         elif kind == "release":
             self._release(page, held.pop(int(message["hold"]), 0))
 
-    def _turn(self, page: str, hold: int, direction: int, held: dict[int, int]) -> None:
-        """Turn the axis of a page as long as it holds the button."""
+    def _turn(self, page: str, message: dict[str, Any], held: dict[int, int]) -> None:
+        """Turn the axis of a page, or its group, as long as it holds the button."""
+        hold, direction, is_group = int(message["hold"]), int(message["direction"]), bool(message.get("group"))
         visitor = self.visitors.get(page)
         if visitor is None or not self.session.num_axes:
             return
-        axes = motion_jobs.masks_of(self.session.num_axes, visitor.axis)
-        lasting = self.session.presence.begin(page, axes, held=True)
+        axes = sorted(visitor.group) if is_group else [visitor.axis]
+        lasting = self.session.presence.begin(page, motion_jobs.masks_of(self.session.num_axes, axes), held=True)
         held[hold] = lasting.number
-        speed = motion_jobs.turned_round(visitor.jog_speed, direction)
-        job = motion_jobs.turn(self.session, visitor.axis, speed, lasting.number)
-        visitor.hand_in(job, f"Jog axis {visitor.axis}")
+        speed = motion_jobs.turned_round(visitor.group_speed if is_group else visitor.jog_speed, direction)
+        visitor.hand_in(motion_jobs.turn(self.session, axes, speed, lasting.number), f"Jog {visitor.named(axes)}")
 
     def _release(self, page: str, number: int) -> None:
         visitor = self.visitors.get(page)
-        if number and self.session.presence.end(number) is not None and visitor is not None:
-            visitor.hand_in(motion_jobs.end_turn(visitor.axis), f"End of the jog of axis {visitor.axis}")
+        if number and (lasting := self.session.presence.end(number)) is not None and visitor is not None:
+            axes = np.flatnonzero(lasting.axes).tolist()
+            visitor.hand_in(motion_jobs.end_turn(axes), f"End of the jog of {visitor.named(axes)}")
 
 
 class _SlowPages(logging.Filter):

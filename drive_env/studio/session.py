@@ -343,7 +343,7 @@ class Session:
             self._drives = SharedDrives(
                 self._real, self.recorder, self._look, self._hear, self.presence.moves, self._why_stopped
             )
-            self._states = AxisStates(self._real, self.description)
+            self._states = AxisStates(self._real, self.description, self.workspace.units)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
             self._read_stored()
@@ -457,8 +457,12 @@ class Session:
         job = self._current
         if self._stop_asked:
             self._obey()
+        if self.presence.is_coupled() and (newest := self.recorder.newest().get((cia402.STATUSWORD, 0))) is not None:
+            self.presence.lose(~np.asarray(cia402.matches(newest, cia402.OPERATION_ENABLED)))
         for overdue in self.presence.take_overdue():
             self.say("warning", f"stopped: {overdue.why}")
+            if job is not None and self._drives is not None and np.any(self._drives.moved & overdue.axes):
+                job.stopped = job.stopped or overdue.why
             self._stop(overdue.axes)
         if not self.presence.is_abandoned():
             self._is_left = False

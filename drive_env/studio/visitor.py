@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -27,13 +27,24 @@ class Visitor:
         session: The drives.
         client: NiceGUI's side of it.
         axis: The axis that it looks at.
+
+    Attributes:
+        jog_speed: Of its axis.
+        group: Axes that it commands together; all before any is left out.
+        group_speed: Of their jog.
     """
 
     def __init__(self, session: Session, client: Client, axis: int) -> None:
         self.session = session
         self.client = client
         self.axis = axis
-        self.jog_speed = session.workspace.of(axis).jog_speed
+        self.jog_speed = self.group_speed = session.workspace.of(axis).jog_speed
+        self.group = set(range(session.num_axes))
+
+    @staticmethod
+    def named(axes: Sequence[int]) -> str:
+        """Return axes in words: "axis 0", "axes 0, 1"."""
+        return f"ax{'i' if len(axes) == 1 else 'e'}s {', '.join(map(str, axes))}"
 
     @property
     def id(self) -> str:
@@ -48,8 +59,12 @@ class Visitor:
 
     def set(self, **changes: Any) -> None:
         """Keep settings of its axis, named as in `AxisSettings`, for the pages after this one."""
+        self.keep(lambda: self.session.workspace.change(self.axis, **changes))
+
+    def keep(self, change: Callable[[], None]) -> None:
+        """Change the workspace; the page says where its file cannot be written."""
         try:
-            self.session.workspace.change(self.axis, **changes)
+            change()
         except OSError as error:
             self.say(sentence(error), "error")
 

@@ -1,15 +1,17 @@
-"""What people have set on the pages and find again: the scope and the jog speed of each axis, also in a file."""
+"""What people have set on the pages and find again, in a file, too: scope and jog speed of axes, units, favourites."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from drive_env import cia402
 from drive_env.cia402 import Key
+from drive_env.dictionary.quantities import SHOWN
 from drive_env.fieldbus.description import Description
 from drive_env.studio.scope_trigger import EDGES, ScopeTrigger
 from drive_env.studio.scope_view import MODES, MOST_CHANNELS, WINDOWS
@@ -19,6 +21,9 @@ from mechanics.untrusted import read_toml
 FORMAT = 1
 CHANNELS = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
 OF_VL = (cia402.VL_VELOCITY_DEMAND, cia402.VL_VELOCITY_ACTUAL)  # of a drive that has none of them
+# Of each dimension the units that can be chosen; the others have the usual one.
+CHOICES = {"angle": ("rev", "deg", "rad"), "speed": ("rpm", "rev/s", "rad/s", "deg/s"), "current": ("A", "mA")}
+UNITS_TEXT = "; ".join(f"{dimension}: {', '.join(units)}" for dimension, units in CHOICES.items())
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,7 @@ class AxisSettings:
 
 
 class Workspace:
-    """The settings of each axis.
+    """The settings of each axis, and those of all axes.
 
     Args:
         description: Of the device.
@@ -57,20 +62,35 @@ class Workspace:
     Raises:
         ValueError: For a file that is not a workspace of this device.
         OSError: If it cannot be read.
+
+    Attributes:
+        units: In which values of each dimension are shown.
+        favourites: Objects that the page Dictionary shows among them.
     """
 
     def __init__(self, description: Description, file: Path | None = None) -> None:
         self._description = description
         self._file = file
         self._axes: dict[int, AxisSettings] = {}
+        self.units = dict(SHOWN)
+        self.favourites: tuple[Key, ...] = ()
         if file is not None and file.exists():
-            self._axes = _read(file, description)
+            data = _read(file, description)
+            with _line_named(file):
+                self._axes = {int(k): _settings(table, description) for k, table in data.get("axis", {}).items()}
+                self.units |= _units(data.get("units", {}))
+                self.favourites = tuple(object_key(name) for name in data.get("favourites", []))
+                _check_objects(self.favourites, description)
+
+    @property
+    def usual_channels(self) -> tuple[Key, ...]:
+        """The objects on a scope where nothing else is set: position, velocity and current, or what a drive has."""
+        there = [(index, 0) for index in (*CHANNELS, *OF_VL) if self._description.has((index, 0))]
+        return tuple(key for key in there if key[0] in CHANNELS) or tuple(there)
 
     def of(self, axis: int) -> AxisSettings:
         """Return the settings of an axis."""
-        known = self._description
-        there = [(index, 0) for index in (*CHANNELS, *OF_VL) if known.has((index, 0))]
-        usual = tuple(key for key in there if key[0] in CHANNELS) or tuple(there)
+        known, usual = self._description, self.usual_channels
         source = (cia402.VELOCITY_ACTUAL, 0)
         return self._axes.get(axis) or AxisSettings(
             channels=usual, source=source if known.has(source) or not usual else usual[-1]
@@ -79,11 +99,27 @@ class Workspace:
     def change(self, axis: int, **changes: Any) -> None:
         """Change settings of an axis, named as in `AxisSettings`; OSError if the file cannot be written."""
         self._axes[axis] = replace(self.of(axis), **changes)
+        self._save()
+
+    def show_in(self, dimension: str, unit: str) -> None:
+        """Show values of a dimension in a unit from now on; errors as `change`."""
+        self.units |= _units({dimension: unit})
+        self._save()
+
+    def toggle_favourite(self, key: Key) -> None:
+        """Add an object to the favourites, or take it away; errors as `change`."""
+        kept = tuple(one for one in self.favourites if one != key)
+        self.favourites = kept if key in self.favourites else (*kept, key)
+        self._save()
+
+    def _save(self) -> None:
         if self._file is not None:
             write_whole(self._file, self._toml())
 
     def _toml(self) -> str:
         lines = [f"format = {FORMAT}", f"device = {json.dumps(self._description.name)}"]
+        lines.append(f"favourites = {json.dumps([object_name(key) for key in self.favourites])}")
+        lines += ["", "[units]", *(f"{name} = {json.dumps(self.units[name])}" for name in CHOICES)]
         for axis, one in sorted(self._axes.items()):
             lines += ["", f"[axis.{axis}]"]
             for name, value in vars(one).items():
@@ -109,7 +145,7 @@ def _written(value: Any) -> Any:
     return object_name(value) if value and isinstance(value[0], int) else [object_name(key) for key in value]
 
 
-def _read(file: Path, description: Description) -> dict[int, AxisSettings]:
+def _read(file: Path, description: Description) -> dict[str, Any]:
     try:
         data = read_toml(file)
     except ValueError as error:
@@ -118,10 +154,29 @@ def _read(file: Path, description: Description) -> dict[int, AxisSettings]:
         raise ValueError(f"{file} is not a workspace of the studio; give a file that it wrote, or a new name")
     if data.get("device") != description.name:
         raise ValueError(f"{file} is of {data.get('device')}, and this is {description.name}; give another file")
+    return data
+
+
+@contextmanager
+def _line_named(file: Path) -> Iterator[None]:
     try:
-        return {int(axis): _settings(table, description) for axis, table in data.get("axis", {}).items()}
+        yield
     except (ValueError, TypeError, AttributeError, KeyError) as error:
         raise ValueError(f"{file}: {error}; mend the line, or give a new name") from None
+
+
+def _units(table: Mapping[str, str]) -> dict[str, str]:
+    """Return the unit of each dimension; ValueError for one that cannot be chosen."""
+    for dimension, unit in table.items():
+        if unit not in CHOICES.get(dimension, ()):
+            raise ValueError(f"units: {dimension} = {unit!r} is not one of {UNITS_TEXT}")
+    return dict(table)
+
+
+def _check_objects(keys: Iterable[Key], description: Description) -> None:
+    for key in keys:
+        if not description.has(key):
+            raise ValueError(f"{description.name} has no object {object_name(key)}")
 
 
 def _settings(table: Mapping[str, Any], description: Description) -> AxisSettings:
@@ -132,9 +187,7 @@ def _settings(table: Mapping[str, Any], description: Description) -> AxisSetting
     found = AxisSettings(
         **{**table, "channels": channels, "source": object_key(table["source"]), "window": float(table["window"])}
     )
-    for key in (*channels, found.source):
-        if not description.has(key):
-            raise ValueError(f"{description.name} has no object {object_name(key)}")
+    _check_objects((*channels, found.source), description)
     for name, value, known in (
         ("mode", found.mode, MODES),
         ("edge", found.edge, EDGES),

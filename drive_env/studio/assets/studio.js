@@ -83,10 +83,11 @@
   );
 
   // --- jog: as long as a button is held -----------------------------------------------------------------------------
-  function hold(direction, element) {
+  function hold(element) {
     if (studio.held) return;
     const number = ++holds;
-    if (send({ k: "turn", hold: number, direction })) {
+    const direction = Number(element.dataset.jog);
+    if (send({ k: "turn", hold: number, direction, group: element.dataset.group === "all" })) {
       studio.held = number;
       holder = element;
       element.classList.add("is-held");
@@ -106,7 +107,7 @@
   const jog = (event) => event.target.closest && event.target.closest("[data-jog]");
   window.addEventListener("pointerdown", (event) => {
     const button = jog(event);
-    if (button && event.button === 0 && !button.disabled) hold(Number(button.dataset.jog), button);
+    if (button && event.button === 0 && !button.disabled) hold(button);
   });
   for (const name of ["pointerup", "pointercancel", "blur", "pagehide", "contextmenu"]) {
     window.addEventListener(name, release);
@@ -119,7 +120,7 @@
     const button = jog(event);
     if (button && event.key === "Enter") {
       event.preventDefault();
-      if (!event.repeat) hold(Number(button.dataset.jog), button);
+      if (!event.repeat) hold(button);
     }
   });
   window.addEventListener("keyup", (event) => event.key === "Enter" && release());
