@@ -57,7 +57,7 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection(session):
-    """Collect tests without the garbage collector, and have it never look at what is there then: nothing of that goes."""
+    """Collect tests without the garbage collector, which never looks at what is there then: nothing of that goes."""
     gc.disable()
     try:
         return (yield)
