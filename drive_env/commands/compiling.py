@@ -56,7 +56,7 @@ def compile_kernels(
 
 
 def _steps(devices: list[str]) -> dict[str, Callable[[], None]]:
-    """Return what compiles the kernels of devices, by its name on the progress bar.
+    """Return the steps that compile the kernels of devices, by their titles on the progress bar.
 
     Raises:
         ValueError: There is no such device.
