@@ -391,6 +391,27 @@ def test_a_limit_of_current_is_not_raised_by_what_its_counts_are(drives, name):
         bus.shutdown()
 
 
+def test_speeds_ramps_and_counts_change_past_the_limits_by_no_register_of_an_enabled_axis(drives):
+    """PosSpeed and Speed are 6081h and 60FFh in other units: what they had before is refused as the move begins."""
+    drives.machine.reset()
+    bus = WorldBus(ObservedWorld(drives, lockstep=True))
+    try:
+        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER, safety=Limits(velocity=10_000)) as master:
+            master.write("PG PosSpeed", 100 * 2**16)
+            motion.enable(master, mode="pp")
+            with pytest.raises(SafetyError, match=r"its drive has 6081h:00 .* beyond the limit 10000"):
+                motion.start_move(master, UNITS)
+            for name in ("Acc", "Dec", "PosSpeed", "Speed", "BitsPerRevol", "F-Type", "F-Resolution", "F-IncrEnc"):
+                register = name if name.startswith("F-") else f"PG {name}"
+                now = master.read(register)
+                with pytest.raises(SafetyError, match=r"checked by objects of CiA 402 alone.*Disable it first"):
+                    master.write(register, now)
+            motion.disable(master)
+            master.write("PG PosSpeed", 2**16)
+    finally:
+        bus.shutdown()
+
+
 def test_outputs_are_forced_and_set_by_the_axis_own_registers():
     with new_drives("gantry") as drives:
         wire = Wire(drives)

@@ -137,6 +137,8 @@ class MasterHints(NamedTuple):
         timeout: Longest wait for an answer.
         timeouts: Index -> longest wait, of objects that take longer.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
+        unchecked_motion: Objects that change speeds, ramps or counts of a revolution beside those of CiA 402, by which
+            a master checks them.
         commands: Index -> its name, of the device's own objects that can be written but are not parameters.
         addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be
             another one after its next reset, or mute.
@@ -146,6 +148,7 @@ class MasterHints(NamedTuple):
     timeout: float
     timeouts: dict[int, float]
     turns_positions_round: tuple[tuple[int, int], ...] = ((cia402.POLARITY, 0),)
+    unchecked_motion: tuple[tuple[int, int], ...] = ()
     commands: Mapping[int, str] = MappingProxyType({})
     addresses: Mapping[int, str] = MappingProxyType({})
 
@@ -503,5 +506,5 @@ def _canopen(data: Mapping[str, Any]) -> CanopenBehaviour:
 
 def _master(data: Mapping[str, Any]) -> MasterHints:
     by_index = {name: {int(index, 16): row for index, row in data[name].items()} for name in OF_INDICES}
-    turns = tuple(parse_key(text) for text in data["turns_positions_round"])
-    return MasterHints(data["rpdo_type"], data["timeout"], turns_positions_round=turns, **by_index)
+    keys = {name: tuple(map(parse_key, data[name])) for name in ("turns_positions_round", "unchecked_motion")}
+    return MasterHints(data["rpdo_type"], data["timeout"], **keys, **by_index)

@@ -43,7 +43,8 @@ class HeldObjects:
             for key in [*values, *refused]
         }
         self.description = SimpleNamespace(
-            num_axes=1, cycle=0.001, has=self.entries.__contains__, hints=SimpleNamespace(turns_positions_round=()),
+            num_axes=1, cycle=0.001, has=self.entries.__contains__,
+            hints=SimpleNamespace(turns_positions_round=(), unchecked_motion=()),
             role=lambda role: CURRENT_LIMIT if role is Role.CURRENT_LIMIT and CURRENT_LIMIT in self.entries else None,
             dictionary=SimpleNamespace(
                 find=lambda key: self.entries[key], has=self.entries.__contains__, roles={}
