@@ -506,5 +506,9 @@ def _canopen(data: Mapping[str, Any]) -> CanopenBehaviour:
 
 def _master(data: Mapping[str, Any]) -> MasterHints:
     by_index = {name: {int(index, 16): row for index, row in data[name].items()} for name in OF_INDICES}
-    keys = {name: tuple(map(parse_key, data[name])) for name in ("turns_positions_round", "unchecked_motion")}
-    return MasterHints(data["rpdo_type"], data["timeout"], **keys, **by_index)
+    turns, unchecked = (
+        tuple(parse_key(text) for text in data[name]) for name in ("turns_positions_round", "unchecked_motion")
+    )
+    return MasterHints(
+        data["rpdo_type"], data["timeout"], turns_positions_round=turns, unchecked_motion=unchecked, **by_index
+    )
