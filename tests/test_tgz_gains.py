@@ -69,9 +69,15 @@ def test_c_k_is_volts_for_amperes_and_c_kdr_its_share_across_them():
         K = 2000e-3 / OF_LINK * field(drives, "u_dc")
         resistance = field(drives, "R_s")
         assert field(drives, "i_q") == pytest.approx(asked * K / (K + resistance), rel=2e-3)
+        motion.disable(drives)
         write(drives, C_KDr=50)
-        drives.advance(0.002)
-        assert field(drives, "current_p_d") == pytest.approx(0.5 * field(drives, "current_p"))
+        for name, value in ((0x23E4, 1), (0x23E5, 3000)):  # in open loop: all of the current is along the field
+            drives.write(name, value)
+        motion.enable(drives, mode="cst")
+        drives.advance(0.1)
+        K = 0.5 * 2000e-3 / OF_LINK * field(drives, "u_dc")
+        assert field(drives, "i_d") == pytest.approx(asked * K / (K + resistance), rel=2e-3)
+        assert field(drives, "i_q") == pytest.approx(0.0, abs=1e-3)
 
 
 def test_c_ti_is_the_time_in_which_the_integrator_adds_what_the_gain_gives():

@@ -91,8 +91,8 @@ class Judging:
         for axis in np.flatnonzero(were_judged & ignores & settled).tolist():
             self._stop_for(
                 f"axis {axis} has ceased to take commands (bit 9 of 6041h is 0): {self._mode_gate.label} does not fit "
-                "its mode of operation, and this program has changed neither",
-                "end the other master, or the service program, then enable again",
+                "its mode of operation",
+                "end what has changed either, another master or the service program, then enable again",
             )
 
     def _judge_speed(self, judged: Mask, bounds: Bounds) -> None:
