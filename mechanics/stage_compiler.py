@@ -67,7 +67,7 @@ def remembered_answers() -> Iterator[None]:
     """Have Numba remember what does not change while it compiles a kernel.
 
     It looks for the implementation of each operator among dozens at each place and each round of type inference (a
-    fifth of the time), writes a record's 400 fields out to name it in events and errors that nobody reads (a twelfth),
+    fifth of the time), writes a record's 400 fields out to name it in events and errors without a reader (a twelfth),
     and copies all variables of a function with each block that it puts in a caller's place (an eighth).
     """
     with ExitStack() as changed:

@@ -77,6 +77,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_program_that_started_them(tmp_path):
     """Killed, it can tell them nothing; they had gone on to the end of their queue."""
     (tmp_path / "many.py").write_text(WORKER)

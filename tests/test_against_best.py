@@ -6,6 +6,7 @@ import csv
 import statistics
 
 import numpy as np
+import pytest
 
 from tuning.compare.against_best import all_rivals
 from tuning.compare.comparison import Comparison, MachineRow, TunerRow
@@ -36,6 +37,7 @@ def test_each_machine_has_its_own_best_rival():
     assert (found.better, found.machines, found.rivals) == (1, 5, "tpe, gp")  # a draw is no better
 
 
+@pytest.mark.slow
 def test_the_interval_holds_the_median_of_all_machines_as_often_as_it_says():
     rng, held = np.random.default_rng(0), []
     for _ in range(150):
@@ -52,6 +54,7 @@ def test_every_tuner_is_held_against_all_others_the_best_first():
     assert all_rivals(comparison({"alone": [1.0]})) == ()
 
 
+@pytest.mark.slow
 def test_they_are_a_file_of_the_comparison(tmp_path):
     save(comparison(HIDDEN), tmp_path, {"suite": "public"})
     with (tmp_path / "rivals.csv").open() as file:

@@ -42,7 +42,7 @@ def run(name, arguments, monkeypatch):
             module.main()
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("name", RUNS)
 def test_it_runs(name, monkeypatch, capsys):
     if name in ("own_reward", "own_load", "curriculum"):

@@ -92,7 +92,7 @@ def is_disabled(drives):
 
 
 # --- on drives --------------------------------------------------------------------------------------------------------
-@pytest.mark.every(6)
+@pytest.mark.every(18)
 @wrong_policies
 def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
     world = World(lockstep=True)
@@ -112,6 +112,7 @@ def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
     world.close()
 
 
+@pytest.mark.every(8)
 @wrong_policies
 def test_drives_in_this_process_are_stopped_too(wrong, guard, message):
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:

@@ -158,6 +158,7 @@ def test_the_next_trial_is_the_best_of_all_candidates_wherever_the_incumbent_is(
     assert action[1] + incumbent == pytest.approx(action[0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_trials_lie_within_the_range_and_the_action_is_a_share_of_the_step(bundle, monkeypatch):
     narrow = AgentFile(bundle.kind, bundle.arrays, {**bundle.settings, "step": 0.5}, "none")
     for one, step in ((bundle, training.STEP), (narrow, 0.5)):

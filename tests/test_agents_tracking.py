@@ -48,6 +48,7 @@ def test_the_shipped_controllers_perform_as_their_cards_say(name):
     assert not found.violations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(one, marks=[pytest.mark.slow] * (one == "arm_path")) for one in OF_TASKS]
 )

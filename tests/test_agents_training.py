@@ -114,6 +114,7 @@ def test_a_training_counts_to_the_end_of_its_last_rollout(tmp_path):
     assert (told[-1].timesteps, told[-1].total) == (32, 32)
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_run(tmp_path):
     told = []
     bundle = train(tiny(), tmp_path, report=told.append)

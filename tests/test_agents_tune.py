@@ -164,6 +164,7 @@ def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, argument
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_policy_that_gives_no_number_leaves_the_drive_as_it_was_and_disabled(tmp_path):
     with emulated("tmcm1636", "two_mass", "qbl4208") as target:
         before = gains(target)

@@ -14,6 +14,7 @@ from tuning.certificate.certificate_files import is_unchanged, load_certificate
 from tuning.snapshot import load_snapshot
 
 
+@pytest.mark.slow
 def test_rules_show_gains_margins_and_what_a_relay_measured():
     done = drive_tune("rules", "simc", "margin_45", "--load", "inertia", "--relay", "--json")
     assert done.exit_code == 0, done.output
@@ -105,6 +106,7 @@ def test_auto_does_not_write_into_a_folder_with_something_in_it(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
+@pytest.mark.slow
 def test_auto_leaves_the_way_back_a_certificate_and_a_report(quick_designs, tmp_path):
     out = tmp_path / "run"
     done = drive_tune("auto", "--load", "inertia", "--out", out, "--json")

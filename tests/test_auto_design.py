@@ -218,6 +218,7 @@ class FedForward:
         return 1.0 + np.abs(ahead - self.best) * np.ones(gains.shape[:2])
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("best", [0, 500, 850, 1000])
 def test_the_speed_feed_forward_of_a_tgz_is_tried_and_taken_where_it_is_better(best):
     """P-SFF, thousandths of the demanded speed."""

@@ -80,6 +80,7 @@ def test_the_gains_before_are_back_and_the_drive_is_off(monkeypatch, tmp_path, h
         assert is_off(drives)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_designs")
 def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
     roll_back = Transaction.roll_back

@@ -185,6 +185,7 @@ def rows_of(folder):
     return {path.parent.relative_to(folder).as_posix(): Row.load(path) for path in folder.glob(f"*/*/*/{RESULT}")}
 
 
+@pytest.mark.slow
 def test_every_run_has_its_row_and_the_table_has_them_all(benchmark):
     rows = rows_of(benchmark)
     assert {name.partition("/")[2] for name in rows} == {"rest/0", "cascade/0", "expert/0", "ppo/0", "ppo/1"}
@@ -218,6 +219,7 @@ def test_the_scores_of_a_baseline_are_those_of_its_episodes(benchmark):
     np.testing.assert_allclose(scores, total / TASKS[TASK].steps, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_is_complete_is_not_made_again(benchmark, monkeypatch):
     kept = {path: path.stat().st_mtime_ns for path in benchmark.glob(f"*/*/*/{RESULT}")}
     lost = benchmark / "TorqueTracking-v1/ppo/1"
@@ -263,7 +265,7 @@ def test_worker_processes_change_no_score(benchmark, tmp_path):
 SHIPPED = hyperparameters.FOLDER
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(24)
 @pytest.mark.parametrize("task", TASKS)
 def test_the_hyperparameters_that_ship_train_on_every_task(task, tmp_path, monkeypatch):
     monkeypatch.setattr(hyperparameters, "FOLDER", SHIPPED)

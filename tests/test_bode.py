@@ -33,6 +33,7 @@ def drawn(plot, colour):
     return np.concatenate(points) if points else np.zeros(0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plot", [0, 1])  # magnitude, phase
 def test_incoherent_bins_are_grey_and_in_no_line(response, plot):
     axes = bode_figure(response).axes[plot]
@@ -59,6 +60,7 @@ def test_a_margin_that_was_not_seen_is_called_so(response):
     assert "phase margin not measured" in bode_figure(blind).get_suptitle()
 
 
+@pytest.mark.slow
 def test_a_picture_is_written(response, tmp_path):
     write_bode(tmp_path / "bode.png", response)
     pixels = imread(tmp_path / "bode.png")

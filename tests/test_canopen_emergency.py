@@ -170,6 +170,7 @@ def test_bus_off_stops_the_drive_and_is_told_after_recovery(wire):
     assert {frame.can_id for frame in wire.take()} == {0x185, 0x285, 0x705}
 
 
+@pytest.mark.slow
 def test_bus_off_enters_stopped_by_default(wire):
     wire.enable()
     wire.start()

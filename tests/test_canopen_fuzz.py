@@ -204,6 +204,7 @@ def test_10000_frames():
     fuzz(1, 10_000)
 
 
+@pytest.mark.every(3)
 @pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
 @pytest.mark.parametrize(
     ("device", "axes", "count"), [("tmcm6212", 6, 3_000), ("tgz_d", 2, 3_000), ("tmcm3313", 3, 3_000)]

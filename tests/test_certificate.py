@@ -190,6 +190,7 @@ def verify(path):
     return CliRunner().invoke(app, ["verify", str(path)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["certificate.json", "report.html"])
 def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, tmp_path, name):
     save_certificate(certificate, tmp_path)
@@ -257,6 +258,7 @@ def test_the_report_needs_nothing_from_anywhere(certificate):
         assert len(np.unique((picture * 255).astype(int).reshape(-1, 3), axis=0)) > 20
 
 
+@pytest.mark.slow
 def test_no_text_of_a_certificate_is_taken_for_html(certificate):
     """What drives, files and people wrote is text: emergencies, names of motors and devices, reasons, notes."""
     evil = "<script>alert(1)</script><img src=x onerror='alert(1)'>\" onclick='alert(1)"
@@ -291,6 +293,7 @@ class Tags(HTMLParser):
         self.handlers += [name for name, _ in attributes if name.startswith("on")]
 
 
+@pytest.mark.slow
 def test_the_report_says_everything_that_the_certificate_holds(certificate):
     words = Page(to_html(certificate)).words
     for said in ("0.3612", "0.355 to 0.367", "ohm", "not identified", "travel too short: 0.1 <turns>", "1400",
@@ -332,6 +335,7 @@ def test_a_margin_that_was_not_seen_is_there_as_what_it_is_at_least():
     assert [name for name in shown.margins if "at least" in name] == ["gain margin, at least [dB]"]
 
 
+@pytest.mark.slow
 def test_what_a_tuner_guessed_is_in_neither_file(certificate):
     guess, reason = Estimate(0.4567, 0.32, 0.59, "A"), "two moves do not tell it from viscous friction"
     known = Estimate(1.48e-5, 1.4e-5, 1.56e-5, "kg*m^2")
@@ -368,7 +372,7 @@ def test_a_load_that_is_not_known_is_said_to_be_none():
     assert math.isnan(found.value) and found.reason == "it does not turn"
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "told"), [(0.5, False), (0.51, True), (math.nan, False)])
 def test_a_position_loop_near_the_velocity_loop_is_pointed_out(certificate, ratio, told):
     axis = certificate.axes[0]

@@ -86,7 +86,7 @@ def test_auto_on_the_axes_that_have_motors_is_accepted_and_lets_the_others_alone
         assert settings_of(drives, axis["axis"])[0x2003, 0] == axis["before"]["run_current"]
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("auto",), ("auto", "--by", "random", "--trials", "1")], ids=" ".join)
 def test_axes_without_a_motor_are_named_before_anything_moves(served, tmp_path, command):
     """It wrote 6060h and ramps of all axes, and failed with advice on 6085h of one that has no motor."""

@@ -47,6 +47,7 @@ def test_a_closed_output_ends_quietly(name, unbuffered, broken):
     assert (found.returncode, found.stderr) == (141, "")
 
 
+@pytest.mark.slow
 def test_both_closed_end_quietly(broken):
     assert run(COMMANDS["a card"], stdout=broken, stderr=broken).returncode == 141
     assert run(("drive_env", "get"), stdout=broken, stderr=broken).returncode == 141
@@ -58,13 +59,14 @@ def test_a_mistake_keeps_its_code_where_nothing_was_printed(broken):
     assert found.returncode == 2 and "there is no file" in found.stderr
 
 
+@pytest.mark.slow
 def test_without_an_output_a_command_does_its_work():
     command = [sys.executable, "-c", PROGRAM, *COMMANDS["a card"]]
     found = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], timeout=120, stderr=subprocess.PIPE, text=True)
     assert (found.returncode, found.stderr) == (0, "")
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_full_disk_is_told(unbuffered):
@@ -74,7 +76,7 @@ def test_a_full_disk_is_told(unbuffered):
     assert found.stderr.endswith("No space left on device\n") and found.stderr.count("\n") == 1
 
 
-@pytest.mark.every(4)
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no such device here")
 @pytest.mark.parametrize(("kind", "device"), [("esi", "tmcm3313"), ("eds", "tmcm1636_fw109")])
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -235,6 +235,7 @@ def test_an_open_loop_stepper_has_no_loops_to_identify(tmp_path):
         assert path.run("motor", quiet).state == "done" and path.run("limits", quiet).state == "done"
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("gains", [(4021, 1573, 445, 329, 118), (4021, 1573, 600, 400, 250)])
 def test_the_margins_that_it_prints_are_those_of_the_true_plant(tmp_path, gains):
     """Of two masses on a spring, by the linear model of what the machine truly is."""
@@ -297,6 +298,7 @@ def test_a_method_that_the_drive_does_not_have_is_refused_before_anything_moves(
         assert found.stdout == "" and settings_of(drives) == before and not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_a_failed_step_over_can_leaves_the_drive_as_it_was_found(tmp_path, monkeypatch):
     """Also where positions were turned round under limits of travel (2080h:01), and the axis was homed."""
     monkeypatch.chdir(tmp_path)
@@ -323,6 +325,7 @@ def test_what_is_stored_survives_a_power_cycle_and_undo_takes_it_back(tmp_path, 
         assert settings_of(drives) == before
 
 
+@pytest.mark.slow
 def test_on_a_terminal_a_step_is_done_left_out_or_gone_back_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     terminal = SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True))

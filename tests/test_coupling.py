@@ -293,6 +293,7 @@ def test_prediction_is_exact_with_a_rigid_inertia():
     assert np.abs(theta - theta_true).max() < WINDOW**2 * acceleration / 4
 
 
+@pytest.mark.slow
 def test_prediction_with_viscous_friction_is_second_order():
     """The reaction is extrapolated, so what is left is its second difference."""
     viscous = 1e-4

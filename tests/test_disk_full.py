@@ -316,7 +316,7 @@ COMMANDS = [
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
-@pytest.mark.every(8)
+@pytest.mark.every(32)
 @pytest.mark.parametrize(("command", "options", "left", "file", "goes_on"), COMMANDS)
 def test_a_command_names_the_file_that_finds_no_room(tmp_path, monkeypatch, command, options, left, file, goes_on):
     """`sweep`, `optimise` and `train` said "[Errno 28] No space left on device" alone."""

@@ -43,6 +43,7 @@ HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 WRITTEN_HERE = [*HOW_TO, *sorted((DOCS / "tutorials").glob("*.md"))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "page",
     [

@@ -274,6 +274,7 @@ def test_motion_copes_with_each_quirk(tmp_path, quirks):
 BY_DEFAULT = ("same mode refused", "all")
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     "name", [name if name in BY_DEFAULT else pytest.param(name, marks=pytest.mark.slow) for name in QUIRKS]
 )
@@ -292,6 +293,7 @@ def test_a_master_that_knows_the_eds_alone_copes_with_each(tmp_path, name):
         world.close()
 
 
+@pytest.mark.slow
 def test_a_mode_that_never_comes_is_told_and_the_axis_is_not_left_running(tmp_path):
     with build(tmp_path, mode_display_delay=1.0) as drives:
         with pytest.raises(TimeoutError, match=r"did not change to csv in 0.5 s, at a halt neither"):

@@ -82,6 +82,7 @@ def test_a_program_that_ends_within_a_step_leaves_the_axis_within_its_travel(emu
     assert theta.max() < 3.02 and theta[-1] > 0.1
 
 
+@pytest.mark.every(2)
 def test_programs_that_touch_no_limit_see_the_same_integers(emulated):
     """A path from end to end at 20 turns/s, and a step of 2.5 turns."""
 
@@ -207,6 +208,7 @@ def check(found):
     assert sum(bool((one.alone.farthest > 0.0).any()) for one in found) > len(found) // 10
 
 
+@pytest.mark.slow
 def test_the_envelope_makes_no_sequence_worse():
     check(compare(range(SAMPLE)))
 

@@ -657,7 +657,7 @@ def test_a_channel_whose_name_ends_in_a_large_number_is_logged(tmp_path, monkeyp
         assert [(one.arbitration_id, bytes(one.data)) for one in reader] == [(0x181, b"\1\2")]
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["log", "blf"])
 def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, ending):
     file = tmp_path / f"session.{ending}"

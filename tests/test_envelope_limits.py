@@ -346,6 +346,7 @@ def test_a_watchdog_that_a_dead_master_left_is_replaced_and_not_put_back(bus, dr
     assert drive.get(0x1016, 1) == 0
 
 
+@pytest.mark.slow
 def test_a_drive_that_watches_a_living_master_is_refused(bus, drive):
     drive.set(0x1016, 5 << 16 | 1000, 1)
     truly = bus._recv_internal

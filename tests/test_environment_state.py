@@ -79,7 +79,7 @@ def assert_same(found, expected):
             np.testing.assert_array_equal(seen, due)
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(48)
 @EVERY_CASE
 def test_what_is_continued_from_a_state_is_the_same_to_the_bit(kind, options):
     """Again in these environments, in others that were made alike, and once more: a state is not used up."""

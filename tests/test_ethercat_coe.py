@@ -33,6 +33,7 @@ def pre_op(rig):
 
 
 # --- SDO --------------------------------------------------------------------------------------------------------------
+@pytest.mark.every(18)
 @pytest.mark.parametrize(
     ("request_", "answer"),
     [
@@ -136,6 +137,7 @@ def test_all_axes_follow_their_own_targets_in_csp(pre_op):
     assert pre_op.request(4) == (4, 0)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("target", [1, 2, 4], ids=["init", "pre_op", "safe_op"])
 def test_who_leaves_op_has_its_motors_stopped(pre_op, target):
     enable(pre_op, mode=9)
@@ -228,6 +230,7 @@ def test_the_lists_of_objects(pre_op):
     assert information(pre_op, 1, struct.pack("<H", 9))[0] == struct.pack("<I", 0x05040001)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("index", "kind", "last", "code", "name"),
     [
@@ -259,6 +262,7 @@ def test_the_description_of_an_entry(pre_op, index, sub, kind, bits, access):
     assert struct.unpack_from("<HBBHHH", content) == (index, sub, 0, kind, bits, access)
 
 
+@pytest.mark.slow
 def test_the_description_of_an_entry_with_its_values(pre_op):
     """2000h: table 35 has 0 to 8, default 8."""
     content, _ = information(pre_op, 5, struct.pack("<HBB", 0x2000, 0, 0x70))

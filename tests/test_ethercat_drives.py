@@ -91,7 +91,7 @@ def as_integers(traces):
     return [np.stack([trace[index] for index in SAMPLED]) for trace in traces]
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("safety", [True, False], ids=["enveloped", "bare"])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_same_script_gives_the_same_integers(name, safety):
@@ -127,6 +127,7 @@ def test_it_goes_to_op_when_a_motor_is_to_run_and_to_init_at_the_end():
     assert slave.application.output_size == slave.application.input_size == 30, "its factory's images"
 
 
+@pytest.mark.slow
 def test_an_image_is_changed_while_no_axis_is_enabled_and_put_back():
     with linked(pace="real-time") as (drives, segment):
         drives.record([0x6041, 0x6077], 0.003)
@@ -197,6 +198,7 @@ def test_a_reset_restarts_the_slave_and_a_restart_of_its_own_is_noticed():
         assert heard == [0] and segment.slaves[0].state is AlState.OP
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("given", "says"), [
     ({"nodes": (1,)}, "there is no position 1: 1 slave answers; count from 0"),
     ({"nodes": (0, 0)}, "must be positions in the line, from 0, each once"),
@@ -285,6 +287,7 @@ def test_an_exception_in_the_program_stops_the_axes_before_op_is_left():
     assert segment.slaves[0].controller.watchdog_time == pytest.approx(0.1), "put back"
 
 
+@pytest.mark.slow
 def test_a_program_that_computes_is_no_dead_master():
     with linked(Limits(silence=0.4), pace="real-time") as (drives, segment):
         motion.enable(drives, mode="csp")
@@ -392,6 +395,7 @@ def run(*words):
     return done.output
 
 
+@pytest.mark.every(9)
 @pytest.mark.parametrize(("words", "says"), [
     (("scan", "--first", "3"), "--first is for CAN; all slaves of a segment are found"),
     (("scan", "--bitrate", "500000"), "--bitrate is for CAN"),
@@ -410,6 +414,7 @@ def test_wrong_options_are_told_in_a_line(over_udp, tmp_path, monkeypatch, words
     assert says in done.output
 
 
+@pytest.mark.slow
 def test_commands_over_udp(over_udp, tmp_path):
     said = run("scan", *over_udp)
     assert said.split()[:3] == ["position", "0", "tmcm3313"] and "vendor 286h" in said and "Init" in said
@@ -437,6 +442,7 @@ def test_a_scan_reads_an_eeprom_that_a_master_has_left_to_the_device():
 FOUR = [0x6064, 0x6062, 0x6077, 0x6041]  # of three axes 12, and the image takes 9
 
 
+@pytest.mark.slow
 def test_a_statusword_that_has_no_room_is_asked_for_meanwhile():
     with linked(pace="real-time", load="inertia", num_machines=3) as (drives, segment):
         assert drives.can_record(FOUR) and not drives.can_record([*FOUR, 0x606C])
@@ -523,6 +529,7 @@ def test_a_dry_run_writes_no_object_sends_no_image_and_goes_to_pre_op_at_most(tm
             assert [one for one in sent if writes_an_object(one)], "a run that is not dry is seen so"
 
 
+@pytest.mark.slow
 def test_programs_that_sample_and_move_in_real_time_over_udp(tmp_path):
     with EmulatedSegment(load="inertia", num_machines=3) as segment:
         segment.world.lockstep = False

@@ -62,6 +62,7 @@ def moved(exchange, startup, slaves=1):
     return [axis.shown["position"] - axis.start for axis in rows]
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", STARTUPS)
 def test_every_write_is_taken_and_every_axis_moves(pre_op, name):
     startup = STARTUPS[name]
@@ -82,7 +83,7 @@ def test_a_start_up_can_be_repeated(pre_op, name):
     assert (pre_op.node.output_size, pre_op.node.input_size) == STARTUPS[name].sizes
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.skipif(TSHARK is None, reason="tshark is not installed (Debian: apt install tshark)")
 @pytest.mark.parametrize("name", STARTUPS)
 def test_wireshark_reads_the_same_writes_and_no_malformed_frame(drives, name, tmp_path):
@@ -117,7 +118,7 @@ def test_codesys_with_the_assignment_taken_away_first(pre_op):
     assert (pre_op.node.output_size, pre_op.node.input_size) == CODESYS.sizes
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("sync0", [False, True], ids=["free", "sync0"])
 def test_six_axes_of_two_modules_under_icube_s_configuration(sync0):
     with EmulatedSegment(number=2) as segment:
@@ -136,7 +137,7 @@ def test_six_axes_of_two_modules_under_icube_s_configuration(sync0):
         master.close()
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("name", STARTUPS)
 def test_our_master_works_where_another_left_its_mapping_and_puts_it_back(pre_op, name):
     """Gaps are in it, which no image of ours has."""

@@ -45,7 +45,7 @@ def shown(segment, sub, position=0):
 
 
 # --- virtual time -----------------------------------------------------------------------------------------------------
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [4000, 1000, 250])
 def test_in_lockstep_outputs_take_effect_at_the_next_pulse(tmp_path, rate):
     """Integers are those without clocks, of which each row acts a cycle later, from 250 us to 4 ms."""
@@ -65,6 +65,7 @@ def test_in_lockstep_outputs_take_effect_at_the_next_pulse(tmp_path, rate):
     assert (np.ptp(found[True][1], axis=0) > 100).all(), "every axis moved"
 
 
+@pytest.mark.slow
 def test_at_4_khz_in_lockstep_a_policy_acts_in_each_cycle(tmp_path):
     """The same integers as in process, row by row, of one call for each cycle of 250 us."""
     device, cycle = at_rate(tmp_path, 4000), 0.00025
@@ -88,6 +89,7 @@ def test_at_4_khz_in_lockstep_a_policy_acts_in_each_cycle(tmp_path):
     assert (np.ptp(expected[:, 1], axis=0) > 50).all()
 
 
+@pytest.mark.slow
 def test_clocks_of_all_slaves_show_one_time_and_pulse_together():
     with (
         EmulatedSegment(number=3) as segment,
@@ -105,6 +107,7 @@ def test_clocks_of_all_slaves_show_one_time_and_pulse_together():
     assert not any(clock.has_sync0 for clock in clocks), "switched off at the end"
 
 
+@pytest.mark.slow
 def test_a_slave_without_clocks_is_told():
     with EmulatedSegment() as segment:
         segment.slaves[0].controller.memory[8] &= ~0x04  # features

@@ -49,6 +49,7 @@ def send(rig, speed):
     rig.exchange_image(OUTPUT.pack(0, 0, speed, 0, 0, 0, 0, 0, 0))
 
 
+@pytest.mark.every(8)
 @pytest.mark.parametrize(("sub", "of_outputs", "of_inputs"), [
     (TYPE, 1, 0x22), (CYCLE_TIME, CYCLE, CYCLE), (SUPPORTED, 6, 6), (LEAST, 250_000, 250_000), (MISSED, 0, 0),
     (TOO_SHORT, 0, 0), (SYNC_ERROR, 0, 0), (0, 32, 32),
@@ -63,6 +64,7 @@ def test_without_clocks_outputs_take_effect_as_they_come(rig, drives):
     assert drives.read(0x60FF)[0] == 1234
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("cycle", [250_000, 1_000_000, 4_000_000])
 def test_sync0_shows_its_type_and_cycle_from_safe_op_to_pre_op(rig, cycle):
     start_sync0(rig, cycle)
@@ -113,6 +115,7 @@ def test_outputs_that_come_too_soon_are_counted(rig):
     assert value(rig, TOO_SHORT) == 3, "a millisecond after the last ones"
 
 
+@pytest.mark.every(9)
 @pytest.mark.parametrize(("index", "sub", "content", "code"), [
     (OUTPUTS, TYPE, "02 00", 0), (INPUTS, TYPE, "02 00", 0), (OUTPUTS, CYCLE_TIME, "90 D0 03 00", 0),
     (OUTPUTS, TYPE, "03 00", 0x06090030), (OUTPUTS, TYPE, "22 00", 0x06090030), (INPUTS, TYPE, "01 00", 0x06090030),
@@ -140,6 +143,7 @@ def test_sync0_that_was_asked_for_and_is_not_there_is_refused(rig, index):
     assert rig.request(0x14) == (4, 0)
 
 
+@pytest.mark.slow
 def test_a_cycle_of_sync0_that_is_too_short_is_refused(rig):
     rig.configure(30, 30)
     rig.write(0x09A0, struct.pack("<I", 249_999))  # ns
@@ -147,6 +151,7 @@ def test_a_cycle_of_sync0_that_is_too_short_is_refused(rig):
     assert rig.request(4) == (0x12, AlStatusCode.DC_CYCLE_TIME)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(("register", "content"), [
     (0x0981, "00"),  # SYNC0 off
     (0x09A0, "FF FF FF FF"),  # its cycle 4.3 s
@@ -174,6 +179,7 @@ def test_a_slave_whose_sync0_stays_away_leaves_op_and_stops_its_axes(rig, drives
     assert np.abs(get_lanes(drives.inside.records, "omega_m", 3)).max() < 1.0
 
 
+@pytest.mark.every(6)
 @pytest.mark.parametrize("leap", [1 << 60, (1 << 63) + 5, 10**9])
 @pytest.mark.parametrize("cycle", [CYCLE, 1])
 def test_a_leap_of_the_system_time_is_no_row_of_pulses(rig, leap, cycle):

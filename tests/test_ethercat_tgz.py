@@ -231,6 +231,7 @@ def csp(drives):
     return np.concatenate([np.stack([trace[index] for index in SAMPLED]) for trace in traces], axis=1)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("device", "load"), [("tgz_d", "gantry"), ("tgz_s", "inertia")])
 def test_a_master_moves_every_axis_in_csp_and_gets_the_integers_of_the_emulator(device, load):
     with EmulatedDrives(device, load, num_threads=1) as inside:

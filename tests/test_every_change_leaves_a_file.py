@@ -175,7 +175,7 @@ def test_the_file_lies_beside_the_results_and_never_replaces_one(tmp_path, monke
     assert (tmp_path / file).read_text(encoding="utf-8") == "what a killed run left"
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["identify", "response", "rules"])
 def test_emulated_drives_leave_none(tmp_path, command):
     _, arguments = COMMANDS[command]

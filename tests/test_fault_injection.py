@@ -75,7 +75,7 @@ def worst_at(emulated, name, kind, chosen):
     return worst_of([(f"{kind} {k}", run_with(emulated, SESSIONS[name], kind, k)) for k in chosen(frames)])
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(27)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind):
@@ -192,6 +192,7 @@ def test_a_signal_at_many_frames_leaves_no_axis_running(emulated, programs, name
 
 
 # --- the harness finds what it is for -------------------------------------------------------------------------------
+@pytest.mark.slow
 @posix_only
 def test_the_verdict_sees_a_program_without_an_envelope_that_is_killed(emulated, programs):
     found = run_and_signal(emulated, programs, "cst_play", "SIGKILL", 150, 1, safety=False, within=1.0)

@@ -101,6 +101,7 @@ def test_certificate(certificate):
     assert fields("certificate response") == list(axis["frequency_responses"][0])
 
 
+@pytest.mark.slow
 def test_identification(tmp_path):
     run("identify", "--load", "inertia", "--out", tmp_path / "found.json")
     (axis,) = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
@@ -130,6 +131,7 @@ def test_sweep(tmp_path):
     assert fields("sweep results") == [name for name in columns if not re.match("[0-9A-F]{4}h:", name)]
 
 
+@pytest.mark.slow
 def test_search(tmp_path):
     mine = shutil.copy(ROOT / "drive_env" / "motors" / "qbl4208.toml", tmp_path / "mine.toml")
     given = ("--motor", mine, "--load", "inertia", "--inertia-range", "0.5/3")
@@ -148,6 +150,7 @@ def test_comparison(tmp_path):
     assert fields("tuners") == header(tmp_path / "out" / "tuners.csv")
 
 
+@pytest.mark.slow
 def test_response(tmp_path):
     run("response", "--load", "inertia", "--out", tmp_path / "out")
     assert fields("response") == header(tmp_path / "out" / "velocity_axis0.csv")

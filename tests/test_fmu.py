@@ -118,6 +118,7 @@ def test_a_pp_move_and_a_csp_move_have_the_integers_of_the_emulator(servo, tmp_p
     assert max(row["position_actual_value"] for row in csp) > 2.9 * 65_536
 
 
+@pytest.mark.slow
 def test_another_process_saves_states_refuses_wrong_steps_and_goes_on(servo, tmp_path):
     found = json.loads(run(ROOT / "tests/fmu_importer.py", servo, cwd=tmp_path))
     check_of_importer(found)

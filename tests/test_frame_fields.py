@@ -288,7 +288,7 @@ def test_no_value_in_an_rpdo_voids_a_stop_before_or_behind_it(name, entry):
     bus.come_to_rest()
 
 
-@pytest.mark.every(12)
+@pytest.mark.every(60)
 @pytest.mark.parametrize("entry", [pytest.param(one, id=f"{one.index:04X}-{one.sub}") for one in received("tmcm3313")])
 def test_no_value_in_a_mapped_image_voids_a_stop_before_or_behind_it(entry):
     bus, key = Coe(plant_of("tmcm3313")), (entry.index, entry.sub)

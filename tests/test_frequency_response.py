@@ -327,6 +327,7 @@ def looked_at():
     return seen, lambda full, less: fit_plant(target.device, gains[0], *full, start, less=less), plants[0]
 
 
+@pytest.mark.slow
 def test_a_resonance_that_a_weaker_shaking_confirms_is_told(looked_at):
     seen, fit, plant = looked_at
     found = fit(seen(), seen(noise=0.03)).estimates["resonance"]
@@ -334,7 +335,7 @@ def test_a_resonance_that_a_weaker_shaking_confirms_is_told(looked_at):
     assert found.low < plant.resonance < found.high
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.85, 0.95, 1.1])
 def test_a_resonance_that_moves_with_the_strength_of_the_shaking_is_refused(looked_at, factor):
     """As with backlash: neither of the two is the axis's."""
@@ -375,6 +376,7 @@ def test_dead_time_is_not_taken_for_a_slower_velocity_filter(dead_time):
         assert found.value == pytest.approx(400.0, rel=0.15)
 
 
+@pytest.mark.slow
 def test_of_a_tgz_as_auto_tunes_it_the_margins_are_the_model_s_but_for_what_its_dead_time_takes():
     """Gains that count integration times. At 560 V dead time swallows small currents: some degrees at the crossover."""
     gains, lag = np.array([[3944, 2985, 13_238, 12_866, 357_034, 1000]]), []

@@ -38,6 +38,7 @@ def test_a_response_within_the_play_of_a_gear_is_no_identification_of_the_axis()
     assert refused
 
 
+@pytest.mark.slow
 def test_an_axis_beside_others_that_give_way_is_identified():
     """While a link is shaken the other one gives way: the response gives 0.64 and 0.74 of the inertia of the moves."""
     load = Load(SCARA, joints=("shoulder", "elbow"), gear=(35, 20))

@@ -25,7 +25,7 @@ def parameters(motor, **others):
     return found | {name: np.array([value]) for name, value in (beside | others).items()}
 
 
-@pytest.mark.every(9)
+@pytest.mark.every(72)
 @pytest.mark.parametrize("name", ["qsh2818_32", "qsh4218_51", "qsh5718_51", "qsh5718_76"])
 @pytest.mark.parametrize("share", [0.5, 0.7])
 def test_there_the_pull_out_torque_is_what_friction_takes(name, share):

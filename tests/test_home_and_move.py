@@ -148,7 +148,7 @@ def test_an_emergency_on_the_way_to_the_target_stops_nothing_and_one_that_kept_f
 
 
 # --- Ctrl-C ---------------------------------------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("words", [
     ("home", "--method", "17"), ("move", "500 rev", "--speed", "600 rpm"),
     ("move", "500 rev", "--speed", "600 rpm", "--out", "long"),

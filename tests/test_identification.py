@@ -437,6 +437,7 @@ def test_a_blocked_rotor_is_said():
 
 
 # --- how drives are treated -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_factory_fresh_drive_is_identified_and_stays_factory_fresh():
     target = emulated(load="inertia", factory_fresh=True, num_threads=1)
     before = {key: target.drives.read(key) for key in borrowed(target.device)}
@@ -453,6 +454,7 @@ def test_a_factory_fresh_drive_is_identified_and_stays_factory_fresh():
 WILD = np.array([[30000, 30000, 32000, 20000, 30000]])
 
 
+@pytest.mark.slow
 def test_wild_gains_never_act_and_come_back():
     target = emulated(load="two_mass", num_threads=1)
     write_gains(target.drives, WILD)

@@ -90,6 +90,7 @@ def interrupted(bus, at):
     bus.at = -1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("act", "safety"),
     [(sample, False), pytest.param(move, LIMITS, marks=pytest.mark.slow)],

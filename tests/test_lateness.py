@@ -75,6 +75,7 @@ def test_identification_blames_neither_encoder_nor_wiring_for_late_syncs(late):
         assert not found.wiring, "nothing is to be written for a check that says nothing"
 
 
+@pytest.mark.slow
 def test_auto_names_late_syncs_and_writes_no_wiring(late, tmp_path):
     with late.open() as target:
         before = target.drives.read((0x2080, 1))

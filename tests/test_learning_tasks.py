@@ -88,7 +88,7 @@ def test_what_has_learnt_nothing_scores_less_than_0_6(name):
     assert max(scores.values()) < UNLEARNT, scores
 
 
-@pytest.mark.every(8)
+@pytest.mark.every(24)
 @pytest.mark.parametrize("name", QUICK)
 def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
     scores = {}
@@ -130,6 +130,7 @@ def test_a_policy_acts_on_the_drives_of_a_bus_as_in_process():
     assert found.bus.values == found.inside.values and found.bus.violations == {} and found.missing == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["GantryBeam", pytest.param("ArmPath", marks=pytest.mark.slow)])
 def test_an_expert_in_the_loops_keeps_stiff_margins(name):
     lanes = make_environments(name, 1)

@@ -100,6 +100,7 @@ def test_a_vertical_axis_does_not_fall_while_it_is_identified():
 HEAVY = {"load.mass": 10.0, "stage.dc_capacitance": LEAST}  # twice what the class has, on the smallest link of it
 
 
+@pytest.mark.slow
 def test_a_heavy_axis_on_a_small_link_does_not_fall_while_it_is_identified():
     """It falls by 50 turns if its moves are planned without its weight, or for more than the link holds."""
     with emulated(load="vertical_screw", parameters=HEAVY, num_threads=1) as target:

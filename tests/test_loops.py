@@ -516,6 +516,7 @@ def test_tables_position_gains_give_10_20_and_40_hz():
     assert k_v / TWO_PI == pytest.approx(np.array([hz for _, _, hz in cases], float), rel=0.01)
 
 
+@pytest.mark.slow
 def test_whole_position_loop_crosses_over_at_its_gain_where_the_velocity_loop_is_ten_times_faster():
     cases = [(row, velocity, velocity // 10) for row, velocity in DESIGNS if velocity // 10 in TABLE_POSITION_P]
     multiples = np.array([0.8, 0.9, 1.0, 1.1, 1.25, 1.4])

@@ -273,6 +273,7 @@ PULSES = {  # torque [N*m] over time; of the break-away torque of 3e-3
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PULSES)
 def test_a_packed_load_follows_the_equations(kind):
     load = machine("inertia")

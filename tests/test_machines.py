@@ -308,6 +308,7 @@ def test_a_following_error_behind_an_end_stop_is_a_fault():
 
 
 # --- winder, fan, arm -------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", [0.0, 10.0, 50.0, 200.0])
 def test_a_winder_s_radius_and_inertia_grow_by_closed_form(turns):
     """r = r_0 + thickness per turn; the web's force has the lever r, the roll J = pi/2 rho (r^4 - core^4)."""

@@ -113,6 +113,7 @@ def out_of_balance(records, before, sums):
     return abs(rest) / moved
 
 
+@pytest.mark.slow
 def test_the_sum_of_all_energies_is_0_within_a_thousandth():
     module = new_module(on_resistance=0.5)
     for torque, periods in (((8.0, 5.0), 150), ((8.0, -12.0), 60), ((-10.0, -10.0), 100), ((0.0, 6.0), 100)):

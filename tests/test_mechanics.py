@@ -82,6 +82,7 @@ def amplitude(signal, t, frequencies):
     return 2 * np.abs((signal * window * phasor).sum(axis=0)) / window.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stiffness", "gate"),
     [(0.3 * STIFFNESS, 0.01), (STIFFNESS, 0.01), (4 * STIFFNESS, 0.01), (10.2 * STIFFNESS, 0.01)],

@@ -56,6 +56,7 @@ def test_a_bound_by_the_identified_model_is_below_the_truth(load):
     assert known >= 10 and missed <= known // 10
 
 
+@pytest.mark.slow
 def test_a_bound_is_the_least_within_the_intervals():
     with emulated(load="two_mass", num_threads=1) as target:
         (identified,) = identify_briefly(target)
@@ -72,6 +73,7 @@ def test_a_bound_is_the_least_within_the_intervals():
                 assert one.phase_deg > bounds[loop].phase_deg - 0.5 and one.gain_db > bounds[loop].gain_db - 0.2
 
 
+@pytest.mark.slow
 def test_gains_that_may_be_unstable_within_the_intervals_have_no_bound():
     with emulated(load="inertia", num_threads=1) as target:
         (identified,) = identify_briefly(target)

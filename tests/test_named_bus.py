@@ -218,6 +218,7 @@ def wrong(
     return found
 
 
+@pytest.mark.slow
 def test_a_named_channel_or_interface_is_opened_or_refused(monkeypatch):
     rows = []
     for command in ON_A_BUS:
@@ -236,6 +237,7 @@ def test_a_named_channel_or_interface_is_opened_or_refused(monkeypatch):
     assert not found, "\n".join(found)
 
 
+@pytest.mark.slow
 def test_no_other_option_makes_an_emulated_machine_of_a_named_bus(monkeypatch):
     rows = []
     for command in [one for one in ON_A_BUS if str(one) != SERVES]:

@@ -174,7 +174,7 @@ def on_a_bus(folder):
         world.close()
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(10)
 @pytest.mark.parametrize("name", some(ON_THE_BUS))
 def test_our_master_moves_it_by_the_vendors_eds(folders, name):
     folder = str(folders[name].folder)

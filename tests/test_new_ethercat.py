@@ -58,7 +58,7 @@ def mapped(device):
     return [{index: values(index) for index in values(assignment)} for assignment in (0x1C12, 0x1C13)]
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("name", CASES)
 def test_each_reaches_op_and_follows_in_csp(made, name):
     folder = str(made[name].folder)

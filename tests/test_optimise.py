@@ -531,6 +531,7 @@ def test_the_way_back_of_an_earlier_search_is_not_replaced(node, tmp_path):
     assert (tmp_path / "obus" / "before.toml").read_text(encoding="utf-8") == "the only copy"
 
 
+@pytest.mark.slow
 def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     search = ("auto", "--by", "random", "--load", "inertia", "--trials", 2, "--machines", 1, "--out", "run")

@@ -319,7 +319,7 @@ def test_files_are_read_and_models_compiled_as_often_for_many_machines_as_for_fe
     assert "compile_packed" not in seen  # the row and its file are as they were
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["its file", "the row"])
 def test_a_model_is_compiled_anew_where_the_load_has_changed(change, tmp_path):
     file = tmp_path / "arm.xml"

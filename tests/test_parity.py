@@ -24,7 +24,7 @@ def test_the_same_script_gives_the_same_integers(name, safety):
         assert_equal(emulated(name), run(SCRIPTS[name], drives))
 
 
-@pytest.mark.every(12)
+@pytest.mark.every(84)
 @pytest.mark.parametrize("how", ["virtual", "hub", SOCKETCAN])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_it_does_so_on_the_virtual_bus_and_through_the_hub(name, how):

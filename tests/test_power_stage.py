@@ -235,6 +235,7 @@ def test_motor_torque_accelerates_the_rotor_against_the_extrapolated_reaction():
 
 
 # --- what the real stage loses ------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_supply_sags_with_the_current_it_delivers():
     """Locked rotor: i = duty u_dc / R and u_dc = V - R_supply 1.5 duty^2 u_dc / R."""
     resistance = np.array([0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.3, 0.3])

@@ -89,7 +89,7 @@ def test_every_joint_is_driven_or_refused_by_its_reason(name, layouts):
         assert math.isnan(found[joint].inertia.high) == bool(says)
 
 
-@pytest.mark.every(9)
+@pytest.mark.every(27)
 @pytest.mark.parametrize("name", RUN)
 def test_what_is_proposed_is_written_and_moves_its_axes(name, tmp_path, monkeypatch):
     """The whole way of a user: file, proposal, the folder that is written, drives that turn its joints."""

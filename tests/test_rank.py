@@ -84,6 +84,7 @@ def breaks(target, rng):
 
 
 # --- the score ----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_oracle_is_the_yardstick():
     found = compare(RIGID, {"truth": knows_the_truth})
     assert [row.relative for row in found.rows] == pytest.approx([1.0] * 4, rel=1e-12)
@@ -108,6 +109,7 @@ def test_the_cost_is_the_robust_cost_of_the_machine():
     )
 
 
+@pytest.mark.slow
 def test_gains_are_judged_by_the_dynamics_asked_for():
     best, rows = find_oracles(RIGID), {}
     for dynamics in ("soft", "standard"):
@@ -133,6 +135,7 @@ def test_auto_is_asked_for_the_dynamics_and_no_other_tuner(monkeypatch):
     assert find_tuner("tpe", 5, "soft").keywords == find_tuner("tpe", 5).keywords
 
 
+@pytest.mark.slow
 def test_a_summary_is_of_all_machines():
     found = compare(RIGID, {"wild": shakes, "truth": knows_the_truth})
     wild, relative = next(row for row in found.tuners if row.tuner == "wild"), [r.relative for r in found.of("wild")]
@@ -145,6 +148,7 @@ def test_a_summary_is_of_all_machines():
     assert [row.tuner for row in found.tuners] == ["truth", "wild"]  # the best first
 
 
+@pytest.mark.slow
 def test_what_a_tuner_does_not_vouch_for_is_not_accepted():
     def doubts(target, rng):
         return outcome(target, read_gains(target))._replace(accepted=np.array([True, False, True, True]))
@@ -155,6 +159,7 @@ def test_what_a_tuner_does_not_vouch_for_is_not_accepted():
 
 
 # --- what tuners do -----------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_what_a_tuner_did_is_counted_by_the_meter_not_by_itself():
     (row, *_) = compare(RIGID, {"slow": moves_and_slows}).rows
     assert row.moves == 1 and row.note == "slowed"
@@ -175,6 +180,7 @@ def test_a_violation_is_named():
     assert row.violations == 1 and row.kinds == "left its travel 1"
 
 
+@pytest.mark.slow
 def test_the_true_machine_is_hidden_from_a_tuner():
     seen = []
     compare(
@@ -192,7 +198,7 @@ def test_a_tuner_that_breaks_is_scored_by_what_it_left_and_the_others_go_on():
     assert next(row for row in found.tuners if row.tuner == "broken").failed == 4
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gains", [np.ones((4, 4), int), np.full((4, 5), np.nan), np.full((4, 5), 10.5)], ids=["shape", "nan", "fraction"]
 )
@@ -286,6 +292,7 @@ def test_the_tuners_of_the_issue_are_there():
     assert set(RULES) <= names
 
 
+@pytest.mark.slow
 def test_the_factory_leaves_and_the_baseline_rule_computes():
     found = compare(RIGID, {name: find_tuner(name) for name in ("factory", "baseline")})
     assert {row.gains["velocity_p"] for row in found.of("factory")} == {445}
@@ -332,6 +339,7 @@ def register(monkeypatch, *entries):
     monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
 
 
+@pytest.mark.slow
 def test_whatever_registers_is_compared(monkeypatch):
     register(monkeypatch, Entry("agent", lambda: knows_the_truth))
     assert tuner_rows()["agent"].meaning == "from others-agents"
@@ -371,6 +379,7 @@ def test_unknown_and_incomplete_tuners_are_named_with_the_remedy(monkeypatch):
 
 
 # --- files and the command ----------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_files_say_what_the_comparison_says(tmp_path):
     found = compare(RIGID, {"slow": moves_and_slows, "broken": breaks})
     save(found, tmp_path, {"suite": "public", "tuners": ["slow", "broken"], "seed": 0, "count": None})

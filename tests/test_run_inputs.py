@@ -366,7 +366,7 @@ def test_settings_of_a_search_repeat_it_from_its_folder_alone(own, decoys, monke
     assert "inputs/motor/mine.toml was changed since the run was made with it" in result.output
 
 
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("other", ["changed", "another load", "another motor"])
 def test_a_journal_is_not_gone_on_with_for_something_else(own, other):
     """Before: trials of both in one study, whatever they were of."""
@@ -447,6 +447,7 @@ class Away:
             os.chdir(before)
 
 
+@pytest.mark.slow
 def test_a_sweep_elsewhere_has_the_files_of_here(own, decoys):
     experiment = load_experiment(write(own / "grid.toml", own_grid(motor="mine.toml", load="arm/arm.xml")))
     here = sweep.run(experiment)
@@ -617,6 +618,7 @@ def test_a_grid_of_a_million_is_split_and_its_shards_are_points_of_it(own):
         np.testing.assert_array_equal(points, np.stack([100 + first, 100 + second], axis=1))
 
 
+@pytest.mark.slow
 def test_a_table_is_written_in_parts_to_the_same_bytes(own, monkeypatch):
     result = sweep.run(load_experiment(write(own / "grid.toml", SMALL)))
     save_sweep(result, own / "whole")

@@ -601,7 +601,7 @@ def test_a_run_is_not_resumed_with_another_experiment(config, tmp_path):
     assert done.stderr.startswith("drive-tune: ")
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("more", "code", "message"), [
     (("--workers", 0), 2, "--workers 0 is below 1"),
     (("--workers", 1, "--cluster", "tcp://x:1"), 2, "choose one"),

@@ -70,6 +70,7 @@ def test_what_breaks_margins_by_the_true_machine_never_reaches_a_drive(load, saf
     np.testing.assert_allclose(worst, [phase[0], gain[0], ms[0]], rtol=0.15)
 
 
+@pytest.mark.slow
 def test_proposals_that_break_the_dynamics_are_no_trials():
     with emulated(load="two_mass", **MACHINE) as target:
         found = optimise(target, FEW, shared=True, anew=True)

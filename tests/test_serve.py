@@ -141,6 +141,7 @@ def test_nobody_reaches_the_port_while_kernels_are_compiled(tmp_path, monkeypatc
     assert f"socket://127.0.0.1:{port}" in done.stdout
 
 
+@pytest.mark.slow
 def test_drives_with_factory_values_turn_the_motor_that_was_named(tmp_path):
     arguments = ("--motor", "ec_i_40", "--factory", "--lockstep")
     with (
@@ -366,6 +367,7 @@ def test_a_script_finds_slaves_on_ethercat_by_the_ready_file(tmp_path):
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_a_ready_file_that_is_there_already_is_left_alone(tmp_path):
     """It may be of a server that runs, and a script that waits for the file would take it for this one's."""
     path = tmp_path / "ready.json"

@@ -48,6 +48,7 @@ def test_a_drive_of_one_axis_shares_nothing():
 
 
 # --- emergencies ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_master_finds_the_axis_of_an_emergency():
     machine = {"load": "inertia", "num_machines": 2 * AXES, "num_threads": 1}
     hot = np.where(np.arange(2 * AXES) == AXES + 4, 151.0, 25.0)
@@ -121,6 +122,7 @@ def cyclic_move(drives):
     return np.stack([trace[name] for name in SAMPLED])
 
 
+@pytest.mark.slow
 def test_cyclic_targets_of_two_modules_are_what_they_are_in_process():
     with EmulatedDrives(MODULE.name, load="inertia", num_machines=2 * AXES, num_threads=1, seed=4) as inside:
         expected = cyclic_move(inside)
@@ -161,6 +163,7 @@ def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back():
         assert cob_ids(bus) == before
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("nodes", "more", "says"),
     [

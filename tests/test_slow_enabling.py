@@ -46,6 +46,7 @@ def on_its_way(drives, wait):
     drives.advance(wait)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("wait", [0.001, 0.1])
 @pytest.mark.parametrize("end", ["close", "interrupt"])
 def test_an_axis_on_its_way_to_operation_enabled_is_called_off_at_the_end(emulated, wait, end):
@@ -63,6 +64,7 @@ def test_an_axis_on_its_way_to_operation_enabled_is_called_off_at_the_end(emulat
     assert np.ptp(truth.theta()) < 0.1
 
 
+@pytest.mark.slow
 def test_one_that_is_waited_for_is_watched(emulated):
     """It turns once it is there, and its limits hold."""
 
@@ -76,7 +78,7 @@ def test_one_that_is_waited_for_is_watched(emulated):
     assert problems(truth, travel=TRAVEL) == []
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(10)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [2, pytest.param(16, marks=pytest.mark.slow)])
 def test_a_fault_at_a_frame_leaves_none_on_its_way(emulated, kind, count):

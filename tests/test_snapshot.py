@@ -404,6 +404,7 @@ def test_restore_refuses_a_file_that_is_not_as_it_was_written(tmp_path, monkeypa
         assert drive_tune("undo", path, "--yes", "--unchecked").exit_code == unchecked
 
 
+@pytest.mark.slow
 def test_a_snapshot_says_of_which_drives_it_is_and_is_not_written_to_others(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
     serial = {"now": 4711}

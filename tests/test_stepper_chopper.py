@@ -78,6 +78,7 @@ def held_voltage(omega_e, share, angle):
     return trace, exact
 
 
+@pytest.mark.slow
 def test_currents_torque_and_power_at_constant_speed_are_those_of_an_independent_integration():
     omega_e = 2.0 * math.pi * np.array([0.0, 10.0, -10.0, 100.0, -300.0, 1000.0, -1000.0, 2000.0])
     trace, exact = held_voltage(omega_e, 0.4, 0.7)

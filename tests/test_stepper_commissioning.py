@@ -132,6 +132,7 @@ def test_an_emergency_in_the_moves_is_named(stepper, at):
     assert reason.startswith("it went into fault at ") and reason.endswith(" rad/s: overvoltage (3210h)"), reason
 
 
+@pytest.mark.slow
 def test_an_emergency_with_a_load_on_the_axis_is_named(stepper, tmp_path, monkeypatch):
     def surges(found, moves, *rest):
         found.drives.machine.fault("supply_surge", at=0.05, duration=0.1)
@@ -198,6 +199,7 @@ def test_a_stepper_is_commissioned_by_its_load(stepper, tmp_path):
         assert result.drive_seconds < 15.0
 
 
+@pytest.mark.slow
 def test_an_axis_that_fails_gets_everything_back(stepper, tmp_path, monkeypatch):
     """The obstacle is not seen: the stop on stall is above any speed."""
     monkeypatch.setattr(commissioning, "prove_with_load", lambda *a: _unseen(*a))

@@ -104,6 +104,7 @@ def energies(request):
         yield tuple(term.reshape(4, 4) for term in terms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", range(4), ids=KINDS)
 def test_the_bridges_energy_is_shaft_work_losses_and_magnetic_energy_within_0_1_percent(energies, kind):
     bridge, copper, shaft, magnetic = (term[kind] for term in energies[:4])

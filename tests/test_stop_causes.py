@@ -45,6 +45,7 @@ def test_a_cause_is_remembered_for_as_long_as_the_axis_is_in_fault():
         assert stop_causes(drives) == [UNTOLD, UNTOLD]
 
 
+@pytest.mark.slow
 def test_every_figure_of_an_identification_that_a_fault_ended_names_the_emergency():
     """Each said that no emergency message was received: it had been read before the second moves."""
     with emulated(load="inertia", num_threads=1) as target:

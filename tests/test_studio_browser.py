@@ -51,7 +51,7 @@ def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_contro
     assert tab.one(".studio-stop").is_displayed()
 
 
-@pytest.mark.every(9)
+@pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):
@@ -64,6 +64,7 @@ def test_nothing_is_wider_than_the_window(tab, path, width):
     assert box["x"] >= 0 and box["x"] + box["width"] <= width
 
 
+@pytest.mark.slow
 def test_navigation_by_keyboard_alone(tab):
     tab.open("/axes")
     for _ in range(12):
@@ -75,6 +76,7 @@ def test_navigation_by_keyboard_alone(tab):
     until(lambda: tab.driver.current_url.endswith("/scope?axis=0"), "the page Scope")
 
 
+@pytest.mark.slow
 def test_light_and_dark(tab):
     tab.open("/axes")
     background = "return getComputedStyle(document.body).backgroundColor"
@@ -98,12 +100,14 @@ def test_enabled_moved_and_disabled(tab):
     tab.await_state("Switch on disabled")
 
 
+@pytest.mark.slow
 def test_a_move_of_an_axis_that_is_off_says_what_to_do(tab):
     at_rest(tab)
     tab.press("move-by")
     until(lambda: any("enable it first" in line for line in tab.told()), f"the remedy; told: {tab.told()}")
 
 
+@pytest.mark.slow
 def test_home_says_that_no_method_is_chosen_and_offers_those_of_the_drive(tab):
     at_rest(tab)
     until(lambda: "no homing method chosen" in tab.named("homing-told").text, "what is missing")
@@ -347,6 +351,7 @@ def test_favourites_and_units_are_those_of_every_page(tab, served):
     choose(tab, "unit-angle", "rev")
 
 
+@pytest.mark.slow
 def test_compared_with_stored_nothing_differs(tab):
     tab.open("/dictionary")
     tab.press("stored")

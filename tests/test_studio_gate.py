@@ -247,6 +247,7 @@ def test_mistakes_are_told_before_anything_is_opened(options, says):
     assert found.exit_code == 2 and says in found.output, found.output
 
 
+@pytest.mark.slow
 def test_a_bus_that_is_not_there_ends_the_command_with_one_line():
     command = [sys.executable, "-c", "from drive_env.programs import drive_env; drive_env()", "studio"]
     options = ["--no-browser", "--port", "0", "--channel", "socket://127.0.0.1:1"]

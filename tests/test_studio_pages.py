@@ -49,6 +49,7 @@ def check_pages(made):
 
 
 # --- every kind of drive --------------------------------------------------------------------------------------------
+@pytest.mark.every(2)
 @pytest.mark.slow  # the pages of one are asked for below
 @pytest.mark.parametrize("device", [*device_names(), HERE / "bare_stepper", HERE / "invented_drive"], ids=str)
 def test_every_page_answers_for_every_device(device):

@@ -104,7 +104,7 @@ def studio_on(*options):
 
 
 def inside(studio):
-    """Return what the emulator of a studio's own drive has inside, once it is there."""
+    """Wait for the emulator of a studio's own drive and return its state."""
     return until(lambda: json.load(urlopen(studio.page("/truth"))), "the emulator")
 
 

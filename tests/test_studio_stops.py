@@ -256,6 +256,7 @@ def another_tab(driver):
         driver.switch_to.window(mine)
 
 
+@pytest.mark.slow
 def test_the_page_is_closed(driver, bench):
     world, _ = bench
     turning(driver, bench)

@@ -237,6 +237,7 @@ def wait(desk, condition, patience=300.0):
         time.sleep(0.01)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     "when", ["identifying", pytest.param("designing gains on digital twins", marks=pytest.mark.slow)]
 )
@@ -298,6 +299,7 @@ def test_an_agent_tunes_trial_by_trial(desk, tmp_path):
     assert run.verdicts[0].verdict in ("accepted", "accepted with reservations", "rejected")
 
 
+@pytest.mark.slow
 def test_rules_are_side_by_side_once_an_axis_is_identified(desk):
     from tuning.rules.rules_by_name import RULES
     from tuning.studio.rules_card import identified_rows

@@ -90,7 +90,7 @@ def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_contro
     assert (tab.errors(), tab.foreign(), tab.nameless()) == ([], [], [])
 
 
-@pytest.mark.every(9)
+@pytest.mark.slow
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("path", PAGES)
 def test_nothing_is_wider_than_the_window(tab, path, width):
@@ -100,6 +100,7 @@ def test_nothing_is_wider_than_the_window(tab, path, width):
     assert tab.driver.execute_script("return document.documentElement.scrollWidth") <= width
 
 
+@pytest.mark.slow
 def test_tune_on_a_narrow_page_is_sections_that_fold(tab):
     """But machine and gains they begin folded; a chart has its size once its section is opened."""
     size_of(tab.driver, 400, 800)
@@ -278,6 +279,7 @@ def test_auto_comes_to_its_certificate_and_its_run_is_in_runs(tab, folder):
 
 
 # --- machine ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_picture_moves_while_the_load_does(tab):
     tab.open("/machine")
     until(lambda: tab.driver.execute_script("return studioMachine.frames") >= 1, "the first picture", 30.0)
@@ -288,6 +290,7 @@ def test_the_picture_moves_while_the_load_does(tab):
     assert tab.driver.execute_script(width) > 300
 
 
+@pytest.mark.slow
 def test_a_fault_that_is_switched_on_acts_on_the_drive(tab):
     tab.open("/axes")
     tab.press("enable")
@@ -306,6 +309,7 @@ def test_a_fault_that_is_switched_on_acts_on_the_drive(tab):
     tab.await_state("Switch on disabled")
 
 
+@pytest.mark.slow
 def test_a_parameter_by_its_number(tab):
     tab.open("/machine")
     enter(tab, "value-load-inertia", 2.5e-5)
@@ -317,6 +321,7 @@ def test_a_parameter_by_its_number(tab):
 
 
 # --- runs ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_report_runs_no_script_and_two_runs_are_compared(tab, folder):
     for k, name in enumerate(("one", "other")):
         run = folder / "runs" / name
@@ -343,6 +348,7 @@ def test_a_report_runs_no_script_and_two_runs_are_compared(tab, folder):
     assert len(tab.all("[data-test=report]")) == 2
 
 
+@pytest.mark.slow
 def test_learning_curves_of_a_training(tab, folder):
     from rigs.trainings import write_events
 

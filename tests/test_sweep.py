@@ -136,6 +136,7 @@ def test_an_object_that_acts_is_not_reported_as_without_effect(small):
     assert sweep.run(grid(swept(P, 200, 300, 2), swept("2043h:01", 50, 500, 3))).without_effect() == ["2043h:01"]
 
 
+@pytest.mark.slow
 def test_a_run_repeats_from_its_settings_to_the_last_byte(tmp_path, small):
     save_sweep(small, tmp_path / "first")
     again = sweep.run(load_experiment(tmp_path / "first" / "settings.toml"))

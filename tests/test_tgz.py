@@ -158,6 +158,7 @@ def test_an_object_of_the_profile_is_there_for_both_axes(row, axis):
         assert entries.find((index, 0)).default == int(last)
 
 
+@pytest.mark.slow
 @every_row("row", [*rows(PROFILE), *rows(OTHERS)])
 def test_a_pdo_carries_what_the_column_of_its_direction_says_and_nothing_else(row):
     """Over the wire, both ways: another one is refused with 06040041h, and the default mapping stays."""

@@ -144,6 +144,7 @@ def gantry():
         yield drives
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("rpm", [100, -100])
 def test_with_d_mode_10_its_set_points_are_speeds(gantry, rpm):
     """500 rpm is 0x1F4_0000_0000 (R)."""

@@ -300,7 +300,7 @@ def disable_voltage(drives):
 ENDS = {end.__name__: end for end in (close, interrupt, fail, disable, quick_stop, reset_fault, disable_voltage)}
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(24)
 @pytest.mark.parametrize("gate", GATES)
 @pytest.mark.parametrize("end", ENDS)
 def test_every_end_finds_an_axis_that_takes_no_commands(inside, end, gate):
@@ -414,7 +414,7 @@ def test_heartbeats_that_stay_away_stop_an_axis_that_takes_no_commands(inside, g
         assert (inside.read(0x6041) & 0x4F == 0x08).all()
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("gate", ["stops", "ignores"])
 def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
     """The master may stop before, if the computer is too busy for it to see the drives."""
@@ -444,6 +444,7 @@ def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
         assert problems(world.truth, reaction=DEAD_MASTER) == []
 
 
+@pytest.mark.slow
 def test_python_canopen_moves_it_in_pp_and_is_ignored_with_another_d_mode(inside):
     with served(inside) as (world, channel):
         network = canopen.Network()
@@ -508,7 +509,7 @@ def sessions(inside):
     return {"pp_move": pp_move, "pv_run": pv_run, "taken_over": taken_over}
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(10)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_at_a_frame_leaves_no_axis_running(inside, kind):
     session = sessions(inside)["taken_over"]

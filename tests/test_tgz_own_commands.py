@@ -150,6 +150,7 @@ FAULTS = {  # of one frame: what arrives, in its order
 }
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("step", [25, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_whatever_happens_to_a_frame_of_the_native_image_the_axes_end_at_rest_and_off(gantry, fault, step):

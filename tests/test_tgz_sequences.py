@@ -26,7 +26,7 @@ def segment():
         yield made
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(24)
 @pytest.mark.parametrize("clock", [None, Sync0(0.001, True), Sync0(0.001, True, True)], ids=["free", "sync0", "sync1"])
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_our_frame_master_moves_both_axes(segment, name, clock, tmp_path):

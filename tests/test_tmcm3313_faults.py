@@ -118,7 +118,7 @@ SESSIONS = {
 }
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     truth, frames, ended = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)
@@ -132,7 +132,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert (closed == (1 if name in ("closed_loop", "closed_loop_paths", "torque") else 0)).all()
 
 
-@pytest.mark.every(10)
+@pytest.mark.every(60)
 @pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)

@@ -82,7 +82,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     assert np.ptp(truth.theta(), axis=0)[: 2 if name == "some_are_off" else AXES].min() > 0.01 * 2 * np.pi
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(30)
 @pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)

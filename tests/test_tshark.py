@@ -95,6 +95,7 @@ def conversation():
     return [log_line(k, frame) for k, frame in enumerate(frames)]
 
 
+@pytest.mark.slow
 def test_no_frame_is_malformed(conversation, tmp_path):
     log = tmp_path / "session.log"
     assert len(dissected(log, conversation)) == len(conversation) > 60
@@ -127,6 +128,7 @@ SHOWN = {
 }  # fmt: skip
 
 
+@pytest.mark.every(4)
 def test_each_service_is_taken_for_what_it_is(conversation, tmp_path):
     lines = dissected(tmp_path / "session.log", conversation)
     for service, least in SHOWN.items():

@@ -89,6 +89,7 @@ def test_a_sweep_leaves_four_files_and_nothing_else(run):
     assert [path.name for path in (folder / "out").iterdir()] == ["run"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["heatmap.png", "best_response.png"])
 def test_pictures_are_pictures(run, name):
     picture = imread(run[0] / "out/run" / name)[:, :, :3]
@@ -148,6 +149,7 @@ def test_help_imports_nothing_heavy(tmp_path):
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_list_names_what_there_is(said):
     done = said("sweep", "--list")
     assert done.exit_code == 0
@@ -170,6 +172,7 @@ def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_
     assert tomllib.loads(changed.stdout) == expected
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("arguments", "message"), [
     (["swep"], "No such command"),
     (["sweep", "--grid", "3"], "No such option"),
@@ -220,6 +223,7 @@ def test_a_sweep_that_leaves_the_loads_travel_names_the_excitation(tmp_path):
     assert "lower velocity_rpm or duration" in " ".join(done.stdout.split())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
     # Minutes; and not one of its shards is done after seconds, which would be kept (test_scale.py).

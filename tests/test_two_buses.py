@@ -83,6 +83,7 @@ def program(name, *arguments):
     return [sys.executable, "-c", code, *map(str, arguments)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "says"),
     [

@@ -86,6 +86,7 @@ def test_one_answer_that_is_repeated_makes_no_second_node(world):
     bus.shutdown()
 
 
+@pytest.mark.slow
 def test_scan_and_get_tell_of_them(twins, monkeypatch):
     """Before: scan showed one node 1, and get one drive's value."""
     twins.lockstep = False

@@ -52,7 +52,7 @@ def pressed(*arguments):
     raise KeyboardInterrupt
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(14)
 @pytest.mark.parametrize(
     ("by", "stage", "words"),
     [
@@ -131,6 +131,7 @@ def test_a_rollback_leaves_no_set_point_that_would_turn_the_motor(tmp_path):
         assert [int(machine.read(key)[0]) for key in SET_POINTS] == [0] * len(SET_POINTS)
 
 
+@pytest.mark.slow
 def test_a_silent_node_is_not_woken_and_what_is_not_known_is_not_claimed(tmp_path, monkeypatch):
     """Pre-operational a drive may stop watching its master (docs/safety.md): a node that is stopped stays so."""
     file = tmp_path / "before.toml"
@@ -228,6 +229,7 @@ def test_what_a_process_says_at_its_end_is_so(tmp_path, command, how):
 
 
 # --- images of EtherCAT -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
     """A mapping is changed while no sync manager carries it: `undo` was refused 1A00h:01 with 0601 0000h."""
     from rigs.ethercat_served import served
@@ -253,6 +255,7 @@ def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
 
 
 # --- axes that are left out ---------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_what_is_borrowed_of_axes_left_out_is_in_the_file_and_comes_back(tmp_path):
     """PDOs are mapped for a whole TMCM-6212: 50 objects of axes 1 to 5 stayed changed after `--axis 0` was killed."""
     from rigs.six_axes import partly_wired

@@ -139,6 +139,7 @@ def test_a_controller_that_leaves_takes_along_what_it_had_to_send():
 
 
 # --- what a bus can carry -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_one_mbit_carries_about_8000_frames_per_second_and_no_more():
     wire, numbers = Wire(), random.Random(1)
     for k in range(12_000):

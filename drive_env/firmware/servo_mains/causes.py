@@ -42,7 +42,7 @@ CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
 
 @stage
 def watch_motion(drive, lane, dt):
-    """Measure for how long an axis is off, outside its window, runs away, stands under its brake, or this is wrong."""
+    """Measure for how long each cause of a fault has held: no power, following error, runaway, brake, its switch."""
     drive.off_time[lane] = 0.0 if drive.stage_on[lane] > 0.0 else drive.off_time[lane] + dt
     window = drive.following_error_window[lane]
     error = abs(drive.position_demand[lane] - drive.theta_meas[lane])

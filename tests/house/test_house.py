@@ -10,8 +10,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from sources import ROOT, nodes_of
 
-ROOT = Path(__file__).parent.parent
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents", "research")
 # The rooms from below to above: a file imports from its own room and from those before it, for types alone, too. A room
 # is a folder of `drive_env`, `tuning` or `agents`, or a file beside these; `mechanics` and `research` are one each.
@@ -51,22 +51,21 @@ MANY = {
 
 
 @cache
-def modules() -> dict[str, ast.Module]:
-    """Every module of ours by its dotted name."""
+def modules() -> dict[str, list[ast.AST]]:
+    """The nodes of every module of ours by its dotted name."""
     found = {}
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-            found[name] = ast.parse(path.read_text(encoding="utf-8"))
+            found[name] = nodes_of(path.read_text(encoding="utf-8"))
     return found
 
 
 @cache
 def imported_by(module: str) -> set[str]:
     """What a module imports: in its functions, and where types alone are checked, too."""
-    tree = modules()[module]
     names: set[str] = set()
-    for node in ast.walk(tree):
+    for node in modules()[module]:
         if isinstance(node, ast.ImportFrom):
             assert node.module and not node.level, "imports here name their package"
             for alias in node.names:
@@ -112,8 +111,8 @@ def test_rooms_import_from_those_below():
 
 def test_a_class_has_its_name_alone():
     homes = defaultdict(list)
-    for name, tree in modules().items():
-        for node in ast.walk(tree):
+    for name, nodes in modules().items():
+        for node in nodes:
             if isinstance(node, ast.ClassDef):
                 homes[node.name].append(name)
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
@@ -152,10 +151,10 @@ MAY_READ = {
 }
 
 
-def readers_in(tree: ast.Module) -> set[str]:
+def readers_in(nodes: list[ast.AST]) -> set[str]:
     """The calls of a module that are in READERS; a file that is opened to be written is none."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if not isinstance(node, ast.Call):
             continue
         names = ast.unparse(node.func).split(".")
@@ -173,7 +172,7 @@ def readers_in(tree: ast.Module) -> set[str]:
 
 
 def test_what_is_read_goes_through_the_readers_with_limits():
-    found = {name: calls for name, tree in modules().items() if (calls := readers_in(tree))}
+    found = {name: calls for name, nodes in modules().items() if (calls := readers_in(nodes))}
     ours = {name: calls for name, calls in found.items() if not name.startswith("research.")}
     assert {name: calls for name, calls in ours.items() if name not in MAY_READ} == {}, (
         "read it by mechanics/untrusted.py, or say in MAY_READ why nobody else's file can be there"
@@ -201,10 +200,10 @@ def commands() -> set[str]:
 ])  # fmt: skip
 def test_functions_are_short(measure, most, known):
     found, seen = set(), set()
-    for name, tree in modules().items():
+    for name, nodes in modules().items():
         folder = ROOT / Path(*name.split("."))
         path = (folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")).relative_to(ROOT)
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.FunctionDef):
                 function = f"{path.as_posix()} {node.name}"
                 seen.add(function)

@@ -8,8 +8,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from sources import ROOT
 
-ROOT = Path(__file__).parents[1]
 PACKAGES = ("drive_env", "mechanics", "tuning", "agents", "research", "benchmarks", "examples")
 SUFFIXES = (".py", ".md", ".toml", ".xml", ".eds", ".npz", ".yml", ".js", ".css", ".html")
 # What belongs to others, is written by a run, or is left to the reader to make.

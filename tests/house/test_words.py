@@ -6,13 +6,11 @@ import ast
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
-from pathlib import Path
 
 import pytest
+from sources import ROOT, nodes_of
 
-ROOT = Path(__file__).parents[1]
-TABLE = tomllib.loads((ROOT / "tests/words.toml").read_text(encoding="utf-8"))
+TABLE = tomllib.loads((ROOT / "tests/house/words.toml").read_text(encoding="utf-8"))
 WORDS = {key: re.compile(rf"(?<!\w)(?:{key})(?!\w)", re.IGNORECASE) for key in TABLE["words"]}
 ANY_WORD = re.compile("|".join(f"(?:{one.pattern})" for one in WORDS.values()), re.IGNORECASE)
 PACKAGES = ("drive_env", "mechanics", "tuning", "agents", "research", "benchmarks", "examples")
@@ -21,11 +19,6 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RIDDLES = {re.compile(rf"(?<!\w)(?:{key})(?!\w)", re.IGNORECASE): better for key, better in TABLE["riddles"].items()}
 COMMENT = re.compile(r"(?:^|  )# (.*)")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-
-
-@lru_cache(maxsize=1)  # a source is asked for twice in a row
-def nodes_of(source: str) -> list[ast.AST]:
-    return list(ast.walk(ast.parse(source)))
 
 
 def texts(source: str, *, private: bool = False) -> Iterator[tuple[int, str]]:

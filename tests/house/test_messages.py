@@ -7,12 +7,12 @@ import fnmatch
 import importlib.util
 import re
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
+
+from sources import ROOT, nodes_of
 
 from drive_env.dictionary import aborts
 
-ROOT = Path(__file__).parents[1]
 PACKAGES = ("drive_env", "mechanics", "tuning", "agents")
 # What is said without being raised: verdicts of certificates, reasons of identification, what the envelope tells.
 SAID = (
@@ -65,9 +65,9 @@ def text_of(node):
 
 
 @cache
-def trees():
+def modules():
     return {
-        str(path.relative_to(ROOT)): ast.parse(path.read_text(encoding="utf-8"))
+        str(path.relative_to(ROOT)): nodes_of(path.read_text(encoding="utf-8"))
         for package in PACKAGES
         for path in sorted((ROOT / package).rglob("*.py"))
     }
@@ -77,8 +77,8 @@ def trees():
 def raised():
     """Return every message that is raised with a text of its own."""
     found = []
-    for place, tree in trees().items():
-        for node in ast.walk(tree):
+    for place, nodes in modules().items():
+        for node in nodes:
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
                 texts = [text for one in node.exc.args if (text := text_of(one)) and re.search(r"[a-z]{3}", text)]
                 error = ast.unparse(node.exc.func).rsplit(".", 1)[-1]
@@ -91,16 +91,15 @@ def told():
     """Return every text by which a command ends, and every warning and error of a log."""
     return [
         Message(f"{place}:{node.lineno}", "", text)
-        for place, tree in trees().items()
-        for node in ast.walk(tree)
+        for place, nodes in modules().items()
+        for node in nodes
         if isinstance(node, ast.Call) and node.args and re.search(TELLING, ast.unparse(node.func))
         if re.search(r"[a-z]{3}", text := text_of(node.args[0]))
     ]
 
 
-def literals(tree):
+def literals(nodes):
     """Return the texts of a module that are no docstrings and no assertions, with … for each value."""
-    nodes = list(ast.walk(tree))
     docstrings = {id(n.value) for n in nodes if isinstance(n, ast.Expr)}
     docstrings |= {id(n.msg) for n in nodes if isinstance(n, ast.Assert)}
     inner = {id(v) for n in nodes if isinstance(n, ast.JoinedStr) for v in n.values}
@@ -116,9 +115,9 @@ def said():
     own = {message.text for message in raised()}
     return [
         Message(f"{place}:{line}", "", text)
-        for place, tree in trees().items()
+        for place, nodes in modules().items()
         if any(fnmatch.fnmatch(place, one) for one in SAID) and "/model/" not in place
-        for line, text in literals(tree)
+        for line, text in literals(nodes)
         if len(re.findall(r"[A-Za-z]{2,}", text)) >= 4 and " " in text.strip() and text not in own
     ]
 
@@ -126,7 +125,7 @@ def said():
 @cache
 def everything():
     """Return every text of the code."""
-    return "\n".join(text for tree in trees().values() for _, text in literals(tree))
+    return "\n".join(text for nodes in modules().values() for _, text in literals(nodes))
 
 
 # --- patterns ---------------------------------------------------------------------------------------------------------
