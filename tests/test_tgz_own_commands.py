@@ -402,10 +402,12 @@ def test_speeds_ramps_and_counts_change_past_the_limits_by_no_register_of_an_ena
             motion.enable(master, mode="pp")
             with pytest.raises(SafetyError, match=r"its drive has 6081h:00 .* beyond the limit 10000"):
                 motion.start_move(master, UNITS)
-            for name in ("Acc", "Dec", "PosSpeed", "Speed", "BitsPerRevol", "F-Type", "F-Resolution", "F-IncrEnc"):
-                register = name if name.startswith("F-") else f"PG {name}"
+            for register in (
+                *(f"PG {name}" for name in ("Acc", "Dec", "PosSpeed", "Speed", "BitsPerRevol")),
+                "F-Type", "F-Resolution", "F-IncrEnc", "M-Polepairs", "M-CommutOffset",
+            ):  # fmt: skip
                 now = master.read(register)
-                with pytest.raises(SafetyError, match=r"checked by objects of CiA 402 alone.*Disable it first"):
+                with pytest.raises(SafetyError, match=r"past the checked objects of CiA 402.*Disable it first"):
                     master.write(register, now)
             motion.disable(master)
             master.write("PG PosSpeed", 2**16)

@@ -137,8 +137,8 @@ class MasterHints(NamedTuple):
         timeout: Longest wait for an answer.
         timeouts: Index -> longest wait, of objects that take longer.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
-        unchecked_motion: Objects that change speeds, ramps or counts of a revolution beside those of CiA 402, by which
-            a master checks them.
+        unchecked_motion: Objects that change speeds, ramps, counts of a revolution or commutation beside
+            those of CiA 402, by which a master checks them.
         commands: Index -> its name, of the device's own objects that can be written but are not parameters.
         addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be
             another one after its next reset, or mute.

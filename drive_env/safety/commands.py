@@ -315,8 +315,8 @@ class Commands:
         hints = self._drives.description.hints
         if key in hints.unchecked_motion and (is_played or np.any(where & self._axes.may_turn)):
             raise SafetyError(
-                f"{entry.label} changes speeds, ramps or counts that are checked by objects of CiA 402 alone, and the "
-                "axis is enabled; nothing was sent. Disable it first, or write 60FFh, 6081h, 6083h or 6084h"
+                f"{entry.label} changes speeds, ramps, counts or commutation past the checked objects of CiA 402, and "
+                "the axis is enabled; nothing was sent. Disable it first, or write 60FFh, 6081h, 6083h or 6084h"
             )
         if key in hints.turns_positions_round and self._limits.user.position is not None:
             raise SafetyError(
