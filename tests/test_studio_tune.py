@@ -184,11 +184,11 @@ def recording(number, kind="velocity"):
 def test_the_last_step_with_the_gains_before_stays_as_the_reference(desk):
     desk.steps.extend(replace(recording(k), gains=(1 if k < 2 else 2,)) for k in range(12))
     shown = desk.last_steps(0, "velocity")
-    assert [step.at for step in shown] == [11, 10, 9, 8, 7, 1]
+    assert [step.at for step in shown] == [11, 1, 10, 9, 8, 7]
     assert step_card.reference_of(shown).at == 1
     lines = {one["name"]: one["lineStyle"] for one in step_card.step_chart(shown)["series"]}
-    assert [lines[step.name]["opacity"] for step in shown] == [1.0, 0.45, 0.45, 0.45, 0.45, 1.0]
-    assert lines[shown[0].name]["type"] == "solid" != lines[shown[-1].name]["type"]
+    assert [lines[step.name]["opacity"] for step in shown] == [1.0, 1.0, 0.45, 0.45, 0.45, 0.45]
+    assert [lines[step.name]["type"] for step in shown[:2]] == ["solid", [8, 4]]
 
 
 @pytest.mark.parametrize("reason", ["", "its loops are too near to instability"])
@@ -345,6 +345,8 @@ def test_auto_comes_to_its_certificate_and_is_undone(desk, tmp_path):
     assert verdict.verdict in ("accepted", "accepted with reservations")
     assert verdict.before == before
     assert gains_of(desk) == verdict.after != before
+    assert [step.gains for step in desk.last_steps(0, "position")] == [verdict.after, before]
+    assert ("velocity", 0) in desk.responses
     assert {one.name for one in run.folder.iterdir()} == {"before.toml", "certificate.json", "report.html"}
     assert run.share == 1.0
     do(desk, tune_jobs.undo(desk, 0))

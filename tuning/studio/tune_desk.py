@@ -176,14 +176,16 @@ class TuneDesk:
             self.version += 1
 
     def last_steps(self, axis: int, kind: str) -> list[StepRecording]:
-        """Return the present step of an axis and the last five before it, the newest first.
+        """Return the present step of an axis and five before it, the newest first; its reference is the second.
 
-        The newest one with other gains than the present step has is among them, as the reference.
+        That is the newest one with other gains than the present step has.
         """
         mine = [step for step in reversed(self.steps) if (step.axis, step.kind) == (axis, kind)]
         reference = reference_of(mine)
-        shown = mine[: LAST + 1]
-        return [*shown[:-1], reference] if reference is not None and reference not in shown else shown
+        if reference is not None:
+            mine.remove(reference)
+            mine.insert(1, reference)
+        return mine[: LAST + 1]
 
     def note(self, axis: int, before: Sequence[int], after: Sequence[int], what: str) -> None:
         """Add a change to the history, unless the gains are equal."""
