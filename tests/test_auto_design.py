@@ -141,12 +141,10 @@ def test_where_no_gains_keep_the_constraints_the_nearest_are_found_and_that_is_s
     assert found.gains[0, 0, VELOCITY_P] == found.gains[0, :, VELOCITY_P].min() < 100
 
 
-def test_of_every_bandwidth_the_most_promising_that_keep_the_constraints_are_looked_at(monkeypatch):
-    monkeypatch.setattr(module, "BANDWIDTHS", np.array([1.0, 2.0]))
-    monkeypatch.setattr(module, "TORQUES", (1.0,))
+def test_of_every_bandwidth_the_most_promising_that_keep_the_constraints_are_looked_at():
     slack = np.array([[0.1, 0.2, -0.1, 0.3, -0.3, -0.1, -0.2, -0.4]])
     promise = np.array([[3.0, 2.0, 1.0, 4.0, 1.0, 2.0, 3.0, 4.0]])
-    assert _of_each(slack, promise, 2).tolist() == [[1, 0, 5, 6]], "of the second one those that come nearest"
+    assert _of_each(slack, promise, 2, 2).tolist() == [[1, 0, 5, 6]], "of the second one those that come nearest"
 
 
 def test_torque_p_is_looked_for_between_three_tenths_of_its_greatest_and_that():

@@ -187,6 +187,20 @@ def test_each_margin_by_itself():
     )
 
 
+@pytest.mark.parametrize("name", ["soft", "stiff"])
+def test_the_edge_of_the_region_goes_through_its_margins_and_has_a_clearance_of_1(name):
+    d = find_dynamics(name)
+    phase, gain = d.region()
+    assert (phase.max(), phase.min()) == pytest.approx((d.phase_deg, -d.phase_deg))
+    assert (gain.max(), gain.min()) == pytest.approx((d.gain_db, -d.gain_db))
+    L = -(10.0 ** (gain / 20.0)) * np.exp(1j * np.radians(phase))
+    on_circle = np.isclose(np.abs(1.0 + L), 1.0 / d.ms, rtol=1e-6)
+    assert on_circle.mean() > 0.5
+    assert (np.abs(1.0 + L) > 1.0 / d.ms - 1e-9).all(), "no point of the edge is inside the circle"
+    for point in L[1::7]:
+        assert d.clearance(np.array([point, point])) == pytest.approx(1.0, abs=1e-6)
+
+
 def test_at_minus_1_the_clearance_is_0_and_it_is_even_to_either_side():
     for d in known_dynamics().values():
         assert d.clearance(np.array([-2.0 + 1e-9j, -1.0, -0.5 - 1e-9j])) == pytest.approx(0.0, abs=1e-6)

@@ -341,10 +341,13 @@ def test_favourites_and_units_are_those_of_every_page(tab, served):
         second = Tab(another, served).open("/dictionary")
         second.type("search", "6064")
         until(lambda: second.one("[data-key='6064:00'] .q-icon").text == "star", "its star")
-    tab.open("/scope")
-    choose(tab, "unit-angle", "deg")
-    units = "return (studioScope.header || {channels: []}).channels.map((one) => one.unit)"
-    until(lambda: "deg" in tab.driver.execute_script(units), "the unit on the scope")
+        second.open("/axes")
+        units = "return (studioScope.header || {channels: []}).channels.map((one) => one.unit)"
+        until(lambda: "rev" in second.driver.execute_script(units), "the live plot")
+        tab.open("/scope")
+        choose(tab, "unit-angle", "deg")
+        until(lambda: "deg" in tab.driver.execute_script(units), "the unit on the scope")
+        until(lambda: "deg" in second.driver.execute_script(units), "the unit in the live plot that is open")
     tab.open("/axes")
     until(lambda: "deg" in tab.one(".card-motion").text, "the unit on the page Axes")
     tab.open("/scope")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,15 +15,20 @@ from drive_env import EmulatedDrives, cia402
 from drive_env.devices import find_device
 from drive_env.drives.raw_gains import read_gains
 from drive_env.fieldbus.description import describe
-from drive_env.loops.margins import Margins
+from drive_env.loops.dynamics import find_dynamics
 from drive_env.studio import motion_jobs
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.session import Session
+from tuning.auto.proving import Shown
+from tuning.auto.result import AxisResult, Result
+from tuning.response.measured_loop import Loops
 from tuning.snapshot import load_snapshot, take_of
-from tuning.studio import gain_card, response_card, step_card, tune_jobs
+from tuning.studio import gain_card, response_card, response_charts, step_card, tune_jobs
+from tuning.studio.stiffness_slider import StiffnessSlider
 from tuning.studio.tune_desk import LAST, StepRecording, TuneDesk, TunerSession
 from tuning.target import of_machines
 
+STANDARD = find_dynamics("standard")
 KNOWN = find_device("tmcm1636").gains
 VELOCITY_P = KNOWN.names.index("velocity_p")
 
@@ -175,6 +181,36 @@ def recording(number, kind="velocity"):
     return StepRecording(0, kind, (number,), "rpm", row, row, row, row, "figures", at=float(number))
 
 
+def test_the_last_step_with_the_gains_before_stays_as_the_reference(desk):
+    desk.steps.extend(replace(recording(k), gains=(1 if k < 2 else 2,)) for k in range(12))
+    shown = desk.last_steps(0, "velocity")
+    assert [step.at for step in shown] == [11, 1, 10, 9, 8, 7]
+    assert step_card.reference_of(shown).at == 1
+    lines = {one["name"]: one["lineStyle"] for one in step_card.step_chart(shown)["series"]}
+    assert [lines[step.name]["opacity"] for step in shown] == [1.0, 1.0, 0.45, 0.45, 0.45, 0.45]
+    assert [lines[step.name]["type"] for step in shown[:2]] == ["solid", [8, 4]]
+
+
+@pytest.mark.parametrize("reason", ["", "its loops are too near to instability"])
+def test_moves_that_auto_measured_are_among_the_steps(desk, tmp_path, reason):
+    """A move of half a turn; where its gains were rejected, those before are the newest."""
+    t = np.arange(300) * 1e-3
+    demand = np.minimum(t / 0.1, 1.0)[:, None] * np.pi
+    shown = Shown(
+        t, demand, 0.99 * demand, np.ones((300, 1)), np.array([True]), ("",), np.zeros(1), np.zeros(1), np.zeros(1)
+    )  # fmt: skip
+    axis = AxisResult((1, 2, 3, 4, 5), (1, 2, 3, 4, 5) if reason else (6, 7, 8, 9, 10), reason)
+    none = np.zeros(1)
+    result = Result((axis,), none, none, none, none, shown, shown, None, {}, STANDARD, tmp_path, False)
+    do(desk, tune_jobs.run_tuner(desk, TunerSession("auto", tmp_path), lambda *_: result), paced=False)
+    steps = desk.last_steps(0, "position")
+    assert [step.gains for step in steps] == ([axis.before, ()] if reason else [axis.after, axis.before])
+    assert ("rejected gains" in steps[1].name) == bool(reason)
+    assert {step.source for step in steps} == {"auto"}
+    assert (steps[0].unit, float(steps[0].demand[-1])) in (("rev", pytest.approx(0.5)), ("°", pytest.approx(180.0)))
+    assert steps[0].actual[-1] == pytest.approx(0.99 * steps[0].demand[-1])
+
+
 def test_the_last_five_lie_under_the_newest(desk):
     desk.steps.extend(recording(k) for k in range(9))
     desk.steps.append(recording(99, "position"))
@@ -187,19 +223,53 @@ def test_the_last_five_lie_under_the_newest(desk):
 
 
 # --- responses ----------------------------------------------------------------------------------------------------
-def test_margins_follow_the_gains_after_a_response(desk):
-    measured = do(desk, tune_jobs.measure_response(desk, 0, "velocity"), paced=False)
+def test_margins_follow_the_gains_after_a_response_and_the_slider_writes_nothing(desk):
     now = gains_of(desk)
-    chart, same = response_card.bode(measured, 0, now)
-    assert set(same) == {"velocity loop, measured", "position loop, present gains"}
-    assert isinstance(same["velocity loop, measured"], Margins)
-    assert len(chart["yAxis"]) == 2
+    assert StiffnessSlider(panel_of(desk), None).designed.startswith("No response of the velocity loop yet")
+    measured = do(desk, tune_jobs.measure_response(desk, 0, "velocity"), paced=False)
     faster = list(now)
     faster[VELOCITY_P] = round(1.5 * now[VELOCITY_P])
-    _, other = response_card.bode(measured, 0, tuple(faster))
-    assert other["velocity loop, present gains"].crossover_hz > 1.2 * same["velocity loop, measured"].crossover_hz
+    sets = response_charts.loops_of(measured, 0, {"": faster, ", before": now})
+    titles, rows = response_card.margin_rows(sets, STANDARD)
+    assert titles == [
+        "", "velocity loop, before", "velocity loop", "position loop, before", "position loop", "asked for",
+    ]  # fmt: skip
+    by_title = {title: values for title, *values in rows}
+    assert by_title["Crossover"][0] == f"{measured.margins(0).crossover_hz:.1f} Hz"
+    assert [float(text.split()[0]) for text in by_title["Crossover"][:2]] == [
+        pytest.approx(18.7, abs=1.5), pytest.approx(29.0, abs=3.0),
+    ]  # fmt: skip
+    assert by_title["Phase margin"][-1] == "≥ 45.0°"
+    assert len(response_charts.bode(sets)["yAxis"]) == len(response_charts.step(measured, 0, {"": now})["yAxis"]) == 2
+    designed = StiffnessSlider(panel_of(desk), None).designed
+    assert (np.diff([designed.at(place, now)[VELOCITY_P] for place in (0.0, 0.5, 1.0)]) > 0).all()
     stand_still(desk)
     assert gains_of(desk) == now
+    assert not desk.changes
+
+
+def panel_of(desk):
+    return SimpleNamespace(desk=desk, axis=0)
+
+
+def test_ends_of_one_part_have_no_gains_by_one_response(monkeypatch):
+    target = SimpleNamespace(linked=True)
+    assert "run auto" in tune_jobs._soft_to_stiff(None, target, None, 0)
+
+
+def test_what_dynamics_forbid_has_a_cross(monkeypatch):
+    """A loop 1 / (s (1 + s T)) whose crossover has 38 degrees of phase margin."""
+    f = np.geomspace(1.0, 400.0, 2000)
+    L = 100.0 / (2j * np.pi * f * (1.0 + 2j * np.pi * f / 70.0))
+    sets = {"": Loops(f, L, 0.1 * L, np.ones(len(f), bool))}
+    cells = {title: values for title, *values in response_card.margin_rows(sets, STANDARD)[1]}
+    assert [text.startswith("✕") for text in cells["Phase margin"]] == [True, False, False]
+    assert not any("✕" in text for text in cells["Crossover"])
+    series = response_charts.nichols(sets, STANDARD)["series"]
+    forbidden = np.array([point for one in series[:2] for point in one["data"]])
+    assert (forbidden.min(axis=0), forbidden.max(axis=0)) == (
+        pytest.approx([-225.0, -8.0], abs=0.1), pytest.approx([-135.0, 8.0], abs=0.1),
+    )  # fmt: skip
 
 
 def test_margins_that_were_not_measured_say_so():
@@ -276,6 +346,8 @@ def test_auto_comes_to_its_certificate_and_is_undone(desk, tmp_path):
     assert verdict.verdict in ("accepted", "accepted with reservations")
     assert verdict.before == before
     assert gains_of(desk) == verdict.after != before
+    assert [step.gains for step in desk.last_steps(0, "position")] == [verdict.after, before]
+    assert ("velocity", 0) in desk.responses
     assert {one.name for one in run.folder.iterdir()} == {"before.toml", "certificate.json", "report.html"}
     assert run.share == 1.0
     do(desk, tune_jobs.undo(desk, 0))

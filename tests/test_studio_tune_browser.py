@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rigs.fault_injection import served as on_a_bus
 from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, studio, until
+from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
@@ -136,10 +137,10 @@ def bench(emulated, tmp_path, monkeypatch):
             made.end()
 
 
-def slide(tab):
-    thumb = tab.named("slider-velocity_p").find_element(By.CSS_SELECTOR, "[tabindex]")
+def slide(tab, name="slider-velocity_p", times=12):
+    thumb = tab.named(name).find_element(By.CSS_SELECTOR, "[tabindex]")
     tab.driver.execute_script("arguments[0].focus()", thumb)
-    for _ in range(12):
+    for _ in range(times):
         tab.key(Keys.ARROW_RIGHT)
 
 
@@ -240,15 +241,32 @@ def test_a_machine_on_a_bus_has_no_page(driver, bench):
 
 
 @pytest.mark.slow
-def test_margins_follow_a_slider_after_a_response(tab):
+def test_the_slider_from_soft_to_stiff_shows_what_it_would_do_and_is_one_change(tab):
+    """A drag shows margins and step at once; the gains are written when it is let go."""
     tab.open("/tune")
-    now = gain(tab)
+    before = gain(tab)
+    assert "press Measure" in text_of(tab, "stiffness-told")
+    slide(tab, "stiffness", 3)
+    assert text_of(tab, "gain-history").startswith("Nothing changed yet")
     tab.press("measure-response")
-    until(lambda: "velocity loop, measured" in text_of(tab, "margins"), "the margins", 60.0)
-    enter(tab, "gain-velocity_p", round(1.5 * now))
-    until(lambda: "velocity loop, present gains" in text_of(tab, "margins"), "the margins with the new gain")
+    until(lambda: "Gains for standard: 45°, 8 dB, Ms 2" in text_of(tab, "stiffness-told"), "the slider", 120.0)
+    assert "before" not in text_of(tab, "margins")
+    slider = tab.named("stiffness")
+    tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", slider)
+    hand = ActionChains(tab.driver).click_and_hold(slider).move_by_offset(round(0.3 * slider.size["width"]), 0)
+    hand.perform()
+    until(lambda: "Written when you let the slider go" in text_of(tab, "stiffness-told"), "what it would be")
+    until(lambda: "velocity loop, before" in text_of(tab, "margins"), "the margins beside those now")
+    until(lambda: gain(tab) > 1.05 * before, "the gain of the slider")
+    assert text_of(tab, "gain-history").startswith("Nothing changed yet")
+    ActionChains(tab.driver).release().perform()
+    until(lambda: text_of(tab, "gain-history").startswith("1 change; the last: dynamics"), "the change")
+    assert "has others now" not in text_of(tab, "stiffness-told")
+    for chart in ("bode-chart", "nichols-chart", "predicted-step"):
+        assert len(tab.all(f"[data-test={chart}] svg path")) > 10
     tab.press("undo")
-    until(lambda: "velocity loop, present gains" not in text_of(tab, "margins"), "the margins with the gains before")
+    until(lambda: gain(tab) == before, "the gains before")
+    assert (tab.errors(), tab.nameless()) == ([], [])
 
 
 @pytest.mark.slow

@@ -127,15 +127,11 @@ def find(driver: Chrome) -> None:
 
 
 def tune(driver: Chrome) -> None:
-    """Have auto tune the axis, with a step before and after it, and a response."""
-    press(driver, "[data-test=record-step]")
-    time.sleep(3.0)
-    press(driver, "[data-test=run-auto]")
-    while "done" not in driver.find_element(By.CSS_SELECTOR, "[data-test=run-head]").text:
-        time.sleep(1.0)
-    for what in ("record-step", "measure-response"):
-        press(driver, f"[data-test={what}]")
-        time.sleep(8.0)
+    """Have auto tune the axis, whose moves are the steps, and measure a response."""
+    for button, told, text in (("run-auto", "run-head", "done"), ("measure-response", "stiffness-told", "Gains for")):
+        press(driver, f"[data-test={button}]")
+        while text not in driver.find_element(By.CSS_SELECTOR, f"[data-test={told}]").text:
+            time.sleep(1.0)
     driver.execute_script("for (const one of document.querySelectorAll('.q-notification')) one.remove()")
 
 
@@ -163,7 +159,7 @@ SHOTS = (
     Shot("axes", "/axes", 1280, 860, False, enable),
     Shot("scope", "/scope", 1280, 960, False, move),
     Shot("dictionary", "/dictionary", 1280, 860, False, find),
-    Shot("tune", "/tune", 1920, 1500, False, tune),
+    Shot("tune", "/tune", 1920, 2060, False, tune),
     Shot("runs", "/runs", 1280, 960, False, nothing),
     Shot("axes-phone", "/axes", 360, 780, True, nothing),
     Shot("commission", "/commission", 1280, 1500, False, commission),

@@ -67,14 +67,8 @@ class Dynamics:
         Args:
             open_loop: L at increasing frequencies, near enough to each other to see every resonance, (..., n).
         """
-        L = open_loop
-        with np.errstate(divide="ignore", invalid="ignore"):
-            gain = 20.0 / math.log(10.0) * np.log(np.abs(L)) / self.gain_db
-            phase = np.degrees(np.angle(-L)) / self.phase_deg
-        # Between the ends of both margins the circle lies farther out, but for slivers along |L| = 1 and the real axis:
-        # this closes the region.
-        corner = (np.sqrt(np.abs(phase)) + np.sqrt(np.abs(gain))) ** 2
-        least = np.minimum(corner, self.ms * np.abs(1.0 + L)).min(axis=-1)
+        gain, phase, each = self._distance(open_loop)
+        least = each.min(axis=-1)
         turned = np.abs(np.diff(phase)) < 180.0 / self.phase_deg  # else it wraps at 0 degrees
         for value, other, where in ((gain, phase, True), (phase, gain, turned)):
             first, second = value[..., :-1], value[..., 1:]
@@ -85,6 +79,28 @@ class Dynamics:
             there = np.where(crosses & (turned | (value is phase)), there, np.inf)
             least = np.minimum(least, there.min(axis=-1))
         return np.asarray(least)
+
+    def _distance(self, L: Complex) -> tuple[Floats, Floats, Floats]:
+        """Return gain and phase from -1, each over its margin, and how much larger the region is that ends there."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain = 20.0 / math.log(10.0) * np.log(np.abs(L)) / self.gain_db
+            phase = np.degrees(np.angle(-L)) / self.phase_deg
+        # Between the ends of both margins the circle lies farther out, but for slivers along |L| = 1 and the real axis:
+        # this closes the region.
+        corner = (np.sqrt(np.abs(phase)) + np.sqrt(np.abs(gain))) ** 2
+        return gain, phase, np.minimum(corner, self.ms * np.abs(1.0 + L))
+
+    def region(self, count: int = 180) -> tuple[Floats, Floats]:
+        """Return the edge of the region around -1: phase [degrees] from -180 and gain [dB], (count + 1,) each."""
+        around = np.linspace(0.0, 2.0 * math.pi, count + 1)
+        phase, gain = np.cos(around) * self.phase_deg, np.sin(around) * self.gain_db
+        inside, outside = np.zeros(count + 1), np.full(count + 1, 3.0)
+        for _ in range(40):
+            middle = 0.5 * (inside + outside)
+            L = -(10.0 ** (middle * gain / 20.0)) * np.exp(1j * np.radians(middle * phase))
+            within = self._distance(L)[2] < 1.0
+            inside, outside = np.where(within, middle, inside), np.where(within, outside, middle)
+        return inside * phase, inside * gain
 
     def slack(self, nominal: Floats, variants: Floats, overshoot: Floats) -> Floats:
         """Return how far machines are from breaking a constraint, relative: 0 where one is just kept, (machines,).

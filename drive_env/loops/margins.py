@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mechanics.arrays import Floats, Integers, Mask
+from mechanics.arrays import Complex, Floats, Integers, Mask
 
 
 class Margins(NamedTuple):
@@ -84,6 +84,15 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     closed = np.where(good, np.abs(L / (1.0 + L)), math.nan)
     sensitivity = 1.0 / np.abs(1.0 + L[good]) if good.any() else np.array([math.nan])
     return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()), phase_at, gain_at)
+
+
+def is_as_stable(before: Complex, now: Complex) -> Mask:
+    """Return whether closed loops are as stable with one open loop as with another, (..., n): (...).
+
+    They are if 1 + L turns round 0 as often.
+    """
+    turned = np.unwrap(np.angle((1.0 + now) / (1.0 + before)), axis=-1)
+    return np.asarray(np.abs(turned[..., -1] - turned[..., 0]) < math.pi)
 
 
 def _unseen(known: Integers, log_gain: Floats) -> Integers:

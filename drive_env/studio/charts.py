@@ -25,7 +25,10 @@ MOST_POINTS = 800  # of a line; more are not seen
 
 @dataclass(frozen=True)
 class ChartLine:
-    """A line: name, x and y of shape (n,), panel from above, number of its colour and of its dashes, width [pixels]."""
+    """A line: name, x and y of shape (n,), panel from above, number of its colour and of its dashes, width [pixels].
+
+    `fill` colours what lies between it and 0.
+    """
 
     name: str
     x: ArrayLike
@@ -35,6 +38,7 @@ class ChartLine:
     dashes: int = 0
     width: float = 2.0
     faint: bool = False
+    fill: bool = False
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,14 @@ class ChartPanel:
 
 
 def options(
-    panels: Sequence[ChartPanel], x_title: str, lines: Sequence[ChartLine], *, logarithmic: bool = False
+    panels: Sequence[ChartPanel],
+    x_title: str,
+    lines: Sequence[ChartLine],
+    *,
+    logarithmic: bool = False,
+    hint: str = "",
 ) -> dict[str, Any]:
-    """Return the option object of ECharts; panels share their x axis."""
+    """Return the option object of ECharts; panels share their x axis, and without lines `hint` says what makes some."""
     count = max(1, len(panels))
     x_axis, y_axis, grid = [], [], []
     top, room = 10.0, 100.0 - 10.0 - 5.0
@@ -60,26 +69,32 @@ def options(
         x_axis.append(
             {
                 "type": "log" if logarithmic else "value", "gridIndex": k, "name": x_title if last else "",
-                "nameLocation": "middle", "nameGap": 24, "axisLabel": {"show": last}, "min": "dataMin",
-                "max": "dataMax", "splitLine": SPLIT, "minorSplitLine": SPLIT | {"show": logarithmic}, "axisLine": AXIS,
+                "nameLocation": "middle", "nameGap": 24, "axisLabel": {"show": last and bool(lines)},
+                "min": "dataMin" if lines else 1.0, "max": "dataMax" if lines else 10.0, "splitLine": SPLIT,
+                "minorSplitLine": SPLIT | {"show": logarithmic}, "axisLine": AXIS,
             }
         )  # fmt: skip
         y_axis.append(
             {
                 "type": "value", "gridIndex": k, "name": panel.title, "nameLocation": "middle", "nameGap": 50,
                 "scale": True, "min": panel.low, "max": panel.high, "splitNumber": 4, "splitLine": SPLIT,
-                "axisLine": AXIS,
+                "axisLine": AXIS, "axisLabel": {"show": bool(lines)},
             }
         )  # fmt: skip
     return {
         "animation": False,
+        "title": {
+            "text": "" if lines else hint, "left": "center", "top": "middle",
+            "textStyle": {"fontSize": 14, "fontWeight": "normal", "width": 250, "overflow": "break",
+                "lineHeight": 22},
+        },
         "tooltip": {"trigger": "axis", "confine": True},
         "legend": {"type": "scroll", "top": 0, "data": list(dict.fromkeys(line.name for line in lines))},
         "grid": grid,
         "xAxis": x_axis,
         "yAxis": y_axis,
         "series": [_series(line) for line in lines],
-    }
+    }  # fmt: skip
 
 
 def _series(line: ChartLine) -> dict[str, Any]:
@@ -96,6 +111,7 @@ def _series(line: ChartLine) -> dict[str, Any]:
             "width": line.width, "color": colour, "type": DASHES[line.dashes % len(DASHES)],
             "opacity": 0.45 if line.faint else 1.0,
         },
+        **({"areaStyle": {"color": colour, "opacity": 0.22, "origin": 0}} if line.fill else {}),
     }  # fmt: skip
 
 

@@ -41,6 +41,7 @@ from mechanics.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
 LIVE = 5.0  # s across the plot of the page Axes
+UNITS_REFRESH = 0.5  # s
 FIRST = (  # of the objects that can be chosen, those that people look for
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
@@ -93,9 +94,16 @@ def live_plot(session: Session, visitor: Visitor) -> None:
     known, view = session.description.dictionary, ScopeView(session.recorder)
     scale, units = session.scales[visitor.axis], session.workspace.units
     keys = [key for key in session.workspace.usual_channels if key in session.recorder.objects]
-    view.channels = tuple(channel_of(known.find(key), visitor.axis, scale, several=False, units=units) for key in keys)
+
+    def follow_units() -> None:
+        now = tuple(channel_of(known.find(key), visitor.axis, scale, several=False, units=units) for key in keys)
+        if now != view.channels:
+            with_units(view, now)
+
+    follow_units()
     view.window = LIVE
     traces(visitor, view, "studio-scope-small")
+    ui.timer(UNITS_REFRESH, follow_units)
     visitor.client.on_delete(lambda: _views.pop(visitor.id, None))
 
 

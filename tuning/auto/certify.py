@@ -86,7 +86,7 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
         after=outcome.after,
         before_si=si_gains(target.device, supply, outcome.before),
         after_si=si_gains(target.device, supply, outcome.after),
-        steps=(*_steps(result, axis), *loaded) if outcome.accepted else (),
+        steps=(*recorded_moves(result, axis), *loaded) if outcome.accepted else (),
         frequency_responses=_responses(target, result, axis, outcome) if outcome.accepted else (),
         dynamics=result.dynamics.name,
         requirements=requirements(result.dynamics, outcome, target.device.gains) if outcome.accepted else (),
@@ -141,7 +141,7 @@ def _crossovers(target: Target, outcome: AxisResult) -> dict[str, float]:
     return dict(zip(CROSSOVERS, (current, velocity, position, position / velocity), strict=True))
 
 
-def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
+def recorded_moves(result: Result, axis: int) -> tuple[StepResponse, ...]:
     """Return the move with the gains before, if it was made, and that with the new ones."""
     moves = ((False, result.earlier), (True, result.shown))
     return tuple(_step(shown, axis, tuned) for tuned, shown in moves if shown is not None and shown.where[axis])

@@ -206,12 +206,12 @@ def design(
 
     most = np.full(n, np.inf) if most_velocity_p is None else most_velocity_p
     column = cascade_columns(device)[2]
-    pool = np.array([_grid(device, plant) for plant in plants])
+    pool = np.array([_grid(device, plant, TORQUES) for plant in plants])
     torque_p = pool[..., cascade_columns(device)[0]].max(axis=1)
     pool[..., column] = np.minimum(pool[..., column], most[:, None])
     # The best by promise of each bandwidth: first of what keeps the margins as it is, then with its variants.
     for each, nominal in ((EACH_NOMINAL, True), (EACH, False)):
-        rows = _of_each(coarse.slack(pool, nominal=nominal), promise(pool), each)
+        rows = _of_each(coarse.slack(pool, nominal=nominal), promise(pool), each, len(BANDWIDTHS) * len(TORQUES))
         pool = np.take_along_axis(pool, rows[:, :, None], axis=1)
         say(0.2)
     cost = coarse.score(pool)
@@ -238,13 +238,50 @@ def design(
     return Designed(pool, np.take_along_axis(cost, order, axis=1), coarse.slack(pool))
 
 
-def _grid(device: Device, plant: Plant) -> Integers:
+def design_by_loops(
+    device: Device, plant: Plant, slack: Callable[[Integers, bool], Floats], most_velocity_p: float
+) -> tuple[Integers, float]:
+    """Return the most promising gains that keep the constraints of the loops, (count,), and how far they keep them.
+
+    It takes seconds, since no twin is run: friction and noise are not looked at, and the current loop has the crossover
+    that its lags allow.
+
+    Args:
+        device: The drive.
+        plant: The axis.
+        slack: Returns how far raw gains, (sets, count), keep the constraints, (sets,); given whether to look at the
+            axis as it is alone.
+        most_velocity_p: The greatest velocity P, raw.
+    """
+    column = cascade_columns(device)[2]
+
+    def bounded(gains: Integers) -> Integers:
+        gains[:, column] = np.minimum(gains[:, column], most_velocity_p)
+        return gains
+
+    pool = bounded(_grid(device, plant, TORQUES[:1]))
+    torque, torque_p = cascade_columns(device)[0], int(pool[0, cascade_columns(device)[0]])
+    pool = pool[_of_each(slack(pool, True)[None], _promise(device, pool)[None], EACH_NOMINAL, len(BANDWIDTHS))[0]]
+    for step in STEPS:
+        best, _ = _best(device, pool, slack(pool, False))
+        near = bounded(_around(device, best, step, torque_p))
+        pool = np.concatenate([best[None], np.unique(near[near[:, torque] == torque_p], axis=0)])
+    return _best(device, pool, slack(pool, False))
+
+
+def _best(device: Device, gains: Integers, slack: Floats) -> tuple[Integers, float]:
+    """Return the most promising of gains that keep the constraints, else those that come nearest, and their slack."""
+    best = int(np.argmin(np.where(slack > 0.0, _promise(device, gains), 1e9 - slack)))
+    return gains[best], float(slack[best])
+
+
+def _grid(device: Device, plant: Plant, torques: Sequence[float]) -> Integers:
     """Return the gains of the grid for an axis, raw, (sets, count); bandwidths change slowest."""
     scales = si_scales(device, plant.supply)
     lag = CURRENT_LAG / device.current_rate
     small = float(small_time_constants(device, plant.velocity_filter)) + plant.delay - 1.0 / device.velocity_rate
     rows = []
-    for bandwidth, torque, integration, position in product(BANDWIDTHS, TORQUES, INTEGRATIONS, POSITIONS):
+    for bandwidth, torque, integration, position in product(BANDWIDTHS, torques, INTEGRATIONS, POSITIONS):
         w = bandwidth / small
         values: dict[Part, float] = {
             ("current", "P"): torque * CURRENT_CROSSOVER / lag * plant.L,
@@ -270,13 +307,12 @@ def _promise(device: Device, gains: Integers) -> Floats:
     return np.asarray(-np.log(device.gains.strength(gains, cascade_columns(device)[2:])).sum(axis=-1))
 
 
-def _of_each(slack: Floats, promise: Floats, each: int) -> Integers:
-    """Return the most promising of every bandwidth and torque P that keep the constraints, (n, those * each).
+def _of_each(slack: Floats, promise: Floats, each: int, count: int) -> Integers:
+    """Return the most promising of every bandwidth and torque P, `count` of these, that keep the constraints.
 
-    Where they are fewer, those that come nearest to keeping them.
+    Where they are fewer, those that come nearest to keeping them. Of shape (n, count * each).
     """
     n, sets = slack.shape
-    count = len(BANDWIDTHS) * len(TORQUES)
     group = (n, count, sets // count)
     order = np.argsort(np.where(slack > 0.0, promise, 1e9 - slack).reshape(group), axis=2, kind="stable")[:, :, :each]
     first = group[2] * np.arange(group[1])[:, None]

@@ -9,7 +9,7 @@ import numpy as np
 
 from drive_env.loops.dynamics import OFF_NOMINAL
 from drive_env.loops.linear_model import controllers, velocity_filter_response, velocity_plant
-from drive_env.loops.margins import Margins, margins
+from drive_env.loops.margins import Margins, is_as_stable, margins
 from drive_env.trials.score import VARIANTS
 from mechanics.arrays import Complex, Floats, Integers
 
@@ -104,9 +104,7 @@ class MeasuredAxis:
         before, now = self.open_loops(self._gains[None]), self.open_loops(gains)
         least = np.full(len(gains), np.inf)
         for loop in LOOPS:
-            # With the gains of the measurement the loop was stable: others are if 1 + L turns round 0 as often.
-            turned = np.unwrap(np.angle((1.0 + now[loop]) / (1.0 + before[loop])), axis=1)
-            stable = np.abs(turned[:, -1] - turned[:, 0]) < math.pi
+            stable = is_as_stable(before[loop], now[loop])  # with the gains of the measurement the loop was stable
             clearance = dynamics.clearance(now[loop])
             least = np.minimum(least, np.where(stable, clearance, -np.minimum(clearance, 1.0)))
         return least

@@ -38,6 +38,11 @@ class Loops(NamedTuple):
     position: Complex
     trusted: Mask
 
+    def margins(self) -> dict[str, margins_.Margins]:
+        """Return the margins of both by name, by their trusted lines; nan for those that they do not show."""
+        both = {"velocity": self.velocity, "position": self.position}
+        return {name: _seen(margins_.margins(self.f, L, self.trusted)) for name, L in both.items()}
+
 
 class AtLeast(NamedTuple):
     """Lower bounds of margins that were not measured; nan without a bound."""
@@ -89,9 +94,7 @@ class MeasuredLoop:
 
     def margins(self, axis: int = 0) -> margins_.Margins:
         """Return the margins of an axis, by its trusted lines; nan for those that they do not show."""
-        found = margins_.margins(*self.refined(axis))
-        # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
-        return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
+        return _seen(margins_.margins(*self.refined(axis)))
 
     def refined(self, axis: int = 0) -> tuple[Floats, Complex, Mask]:
         """Return frequencies, open loop, and which of them are trusted, between the lines too.
@@ -148,6 +151,20 @@ class MeasuredLoop:
         velocity = L * ratio
         return Loops(f, velocity, outer_loop(self.device, fit.plant, now, f, velocity), trusted)
 
+    def extended(self, f: Floats, axis: int = 0) -> MeasuredLoop:
+        """Return the loop at other frequencies [Hz], (n,), by the fitted model and by what an axis measured over it."""
+        fit = self.fits[axis]
+        assert fit is not None and fit.is_good, "a model fits"
+        at, L, _ = self.refined(axis)
+        off = np.log(L / fit.open_loop(self.device, self.gains[axis], at))
+        ends = {"left": off[0], "right": 0.0}
+        open_loop = fit.open_loop(self.device, self.gains[axis], f) * np.exp(np.interp(f, at, off, **ends))
+        rows = np.ones(self.open_loop.shape[1])
+        return replace(
+            self, f=f, open_loop=open_loop[:, None] * rows, coherence=np.ones((len(f), len(rows))),
+            traced=np.zeros(len(f), bool),
+        )  # fmt: skip
+
     def at_least(self, loop: str, gains: Sequence[int] | Integers, axis: int = 0) -> AtLeast:
         """Return lower bounds of a loop's margins, by the fitted model, everything within its intervals.
 
@@ -196,6 +213,14 @@ class MeasuredLoop:
         if fit is None:
             raise ValueError(f"the {self.loop} loop does not give the axis model; measure the velocity loop")
         return fit.estimates
+
+
+def _seen(found: margins_.Margins) -> margins_.Margins:
+    """Return margins without a gain margin that was not seen.
+
+    A phase of -180 degrees that was not reached may lie above the frequencies looked at.
+    """
+    return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
 
 
 def merged(results: Sequence[MeasuredLoop]) -> MeasuredLoop:

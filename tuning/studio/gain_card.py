@@ -64,7 +64,7 @@ class GainCard:
         self._panel = panel
         self._slid = slid
         self._device = panel.device
-        self._shown: tuple[int, ...] = ()
+        self.shown: tuple[int, ...] = ()  # in the drive
         self._is_setting = False
         self.wanted: list[int] = []  # as the sliders stand, before they are let go
         self._moved: set[int] = set()  # columns of sliders that are being moved: what is read leaves them alone
@@ -102,33 +102,41 @@ class GainCard:
         self._controls.append((gain, slider, number, unit))
 
     def _slides(self, column: int, place: int) -> None:
-        """Show a slider's value while it is moved; written when it is let go."""
         if self._is_setting or not self.wanted:
             return
-        gain, _, number, _ = self._controls[column]
-        self.wanted[column] = value_at(place, gain.highest)
-        self._moved.add(column)
+        value = value_at(place, self._controls[column][0].highest)
+        self.preview((*self.wanted[:column], value, *self.wanted[column + 1 :]), slid=column)
+
+    def preview(self, gains: tuple[int, ...], slid: int | None = None) -> None:
+        """Show gains while a slider is moved, the one of column `slid` or another; written when it is let go."""
         self._is_setting = True
-        number.set_value(self.wanted[column])
+        for column, (value, (gain, slider, number, _)) in enumerate(zip(gains, self._controls, strict=True)):
+            if value != self.wanted[column] or column == slid:
+                self.wanted[column] = value
+                self._moved.add(column)
+                number.set_value(value)
+                if column != slid:
+                    slider.set_value(place_of(value, gain.highest))
         self._is_setting = False
-        self._units(tuple(self.wanted))
+        self._units(gains)
         self._slid()
 
     async def _apply(self, column: int, value: float | None) -> None:
-        if self._is_setting or value is None or not self._shown:
-            return
-        if int(value) == self._shown[column]:
-            if int(value) == self.wanted[column]:
-                self._moved.discard(column)
-            return
-        panel, gain = self._panel, self._controls[column][0]
-        what = f"{gain.title} {self._shown[column]} to {int(value)}"
-        job = tune_jobs.set_gains(panel.desk, panel.axis, {column: int(value)}, what)
-        self.wanted[column] = int(value)
-        await panel.visitor.do(job, f"{gain.title} {int(value)}")
-        if self.wanted[column] == int(value):  # not moved on meanwhile
-            self._moved.discard(column)
-        self.show(force=True)
+        if not self._is_setting and value is not None and self.shown:
+            await self.write({column: int(value)})
+
+    async def write(self, gains: dict[int, int], what: str = "") -> None:
+        """Write gains by column, as one change, `what` in its history: the gain's old and new value by default."""
+        panel, changed = self._panel, {k: value for k, value in gains.items() if value != self.shown[k]}
+        if changed:
+            titles = [f"{self._controls[k][0].title} {self.shown[k]} to {value}" for k, value in changed.items()]
+            self.wanted = [changed.get(k, value) for k, value in enumerate(self.wanted)]
+            job = tune_jobs.set_gains(panel.desk, panel.axis, changed, what or titles[0])
+            await panel.visitor.do(job, what or titles[0])
+        # What was moved on meanwhile stays as it is.
+        self._moved -= {k for k, value in gains.items() if self.wanted[k] == value}
+        if changed:
+            self.show(force=True)
 
     async def _undo_last(self) -> None:
         panel = self._panel
@@ -148,9 +156,9 @@ class GainCard:
         if desk.gains is None or axis >= len(desk.gains):
             return
         now = tuple(map(int, desk.gains[axis]))
-        if now != self._shown or force:
+        if now != self.shown or force:
             old = self.wanted or list(now)
-            self._shown = now
+            self.shown = now
             self.wanted = [old[k] if k in self._moved else value for k, value in enumerate(now)]
             self._is_setting = True
             for column, (gain, slider, number, _) in enumerate(self._controls):

@@ -8,24 +8,27 @@ from nicegui import ui
 
 from drive_env.studio import charts
 from tuning.studio import tune_jobs
-from tuning.studio.tune_desk import LAST, StepRecording
+from tuning.studio.tune_desk import LAST, StepRecording, reference_of
 from tuning.studio.tune_panel import TunePanel, card
 
 KINDS = {"velocity": ("csv", "Velocity step"), "position": ("pp", "Move")}
 
 
 def step_chart(steps: list[StepRecording]) -> dict[str, Any]:
-    """Return the chart of steps, the newest first: it is drawn strong, those before it faint and dashed."""
+    """Return the chart of steps, the newest first: strong, the last one with other gains dashed, others faint."""
     if not steps:
-        return charts.options([charts.ChartPanel("")], "t [s]", [])
-    newest = steps[0]
+        panels = [charts.ChartPanel("actual value"), charts.ChartPanel("current [A]")]
+        return charts.options(panels, "t [s]", [], hint="Press Record: a step with the present gains.")
+    newest, reference = steps[0], reference_of(steps)
     what = "speed" if newest.kind == "velocity" else "position"
     panels = [charts.ChartPanel(f"{what} [{newest.unit}]"), charts.ChartPanel("current [A]")]
     lines = [charts.ChartLine("demand", newest.t, newest.demand, 0, 7, 2, 1.5)]
     for age, step in enumerate(steps[: LAST + 1]):
         for panel, values in enumerate((step.actual, step.current)):
-            width = 2.4 if age == 0 else 1.4
-            lines.append(charts.ChartLine(step.name, step.t, values, panel, age, age, width, faint=age > 2))
+            strong = step in (newest, reference)
+            lines.append(
+                charts.ChartLine(step.name, step.t, values, panel, age, age, 2.4 if strong else 1.2, faint=not strong)
+            )
     return charts.options(panels, "t [s]", lines)
 
 
@@ -38,7 +41,8 @@ class StepCard:
 
     def __init__(self, panel: TunePanel) -> None:
         self._panel = panel
-        self._seen: tuple[Any, ...] = ()
+        self._seen: tuple[Any, ...] = (None,)
+        self._newest: StepRecording | None = None
 
     def build(self) -> None:
         """Make it."""
@@ -74,7 +78,8 @@ class StepCard:
         for control in (self._rpm, self._hold):
             control.set_visibility(velocity)
         self._turns.set_visibility(not velocity)
-        self._seen = ()
+        if hasattr(self, "_chart"):
+            self.show()
 
     async def _record(self) -> None:
         panel, kind = self._panel, str(self._kind.value)
@@ -96,7 +101,14 @@ class StepCard:
         """Show the steps there are."""
         if not hasattr(self, "_chart"):
             return
-        steps = self._panel.desk.last_steps(self._panel.axis, str(self._kind.value))
+        desk, axis = self._panel.desk, self._panel.axis
+        newest = next(
+            (step for step in reversed(desk.steps) if step.axis == axis and step.kind in self._kind.options), None
+        )
+        if newest is not None and newest is not self._newest:
+            self._newest = newest
+            self._kind.set_value(newest.kind)  # what was recorded last is what is looked at
+        steps = desk.last_steps(axis, str(self._kind.value))
         seen = (self._kind.value, *(step.at for step in steps))
         if seen == self._seen:
             return
@@ -104,10 +116,14 @@ class StepCard:
         charts.show(self._chart, step_chart(steps))
         self._told.clear()
         with self._told:
+            reference = reference_of(steps)
             for age, step in enumerate(steps):
+                before = "before, " if step is reference else ""
                 with ui.element("div").classes("studio-step"):
                     ui.html(_sample(age), sanitize=False)
-                    ui.label(f"{step.name}: {step.figures}").classes("studio-strong" if age == 0 else "studio-hint")
+                    ui.label(f"{before}{step.name}: {step.figures}").classes(
+                        "studio-strong" if age == 0 else "studio-hint"
+                    )
 
 
 def _sample(age: int) -> str:

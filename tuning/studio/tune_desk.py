@@ -22,6 +22,7 @@ from tuning.target import Target, address_of, hold_to_travel, of_bus, of_machine
 
 if TYPE_CHECKING:
     from drive_env.studio.session import Session
+    from tuning.auto.soft_to_stiff import SoftToStiff
     from tuning.compare.side_by_side import AxisRules
     from tuning.identify.identified_axis import Identification
     from tuning.response.measured_loop import MeasuredLoop
@@ -41,19 +42,20 @@ class GainChange:
     what: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StepRecording:
     """A step that was recorded with the gains of its time.
 
     Attributes:
         axis: Of the axis.
         kind: "velocity" or "position".
-        gains: Raw, of the axis.
+        gains: Raw, of the axis; empty where they were rejected.
         unit: Of demand and actual.
         t: [s], shape (n,).
         demand, actual: Shape (n,).
         current: [A], shape (n,).
         figures: In words: rise, overshoot, settling.
+        source: The tuner that moved; "" for a step that a page asked for.
         at: When [s since 1970].
     """
 
@@ -66,12 +68,20 @@ class StepRecording:
     actual: Floats
     current: Floats
     figures: str
+    source: str = ""
     at: float = field(default_factory=time.time)
 
     @property
     def name(self) -> str:
         """Time of day and gains, which tell it from others."""
-        return f"{time.strftime('%H:%M:%S', time.localtime(self.at))}  {', '.join(map(str, self.gains))}"
+        gains = ", ".join(map(str, self.gains)) or "rejected gains"
+        source = f"{self.source}: " if self.source else ""
+        return f"{time.strftime('%H:%M:%S', time.localtime(self.at))}  {source}{gains}"
+
+
+def reference_of(steps: Sequence[StepRecording]) -> StepRecording | None:
+    """Return the first of steps, the newest first, with other gains than the newest one; None without one."""
+    return next((step for step in steps if step.gains != steps[0].gains), None)
 
 
 @dataclass(frozen=True)
@@ -148,6 +158,7 @@ class TuneDesk:
         self.before_file: Path | None = None
         self.steps: deque[StepRecording] = deque(maxlen=10 * (LAST + 1))
         self.responses: dict[tuple[str, int], MeasuredLoop] = {}
+        self.soft_to_stiff: dict[int, SoftToStiff | str] = {}  # of axes, or the reason why there are no such gains
         self.identified: list[Identification] = []
         self.rules: list[AxisRules] = []
         self.run: TunerSession | None = None
@@ -165,9 +176,16 @@ class TuneDesk:
             self.version += 1
 
     def last_steps(self, axis: int, kind: str) -> list[StepRecording]:
-        """Return the present step of an axis and the last five before it, the newest first."""
-        mine = [step for step in self.steps if (step.axis, step.kind) == (axis, kind)]
-        return mine[::-1][: LAST + 1]
+        """Return the present step of an axis and five before it, the newest first; its reference is the second.
+
+        That is the newest one with other gains than the present step has.
+        """
+        mine = [step for step in reversed(self.steps) if (step.axis, step.kind) == (axis, kind)]
+        reference = reference_of(mine)
+        if reference is not None:
+            mine.remove(reference)
+            mine.insert(1, reference)
+        return mine[: LAST + 1]
 
     def note(self, axis: int, before: Sequence[int], after: Sequence[int], what: str) -> None:
         """Add a change to the history, unless the gains are equal."""

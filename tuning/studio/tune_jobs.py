@@ -23,6 +23,7 @@ from tuning.studio.tune_desk import AxisVerdict, StepRecording, TuneDesk, TunerS
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
+    from tuning.auto.soft_to_stiff import SoftToStiff
     from tuning.response.measured_loop import MeasuredLoop
     from tuning.target import Target
 
@@ -257,7 +258,10 @@ def _keep(desk: TuneDesk, step: StepRecording) -> StepRecording:
 
 # --- response, identification, rules ----------------------------------------------------------------------------------
 def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives], MeasuredLoop]:
-    """Return the job that measures a loop's frequency response with the present gains."""
+    """Return the job that measures a loop's frequency response with the present gains.
+
+    By that of the velocity loop it designs gains from soft to stiff; nothing of them is written.
+    """
 
     def job(drives: Drives) -> MeasuredLoop:
         from tuning.response.frequency_response import measure
@@ -267,10 +271,26 @@ def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives],
             found = measure(target, loop, where=only(drives, axis), progress=progress_of(desk, "shaking"))
         desk.responses[loop, axis] = found
         desk.gains = read_gains(drives)
+        if loop == "velocity":
+            desk.soft_to_stiff[axis] = "Gains from soft to stiff are being designed by this response."
+            desk.touch()
+            desk.soft_to_stiff[axis] = _soft_to_stiff(desk, target, found, axis)
         desk.touch()
         return found
 
     return job
+
+
+def _soft_to_stiff(desk: TuneDesk, target: Target, measured: MeasuredLoop, axis: int) -> SoftToStiff | str:
+    """Return gains of an axis from soft to stiff by its response, or the reason why there are none."""
+    from tuning.auto.soft_to_stiff import soft_to_stiff
+
+    if target.linked:
+        return "Axes that drive one part have no gains by the response of one of them: run auto."
+    try:
+        return soft_to_stiff(measured, target.motor, axis, progress_of(desk, "designing gains from soft to stiff"))
+    except ValueError as error:
+        return f"There are no gains from soft to stiff: {error}."
 
 
 def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
@@ -341,6 +361,7 @@ def run_tuner(
             try:
                 with desk.target(drives) as target:
                     result = work(target, run, _progress(desk, run))
+                    _keep_measured(desk, target, result, run.title)
                 run.verdicts = verdicts(result)
             finally:
                 desk.gains = read_gains(drives)
@@ -370,6 +391,30 @@ def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]
         progress_of(desk, what)(share)
 
     return tell
+
+
+def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> None:
+    """Keep what auto measured on the drives: its moves, that with the present gains last, and the response."""
+    from tuning.auto.certify import recorded_moves
+    from tuning.auto.result import Result
+
+    if not isinstance(result, Result):
+        return  # that of a stepper's commissioning has none
+    increments = target.increments()
+    for k, axis in enumerate(result.axes):
+        # The gains of the new move where the axis was rejected are those that did not stay.
+        moves = [(one, (axis.after if axis.accepted else ()) if one.tuned else axis.before)
+                 for one in recorded_moves(result, k)]  # fmt: skip
+        for one, gains in moves if axis.accepted else reversed(moves):
+            scaled = (
+                _in_unit(desk, k, cia402.POSITION_ACTUAL, row * increments[k]) for row in (one.reference, one.actual)
+            )
+            (demand, unit), (actual, _) = scaled
+            figures = _figures(one.t, actual, float(demand[-1]), unit)
+            _keep(desk, StepRecording(k, "position", gains, unit, one.t, demand, actual, one.current, figures, title))
+        if result.response is not None and np.isfinite(result.response.open_loop[:, k]).any():
+            desk.responses["velocity", k] = result.response
+            desk.soft_to_stiff.pop(k, None)
 
 
 def verdicts(result: Any) -> tuple[AxisVerdict, ...]:

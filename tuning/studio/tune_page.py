@@ -15,6 +15,7 @@ from tuning.studio.gain_card import GainCard
 from tuning.studio.response_card import ResponseCard
 from tuning.studio.rules_card import RulesCard
 from tuning.studio.step_card import StepCard
+from tuning.studio.stiffness_slider import StiffnessSlider
 from tuning.studio.tune_panel import TunePanel, card, machine_card
 from tuning.studio.tuner_card import TunerCard
 
@@ -49,7 +50,8 @@ class TunePage:
 
     def __init__(self, panel: TunePanel) -> None:
         self.panel = panel
-        self.gains, self.step, self.response = GainCard(panel, self._gains_slide), StepCard(panel), ResponseCard(panel)
+        self.gains, self.step = GainCard(panel, self._gains_slide), StepCard(panel)
+        self.response = ResponseCard(panel, StiffnessSlider(panel, self.gains))
         self.rules, self.tuner = RulesCard(panel), TunerCard(panel)
         self._seen = -1
 
