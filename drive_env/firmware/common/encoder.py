@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES, Field
 from mechanics.compiled import inlined
 
@@ -64,3 +65,62 @@ def encoder_count(edges, backwards):
     """
     count = np.floor(edges)
     return count + backwards * (-1.0 - 2.0 * count)
+
+
+@inlined
+def derive_counter(drive, lane):
+    """Compute the quotients of the encoder: writes turns_per_count and counts_per_rad."""
+    # 2080h:02 and 608Fh may be 0, which is no encoder that could be counted with.
+    steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
+    steps = steps if steps > 0.0 else 1.0
+    drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
+    drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
+
+
+@inlined
+def count_at(drive, lane, angle):
+    """Return what the counter shows at an angle of the disc [rad]; that of an encoder that is broken stands still."""
+    count = encoder_count(angle * drive.counts_per_rad[lane], drive.encoder_true_direction[lane])
+    return drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
+
+
+@inlined
+def read_counter(drive, lane):
+    """Find the disc's error, and return what the counter shows now."""
+    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
+    return count_at(drive, lane, drive.theta_m[lane] + drive.encoder_error[lane])
+
+
+@inlined
+def filtered_velocity(drive, lane, raw):
+    """Return a velocity [rad/s] after the second-order low-pass, whose state it moves on by a window."""
+    b = drive.velocity_filter_b[lane]
+    omega = b * raw + drive.velocity_filter_z[0, lane]
+    drive.velocity_filter_z[0, lane] = (
+        2.0 * b * raw - drive.velocity_filter_a[0, lane] * omega + drive.velocity_filter_z[1, lane]
+    )
+    drive.velocity_filter_z[1, lane] = b * raw - drive.velocity_filter_a[1, lane] * omega
+    return omega
+
+
+@inlined
+def index_in_window(drive, lane, edges, first, up):
+    """Return whether the index came in the window that has passed, at which edge, and the count there.
+
+    Args:
+        drive: The record.
+        lane: Of the axis.
+        edges: Of the disc at its present angle.
+        first: Edge at which the index becomes active in that direction, of any turn.
+        up: 1: it turned upwards, or stood; 0: downwards.
+    """
+    counts = drive.encoder_counts[lane]
+    before = drive.true_edges[lane]
+    turn = np.floor((edges - first) / counts)
+    turn_before = np.floor((before - first) / counts)
+    sees = drive.encoder_broken[lane] < 0.5 and drive.encoder_gain[lane] > 0.0
+    came = sees and turn != turn_before
+    at = first + counts * (turn if turn > turn_before else turn_before)
+    count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
+    return came, at, count

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from drive_env.firmware.common import phases
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.common.encoder import encoder_count, shake_encoders
-from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.cycle import FirmwareStages, Stage, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment, causes, fields, thermal
 from drive_env.firmware.servo.derived import derive
@@ -33,24 +34,29 @@ def collect_torque(drive, s, weight, moment):
         drive.moment_window[s, lane] += moment * drive.tau_m[lane]
 
 
-@stage
-def run_tick(drive, rates, k):
-    """Run the current loop once: sensors, regulation, bridge and winding, torque for the load's next steps.
+def tick_with(convert: Stage) -> Stage:
+    """Return the stage that runs the current loop once, with what turns a tick's currents into energy and motion."""
 
-    One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
-    """
-    if drive.block_uses_halls[0]:
-        measure_halls(drive, rates.tick)
-    measure_angle(drive, rates.tick)
-    measure_currents(drive)
-    current_loop(drive)
-    power_stage(drive)
-    if drive.block_has_open_phase[0]:
-        open_phases(drive)
-    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+    @stage
+    def run_tick(drive, rates, k):
+        """Run the current loop once: sensors, regulation, bridge and winding, torque for the load's next steps.
+
+        One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+        """
+        if drive.block_uses_halls[0]:
+            measure_halls(drive, rates.tick)
+        measure_angle(drive, rates.tick)
+        measure_currents(drive)
+        current_loop(drive)
+        power_stage(drive)
+        if drive.block_has_open_phase[0]:
+            open_phases(drive)
+        convert(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+        collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+        for s in range(1, rates.substeps):
+            collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+    return run_tick
 
 
 @stage
@@ -173,11 +179,11 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, alignment.commutate, tell_sensor),
+    switch=(phases.forget_peaks, alignment.commutate, tell_sensor),
     tell=(tell_status,),
     end_period=(find_what_is_needed,),
     window=(read_motion, regulate_motion, prepare_winding),
-    tick=(run_tick,),
+    tick=(tick_with(convert_energy),),
     power_on=(power_on, tell_counts),
     halt=(halt,),
 )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from drive_env.firmware.common import start_up
+from drive_env.firmware.common import phases, start_up
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.common.dc_link import derive_link
 from drive_env.firmware.common.encoder import encoder_count, shake_encoders
 from drive_env.firmware.common.warming import warmed
-from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.cycle import FirmwareStages, Stage, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper import causes, fields
 from drive_env.firmware.stepper.chopper import choose_drive, drain_shorts, find_ripple
@@ -38,20 +38,25 @@ def collect_torque(drive, s, weight, moment):
         drive.moment_window[s, lane] += moment * (drive.tau_m[lane] + drive.tau_detent[lane])
 
 
-@stage
-def run_tick(drive, rates, k):
-    """Run the current loop once: steps, chopper, winding, torque for the load's next steps.
+def tick_with(step: Stage) -> Stage:
+    """Return the stage that runs the current loop once, with what steps the field for a tick."""
 
-    One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
-    """
-    make_steps(drive, rates.tick)
-    chop(drive)
-    power_stage(drive)
-    collect_voltage(drive)
-    move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+    @stage
+    def run_tick(drive, rates, k):
+        """Run the current loop once: steps, chopper, winding, torque for the load's next steps.
+
+        One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+        """
+        step(drive, rates.tick)
+        chop(drive)
+        power_stage(drive)
+        collect_voltage(drive)
+        move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+        collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+        for s in range(1, rates.substeps):
+            collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+    return run_tick
 
 
 @stage
@@ -188,11 +193,11 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, slow_ramp, hold_stalled, causes.switch_brake, scale_current),
+    switch=(phases.forget_peaks, slow_ramp, hold_stalled, causes.switch_brake, scale_current),
     tell=(tell_status,),
     end_period=(spread_steps,),
     window=(watch_load, read_motion, prepare_chopper),
-    tick=(run_tick,),
+    tick=(tick_with(make_steps),),
     power_on=(power_on, forget_load, forget_reduction, forget_waiting),
     halt=(halt, forget_load, forget_reduction, forget_waiting),
 )
