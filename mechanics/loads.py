@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mechanics.load import Combination, Contact, Friction, Load, Parameter, Roll, Switch
 from mechanics.model import MODELS, resolve
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 
 def _friction(element: str, unit: str = "rad", **bounds: tuple[float, float]) -> tuple[Parameter, ...]:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs.auto_stages import recorded
+from rigs.known_machines import true_plant
 
 from drive_env.devices import find_device
 from drive_env.drives.raw_gains import write_gains
@@ -15,7 +16,7 @@ from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
-from drive_env.loops.true_plant import true_machines, true_plant
+from drive_env.loops.true_plant import true_machines
 from tuning.auto.bench import Journal
 from tuning.auto.certify import certificate, requirements
 from tuning.auto.measured_margins import MeasuredAxis

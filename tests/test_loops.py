@@ -29,7 +29,7 @@ from drive_env.firmware.servo.power_stage import convert_energy, power_stage, re
 from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.motors import MOTORS
-from mechanics.compiled import OPTIONS, cached
+from mechanics.kernels.compiled import OPTIONS, cached
 
 window = FIRMWARE.window
 

@@ -14,7 +14,7 @@ from drive_env.devices import find_device
 from drive_env.devices.commissioning import preset as rule
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import find_motor
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 DEVICE = find_device("tmcm1636")
 MOTORS = DEVICE.motors  # steppers: test_stepper_motors.py

@@ -8,8 +8,8 @@ import pytest
 from numba import njit, types
 from numba.core import inline_closurecall
 
-from mechanics import compiled, stage_compiler
-from mechanics.compiled import OPTIONS, inlined, stage
+from mechanics.kernels import compiled, stage_compiler
+from mechanics.kernels.compiled import OPTIONS, inlined, stage
 
 PARTS = (
     (types.Record, "__repr__"),

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import mujoco
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains, bandwidths_from_gains
 from scipy.linalg import solve_continuous_are
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.highest_speed import highest_speeds
 from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, TERMS, WEIGHTS, Tracking, TrackingConfig

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from drive_env.cia402 import Key
 from mechanics.arrays import Floats, Integers, Mask
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.axis_objects import AxisObjects

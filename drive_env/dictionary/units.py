@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.arrays import Floats
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 TWO_PI = 2.0 * np.pi
 MILLIAMPERE = 1e-3  # [A]

@@ -24,7 +24,7 @@ from drive_env.dictionary.codec import (
 )
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emulator.group import Channels
-from mechanics.compiled import cached, stage
+from mechanics.kernels.compiled import cached, stage
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

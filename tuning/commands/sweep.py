@@ -233,7 +233,7 @@ def _print_best(result: Any, count: int) -> None:
 
 
 def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
-    from mechanics.untrusted import read_text
+    from mechanics.reading.untrusted import read_text
     from tuning.runs.experiment import load_experiment, shipped_experiment
 
     experiment = load_experiment(config, **overrides)

@@ -17,7 +17,7 @@ from drive_env.firmware.common.protection import (
     WARN,
     Cause,
 )
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 HOMING = 6  # limit switches are what homing looks for
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware.record import LANES, Field
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that holds its voltage
 SMALLEST_VOLTAGE = 1e-3  # V; an empty DC link divides nothing

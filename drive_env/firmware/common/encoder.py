@@ -6,7 +6,7 @@ import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES, Field
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 U32 = np.uint32  # without it every operation of the generator widens to 64 bits
 # Sum of four random bytes: mean 510, variance 4 (256^2 - 1) / 12.
@@ -90,6 +90,35 @@ def read_counter(drive, lane):
     s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
     drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
     return count_at(drive, lane, drive.theta_m[lane] + drive.encoder_error[lane])
+
+
+@inlined
+def forget_velocity(drive, lane):
+    """Begin the velocity filter anew."""
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+
+
+@inlined
+def start_counter(drive, lane):
+    """Begin counting where the disc stands, and return its edges there."""
+    forget_velocity(drive, lane)
+    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
+    edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
+    drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
+    drive.count_zero[lane] = drive.count[lane]
+    return edges
+
+
+@inlined
+def find_noise(drive):
+    """Write whether a lane of the block has a noisy encoder."""
+    drive.block_has_noisy_encoder[0] = 0
+    for lane in range(LANES):
+        # Once more after the noise has ended, so that none of it is left in the angle.
+        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
+            drive.block_has_noisy_encoder[0] = 1
 
 
 @inlined

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware.record import Field
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
 

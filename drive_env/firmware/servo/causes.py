@@ -6,7 +6,7 @@ from drive_env.firmware.common import causes, fsa, start_up
 from drive_env.firmware.common.phases import open_load_a, open_load_b
 from drive_env.firmware.common.protection import CUT, FAULT_RESET, FOLLOWING_ERROR, STOP, WARN, Cause
 from drive_env.firmware.servo import alignment
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 OPEN_LOAD_DEMAND = 1.0  # A of phase current that must be asked for
 OPEN_LOAD_CURRENT = 0.3  # A below which there is none

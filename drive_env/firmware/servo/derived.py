@@ -5,7 +5,7 @@ from __future__ import annotations
 from drive_env.firmware.common.dc_link import derive_link
 from drive_env.firmware.common.encoder import derive_counter
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined

@@ -12,7 +12,7 @@ from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.common.encoder import index_in_window
 from drive_env.firmware.common.modes import hm
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 
 @stage

@@ -15,7 +15,7 @@ from __future__ import annotations
 from drive_env.firmware.common.arithmetic import clip, cosine_series, exponential, sine_series
 from drive_env.firmware.common.dc_link import drain_link, turn_rotor
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 SQRT3 = 3.0**0.5
 

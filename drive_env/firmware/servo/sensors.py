@@ -8,7 +8,7 @@ from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.common.encoder import BYTES_MEAN, BYTES_SCALE, U32, count_at, filtered_velocity, read_counter
 from drive_env.firmware.common.phases import note_peaks
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 SQRT3 = 3.0**0.5
 PI = 3.141592653589793

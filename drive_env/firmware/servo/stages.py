@@ -6,7 +6,7 @@ import numpy as np
 
 from drive_env.firmware.common import phases
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
-from drive_env.firmware.common.encoder import encoder_count, shake_encoders
+from drive_env.firmware.common.encoder import find_noise, forget_velocity, shake_encoders, start_counter
 from drive_env.firmware.cycle import FirmwareStages, Stage, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment, causes, fields, thermal
@@ -22,7 +22,7 @@ from drive_env.firmware.servo.sensors import (
     tell_counts,
 )
 from drive_env.firmware.servo.status_flags import tell_status
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 
 @inlined
@@ -108,15 +108,12 @@ def find_what_is_needed(drive, rates):
     find_whether_index_is_needed(drive)
     drive.block_uses_halls[0] = 0
     drive.block_has_open_phase[0] = 0
-    drive.block_has_noisy_encoder[0] = 0
+    find_noise(drive)
     for lane in range(LANES):
         if drive.angle_source[lane] == alignment.HALL or drive.velocity_sensor[lane] == alignment.VELOCITY_BY_HALL:
             drive.block_uses_halls[0] = 1
         if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0 or drive.open_c[lane] > 0.0:
             drive.block_has_open_phase[0] = 1
-        # Once more after the noise has ended, so that none of it is left in the angle.
-        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
-            drive.block_has_noisy_encoder[0] = 1
 
 
 @stage
@@ -128,8 +125,7 @@ def tell_sensor(drive, lane, dt):
 @stage
 def halt(drive, lane):
     """Leave no number behind that is none."""
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
+    forget_velocity(drive, lane)
     drive.current_sum_d[lane] = 0.0
     drive.current_sum_q[lane] = 0.0
     drive.i_d[lane] = 0.0
@@ -149,15 +145,7 @@ def power_on(drive, lane):
     drive.current_sum_d[lane] = 0.0
     drive.current_sum_q[lane] = 0.0
     drive.i_q_ref[lane] = 0.0
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
-    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
-    count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
-    gain = drive.encoder_gain[lane]
-    told = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI * gain
-    drive.count[lane] = encoder_count(told, drive.encoder_true_direction[lane])
-    drive.count_zero[lane] = drive.count[lane]
+    count = np.floor(start_counter(drive, lane))
     drive.angle_zero[lane] = (
         drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
     )

@@ -29,7 +29,7 @@ from drive_env.firmware.common.protection import (
 from drive_env.firmware.servo.causes import overcurrent_a, overcurrent_b
 from drive_env.firmware.servo.causes import overcurrent_high_side as overcurrent_link
 from drive_env.firmware.servo_mains.mains_link import owner
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 REVERSE_TIME = 0.01  # s of speeding up against the current, after which the commutation is wrong
 REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for

@@ -45,7 +45,7 @@ from drive_env.firmware.servo_mains.registers import (
     read_settings,
     tell_status,
 )
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 
 @inlined

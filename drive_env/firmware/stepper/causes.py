@@ -9,7 +9,7 @@ from drive_env.firmware.common import brake, causes
 from drive_env.firmware.common.phases import open_load_a, open_load_b
 from drive_env.firmware.common.protection import CUT, FAULT_RESET, FOLLOWING_ERROR, STOP, WARN, Cause
 from drive_env.firmware.stepper.stall_guard import stalled
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 OPEN_LOAD_DEMAND = 0.3  # of the amplitude, that must be asked of a phase
 OPEN_LOAD_CURRENT = 0.05  # of the amplitude, below which there is none

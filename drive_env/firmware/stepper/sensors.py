@@ -12,7 +12,7 @@ import numpy as np
 from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.common.encoder import derive_counter, filtered_velocity, index_in_window, read_counter
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined

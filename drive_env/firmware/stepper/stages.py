@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from drive_env.firmware.common import phases, start_up
-from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.common.dc_link import derive_link
-from drive_env.firmware.common.encoder import encoder_count, shake_encoders
+from drive_env.firmware.common.encoder import find_noise, forget_velocity, shake_encoders, start_counter
 from drive_env.firmware.common.warming import warmed
 from drive_env.firmware.cycle import FirmwareStages, Stage, compose
 from drive_env.firmware.record import LANES
@@ -24,7 +23,7 @@ from drive_env.firmware.stepper.stall_guard import (
 )
 from drive_env.firmware.stepper.steps import count_steps, derive_steps, make_steps, plan_steps
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 LARGEST_SQUARE = 1e12  # A^2
 
@@ -121,14 +120,11 @@ def spread_steps(drive, rates):
     """Plan the steps of the coming period, and leave out of it what no drive of a block needs."""
     if rates.period > 0.0:
         plan_steps(drive, rates.period)
-    drive.block_has_noisy_encoder[0] = 0
+    find_noise(drive)
     drive.block_has_dc_step[0] = 0
     for lane in range(LANES):
         if drive.dc_speed[lane] > 0.0:
             drive.block_has_dc_step[0] = 1
-        # Once more after the noise has ended, so that none of it is left in the angle.
-        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
-            drive.block_has_noisy_encoder[0] = 1
 
 
 @stage
@@ -140,8 +136,7 @@ def tell_status(drive, lane):
 @stage
 def halt(drive, lane):
     """Leave no number behind that is none."""
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
+    forget_velocity(drive, lane)
     drive.step_rate[lane] = 0.0
     drive.i_a[lane] = 0.0
     drive.i_b[lane] = 0.0
@@ -164,12 +159,7 @@ def power_on(drive, lane):
     drive.i_a[lane] = 0.0
     drive.i_b[lane] = 0.0
     drive.tau_detent[lane] = 0.0
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
-    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
-    edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
-    drive.true_edges[lane] = edges
+    drive.true_edges[lane] = start_counter(drive, lane)
     drive.step_seen[lane] = 0.0
     drive.step_shift[lane] = 0.0
     drive.loop_closed[lane] = 0.0
@@ -178,8 +168,6 @@ def power_on(drive, lane):
     drive.latch_armed[lane] = 0.0
     drive.latch_steps[lane] = 0.0
     drive.latch_encoder[lane] = 0.0
-    drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
-    drive.count_zero[lane] = drive.count[lane]
     drive.theta_encoder[lane] = 0.0
     drive.omega_encoder[lane] = 0.0
     drive.position_actual[lane] = 0.0

@@ -18,7 +18,7 @@ from drive_env.firmware.common.dc_link import drain_link, turn_rotor
 from drive_env.firmware.common.phases import note_peaks
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.chopper import PWM_STEPS, phase_voltage
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined

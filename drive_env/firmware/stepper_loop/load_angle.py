@@ -15,7 +15,7 @@ from drive_env.firmware.common.arithmetic import TWO_PI, clip
 from drive_env.firmware.common.encoder import count_at
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.steps import table_values
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 FULL_ANGLE = 1024.0  # of an electrical turn, which is four full steps
 GREATEST = 511.0  # the register's, just below half a turn

@@ -15,7 +15,7 @@ from drive_env.firmware.stepper_loop.current_level import scale_by_load, tell_to
 from drive_env.firmware.stepper_loop.encoder import see_axis, seed_steps
 from drive_env.firmware.stepper_loop.load_angle import limit_lead, move_field
 from drive_env.firmware.stepper_loop.torque import ask_torque, tell_torque_mode
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 
 @stage
