@@ -143,11 +143,7 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
     emergencies, canopen = base["emergencies"], base["canopen"]
     more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
     objects = {"serial_number": "1018:4", **canopen["objects"]}
-    return {
-        **base,
-        "emergencies": {**more, **emergencies},
-        "canopen": {**canopen, "objects": objects},
-    }
+    return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
 
 
 def check_rates(rates: Mapping[str, float]) -> None:

@@ -110,12 +110,7 @@ UNITS: dict[str, Unit] = {
             lambda c: RPM * c.velocity_ratio,
             follows_scale=True,
         ),
-        Unit(
-            "velocity unit/s",
-            "velocity units per second",
-            lambda c: RPM * c.velocity_ratio,
-            follows_scale=True,
-        ),
+        Unit("velocity unit/s", "velocity units per second", lambda c: RPM * c.velocity_ratio, follows_scale=True),
         Unit(
             "set-point unit",
             "velocity units times numerator over denominator of the set-point factor",

@@ -121,12 +121,7 @@ class Machines:
                 group.load.plant.load_torque[:] = calm
 
     def load_profile(
-        self,
-        at: ArrayLike | None,
-        torque: ArrayLike | None = None,
-        *,
-        of: str = "time",
-        period: float | None = None,
+        self, at: ArrayLike | None, torque: ArrayLike | None = None, *, of: str = "time", period: float | None = None
     ) -> None:
         """Add a torque from a table to `load_torque`, interpolated linearly, in all machines; None takes it away.
 

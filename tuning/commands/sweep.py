@@ -92,12 +92,7 @@ def sweep(
 
 
 def _sweep(
-    config: Path | None,
-    overrides: dict[str, Any],
-    folder: Path,
-    workers: int | None,
-    cluster: str | None,
-    resume: bool,
+    config: Path | None, overrides: dict[str, Any], folder: Path, workers: int | None, cluster: str | None, resume: bool
 ) -> None:
     from rich.console import Console
 

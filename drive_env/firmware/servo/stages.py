@@ -14,13 +14,7 @@ from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.index import find_whether_index_is_needed, watch_index
 from drive_env.firmware.servo.loops import current_loop, motion_loops
 from drive_env.firmware.servo.power_stage import convert_energy, open_phases, power_stage, refresh_winding
-from drive_env.firmware.servo.sensors import (
-    measure_angle,
-    measure_currents,
-    measure_halls,
-    measure_motion,
-    tell_counts,
-)
+from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_halls, measure_motion, tell_counts
 from drive_env.firmware.servo.status_flags import tell_status
 from mechanics.kernels.compiled import inlined, stage
 

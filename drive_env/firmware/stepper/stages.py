@@ -14,13 +14,7 @@ from drive_env.firmware.stepper.cool_step import adapt_current, forget_reduction
 from drive_env.firmware.stepper.current_scale import scale_current
 from drive_env.firmware.stepper.dc_step import forget_waiting, release_steps, slow_ramp
 from drive_env.firmware.stepper.sensors import derive_encoder, measure_motion
-from drive_env.firmware.stepper.stall_guard import (
-    collect_voltage,
-    forget_load,
-    hold_stalled,
-    read_load,
-    stop_stalled,
-)
+from drive_env.firmware.stepper.stall_guard import collect_voltage, forget_load, hold_stalled, read_load, stop_stalled
 from drive_env.firmware.stepper.steps import count_steps, derive_steps, make_steps, plan_steps
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
 from mechanics.kernels.compiled import inlined, stage
