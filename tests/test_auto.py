@@ -144,10 +144,7 @@ def test_gains_are_all_that_is_changed_and_the_drives_are_off(five):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("axis", "words"),
-    [(SHORT, "travel is too short: 0.008 rad (0.0013 turns), and 0.2 rad")],
-)
+@pytest.mark.parametrize(("axis", "words"), [(SHORT, "travel is too short: 0.008 rad (0.0013 turns), and 0.2 rad")])
 def test_what_cannot_be_tuned_gets_its_gains_back_and_the_reason_is_named(five, axis, words):
     _, result, before, after, _ = five
     assert not result.axes[axis].accepted

@@ -21,15 +21,7 @@ from tuning.auto.bench import Journal
 from tuning.auto.certify import certificate, requirements
 from tuning.auto.measured_margins import MeasuredAxis
 from tuning.auto.result import AxisResult, Result, collect
-from tuning.certificate.certificate import (
-    CROSSOVERS,
-    KEPT,
-    NEARLY_KEPT,
-    NOT_KEPT,
-    NOT_MEASURED,
-    SEEN_KEPT,
-    TAKEN,
-)
+from tuning.certificate.certificate import CROSSOVERS, KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED, SEEN_KEPT, TAKEN
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated

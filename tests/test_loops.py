@@ -649,14 +649,8 @@ def refresh_stage(drive, rates):
 
 # Packed and scalar double multiplications, additions, subtractions and their fused forms.
 INSTRUCTIONS = {
-    "x86": (
-        r"\bv?(?:mul|add|sub)pd\b|\bvfn?m(?:add|sub)\d+pd\b",
-        r"\bv?(?:mul|add|sub)sd\b|\bvfn?m(?:add|sub)\d+sd\b",
-    ),
-    "arm": (
-        r"\bf(?:mul|add|sub|mla|mls)(?:\.2d\b|\s+v\d+\.2d)",
-        r"\bf(?:n?mul|add|sub|n?madd|n?msub)\s+d\d+",
-    ),
+    "x86": (r"\bv?(?:mul|add|sub)pd\b|\bvfn?m(?:add|sub)\d+pd\b", r"\bv?(?:mul|add|sub)sd\b|\bvfn?m(?:add|sub)\d+sd\b"),
+    "arm": (r"\bf(?:mul|add|sub|mla|mls)(?:\.2d\b|\s+v\d+\.2d)", r"\bf(?:n?mul|add|sub|n?madd|n?msub)\s+d\d+"),
 }
 
 

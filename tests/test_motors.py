@@ -157,10 +157,7 @@ def test_the_qube_servo_3_row_is_that_of_its_manual():
 
 @pytest.mark.parametrize(
     ("name", "R", "L", "K_t", "J"),
-    [
-        ("class_20w", 2.2, 0.45e-3, 0.022, 0.9e-6),
-        ("class_750w", 0.05, 0.1e-3, 0.11, 1.2e-4),
-    ],
+    [("class_20w", 2.2, 0.45e-3, 0.022, 0.9e-6), ("class_750w", 0.05, 0.1e-3, 0.11, 1.2e-4)],
 )
 def test_class_rows_are_those_of_the_gain_tables_columns(name, R, L, K_t, J):
     row = MOTORS[name]

@@ -307,10 +307,7 @@ def test_the_carried_term_is_the_error_of_where_the_bob_is():
     [
         ({"load": "inertia", "tilt": (0.1, 0.2)}, "tilt is of a pendulum, and load 'inertia' has none"),
         ({"load": "inverted_pendulum", "tilt": (0.2, 0.1)}, r"tilt is \[low, high\] within a turn, in order"),
-        (
-            {"load": "inverted_pendulum", "tilt": (0.0, 0.7)},
-            "must be beyond the greatest tilt, 0.7 rad",
-        ),
+        ({"load": "inverted_pendulum", "tilt": (0.0, 0.7)}, "must be beyond the greatest tilt, 0.7 rad"),
         ({"margins": {"traking": 1.0}}, "a margin's name is one of 'tracking', .* not 'traking'"),
         ({"margins": {"tracking": 0.0}}, "the margin of tracking must be above 0 and finite, not 0"),
         ({"action": "ramp", "ramp": 0.0}, "ramp must be above 0 and finite, not 0"),

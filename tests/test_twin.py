@@ -20,14 +20,7 @@ from drive_env.motors import find_motor
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.score import robust_cost
 from tuning.auto import twin
-from tuning.auto.twin import (
-    WORLDS,
-    Known,
-    MachineVariant,
-    Twins,
-    known_of,
-    twin_parameters,
-)
+from tuning.auto.twin import WORLDS, Known, MachineVariant, Twins, known_of, twin_parameters
 from tuning.estimate import Estimate, refused
 from tuning.identify.identified_axis import Identification
 

@@ -19,10 +19,7 @@ from mechanics.arrays import Floats
 from mechanics.shaft import way
 from tuning.auto.identified import calm_gains
 from tuning.auto.proving import ProvingGround
-from tuning.compare.suite import (
-    groups,
-    open_group,
-)
+from tuning.compare.suite import groups, open_group
 from tuning.estimate import refused
 
 
