@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.coe_rig import CoeRig
-from rigs.truth import brake_is_closed
+from rigs.truth import brake_is_closed, field
 
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 from drive_env.canopen.frames import Frame
 from drive_env.devices import find_device
 from drive_env.drives.currents import read_current_limit, write_current_limit
 from drive_env.ethercat.application import AlState
-from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.record import set_lanes
 
 DEVICE = find_device("tgz_d")
 RPM = math.pi / 30.0
@@ -66,10 +66,6 @@ def new_drives(load="inertia", **given):
 def drives():
     with new_drives() as drives:
         yield drives
-
-
-def field(drives, name, part=0):
-    return get_lanes(drives.inside.records, name, drives.num_axes, part).astype(float)
 
 
 def errors(drives):

@@ -43,9 +43,15 @@ def truth_of(drives):
     }
 
 
+def field(drives, name, part=0):
+    """A field of the record of every axis, shape (num_axes,)."""
+    return get_lanes(drives.inside.records, name, drives.num_axes, part).astype(float)
+
+
 def brake_is_closed(drives):
     """Whether the brake of each axis holds, shape (num_axes,)."""
-    names = ("brake_mode", "stage_on", "brake_opened")
-    mode, stage_on, opened = (get_lanes(drives.inside.records, name, drives.num_axes) for name in names)
-    shut = (mode == WITH_STAGE) & (stage_on == 0.0) | (mode == WITH_OUTPUT) & (opened == 0)
+    mode = field(drives, "brake_mode")
+    shut = (mode == WITH_STAGE) & (field(drives, "stage_on") == 0) | (mode == WITH_OUTPUT) & (
+        field(drives, "brake_opened") == 0
+    )
     return (mode == CLOSED) | shut
